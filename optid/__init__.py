@@ -1,0 +1,47 @@
+"""optid: identification of Hammerstein systems by optimisation with constraints.
+
+The public names are loaded on first use, so that ``import optid`` stays fast.
+"""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Data": "data",
+    "read": "readers",
+    "open_stream": "readers",
+    "Triangular": "bases",
+    "Trigonometric": "bases",
+    "Polynomial": "bases",
+    "BSpline": "bases",
+    "PiecewiseConstant": "bases",
+    "Linear": "bases",
+    "UserFunctions": "bases",
+    "Nonlinearity": "models",
+    "HammersteinARX": "models",
+    "Program": "program",
+    "Status": "solution",
+    "Solution": "solution",
+    "Bound": "solution",
+    "solve": "solving",
+    "fit": "fitting",
+    "Fit": "fitting",
+    "validate": "validation",
+    "load": "io",
+    "RecursiveARX": "recursion",
+}
+_MODULES = {"signals", "bases", "plots", "report", "errors"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f"optid.{_HOME[name]}"), name)
+    if name in _MODULES:
+        return import_module(f"optid.{name}")
+    raise AttributeError(f"module 'optid' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*_HOME, *_MODULES, "__version__"])

@@ -1,0 +1,60 @@
+"""Named errors: every refusal says which channel, sample, argument or constraint is wrong and what to do."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class OptidError(Exception):
+    """Base class of everything optid raises on purpose."""
+
+
+class DataError(OptidError, ValueError):
+    """The record cannot be used as it is: shape, missing or impossible samples, time stamps, units."""
+
+
+class RankError(DataError):
+    """The record does not determine the parameters: too few rows, no excitation, unvisited basis functions."""
+
+
+class StructureError(OptidError, ValueError):
+    """An argument that describes the model is wrong: na, nb, nk, basis, constraint, gauge."""
+
+
+class LookupFailed(OptidError, LookupError):  # noqa: N818 - reads as the outcome of a look-up
+    """No formulation, solver, constraint, basis or example has this name."""
+
+
+class InfeasibleError(OptidError, RuntimeError):
+    """No model satisfies all constraints; the message lists a smallest conflicting subset."""
+
+
+class UnboundedError(OptidError, RuntimeError):
+    """The programme has no minimum."""
+
+
+class SolverMissing(OptidError, RuntimeError):  # noqa: N818
+    """The solver exists but is not installed; the message has the pip line."""
+
+
+class SolverFailed(OptidError, RuntimeError):  # noqa: N818
+    """The solver crashed, ran out of time or returned a point that our residuals refuse."""
+
+
+class ModelFileError(OptidError, ValueError):
+    """A model file is truncated, of another version, or not a model."""
+
+
+class DataWarning(UserWarning):
+    """Something weakens the answer without making it meaningless; the text has the number."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a sentence that names the nearest known word, or all of them.
+
+    Args:
+        name: what the user wrote.
+        known: the words that exist.
+    """
+    words = sorted(known)
+    close = get_close_matches(name, words, n=1, cutoff=0.5)
+    return f"Did you mean {close[0]!r}?" if close else "Known: " + ", ".join(words) + "."
