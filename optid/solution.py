@@ -1,8 +1,26 @@
 """What a solve returns: why it stopped, whether there is a point, whether it is proved, and what we measured ourselves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
+
+import numpy as np
+
+
+class Status(Enum):
+    """Why a solve stopped, after our own residuals have judged the solver's claim."""
+
+    OPTIMAL = "optimal"
+    LOCAL = "locally optimal"
+    INACCURATE = "inaccurate"
+    INFEASIBLE = "infeasible"
+    UNBOUNDED = "unbounded"
+    LIMIT = "limit"
+    FAILED = "failed"
+
+    def __str__(self) -> str:
+        return self.value
 
 
 @dataclass(frozen=True)
@@ -24,3 +42,98 @@ class Bound:
     reason: str = ""
     seconds: float = 0.0
     multipliers: Any = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Our own measurements at a solver's point; all relative, zero at an exact solution.
+
+    Attributes:
+        violation: largest constraint violation, relative to the size of the constraint's terms.
+        worst: name of the constraint that is violated most.
+        stationarity: norm of the gradient of the Lagrangian relative to that of the objective;
+            ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound judges there).
+        complementarity: largest product of multiplier and slack, relative to the objective.
+    """
+
+    violation: float
+    worst: str
+    stationarity: float
+    complementarity: float
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds spent building, solving, judging and proving."""
+
+    build: float = 0.0
+    solve: float = 0.0
+    judge: float = 0.0
+    prove: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Sum of all phases in seconds."""
+        return self.build + self.solve + self.judge + self.prove
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The outcome of one solve: three separate facts (why it stopped, a point, a proof) and the evidence.
+
+    Attributes:
+        status: why it stopped, after judgement.
+        claimed: what the solver said, in its own word.
+        reason: one sentence where the status needs one.
+        values: {variable name: array}, empty where there is no point.
+        duals: {constraint name: multiplier array}, empty where the solver gives none.
+        objective: value of the programme's objective at ``values``, recomputed (``nan`` without a point).
+        bound: certified lower bound, or None where the programme has no certificate.
+        residuals: our own measurements, or None without a point.
+        scale: objective of the zero model (``YᵀY``), the yardstick of the gap.
+        solver: name of the back end; ``chosen`` says why when it was chosen automatically.
+        iterations: as counted by the solver, -1 where it does not say.
+        times: seconds per phase.
+    """
+
+    status: Status
+    claimed: str
+    solver: str
+    reason: str = ""
+    chosen: str = ""
+    values: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    duals: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    objective: float = float("nan")
+    bound: Bound | None = None
+    residuals: Residuals | None = None
+    scale: float = 1.0
+    iterations: int = -1
+    times: Times = Times()
+
+    @property
+    def has_point(self) -> bool:
+        """Whether there is a point at all."""
+        return bool(self.values)
+
+    @property
+    def proof(self) -> bool:
+        """Whether global optimality of the point is proved."""
+        return self.bound is not None and self.bound.proved
+
+    @property
+    def gap(self) -> float:
+        """Relative distance between objective and certified bound; ``inf`` where there is no bound."""
+        if self.bound is None or not self.has_point:
+            return float("inf")
+        return relative_gap(self.objective, self.bound.value, self.scale)
+
+
+def relative_gap(objective: float, bound: float, scale: float) -> float:
+    """Return ``(F - D) / max(F, 1e-9 scale)``, never below zero.
+
+    Args:
+        objective: F, the value reached.
+        bound: D, the certified lower bound.
+        scale: ``YᵀY``; its floor keeps noise-free problems meaningful.
+    """
+    return max(0.0, objective - bound) / max(objective, 1e-9 * scale, np.finfo(float).tiny)

@@ -1,0 +1,314 @@
+"""A programme: the identification problem written once, in CVXPY, with everything in it named."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+
+from optid.errors import StructureError, nearest
+from optid.solution import Bound
+
+Values = Mapping[str, np.ndarray]
+Builder = Callable[["View"], Any]
+
+
+class View(Mapping[str, cp.Expression]):
+    """The named expressions that a constraint may speak about, and the structure it may need.
+
+    Attributes:
+        kind: "exact" (variables a, b, mu, offset) or "relaxed" (a, Theta, offset).
+        channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
+            with several they carry the input, as in ``mu[valve]``.
+        bases: the fitted basis of every channel.
+        gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
+    """
+
+    def __init__(self, expressions: Mapping[str, cp.Expression], *, kind: str, channels: tuple[str, ...] = (),
+                 bases: Mapping[str, Any] | None = None, gauge: str = "") -> None:
+        self._expressions = dict(expressions)
+        self.kind = kind
+        self.channels = channels
+        self.bases = dict(bases or {})
+        self.gauge = gauge
+
+    def __getitem__(self, name: str) -> cp.Expression:
+        try:
+            return self._expressions[name]
+        except KeyError:
+            raise StructureError(
+                f"a constraint asks for {name!r}, which this formulation does not have. {nearest(name, self)}"
+            ) from None
+
+    def __iter__(self):
+        return iter(self._expressions)
+
+    def __len__(self) -> int:
+        return len(self._expressions)
+
+    def key(self, name: str, channel: str | None = None) -> str:
+        """Return the key of a per-channel quantity: ``mu`` with one input, ``mu[channel]`` with several."""
+        if len(self.channels) <= 1:
+            return name
+        if channel is None:
+            raise StructureError(f"{name!r} needs a channel: there are several inputs ({', '.join(self.channels)})")
+        return f"{name}[{channel}]"
+
+
+def named(built: Any, default: str) -> dict[str, tuple[Constraint, ...]]:
+    """Bring what a constraint builder returned into the form {name: (constraint, ...)}.
+
+    Args:
+        built: a CVXPY constraint, a list of them, or a dictionary of either.
+        default: name used where the builder gave none.
+
+    Raises:
+        StructureError: when something in it is not a CVXPY constraint.
+    """
+    if isinstance(built, Mapping):
+        groups = {str(name): item for name, item in built.items()}
+    elif isinstance(built, list | tuple):
+        groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
+    else:
+        groups = {default: built}
+    result: dict[str, tuple[Constraint, ...]] = {}
+    for name, item in groups.items():
+        members = tuple(item) if isinstance(item, list | tuple) else (item,)
+        for member in members:
+            if not isinstance(member, Constraint):
+                raise StructureError(
+                    f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1"
+                )
+        result[name] = members
+    return result
+
+
+@dataclass(frozen=True)
+class RankOneForm:
+    """The least-squares structure behind a bilinear programme, for methods that exploit it.
+
+    ``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
+
+    Attributes:
+        problem: the numbers (`optid.rank_one.RankOne`).
+        linear: names of the linear variables in the order of z (each flattened column by column).
+        blocks: (mu name, b name) of every rank-one block.
+        gauge: "norm", "gain" or "b0".
+    """
+
+    problem: Any
+    linear: tuple[str, ...]
+    blocks: tuple[tuple[str, str], ...]
+    gauge: str = "norm"
+
+
+@dataclass(frozen=True)
+class Program:
+    """One optimisation problem with named parts, independent of who solves it.
+
+    Attributes:
+        name: name of the formulation.
+        objective: CVXPY objective, in units of the data (residuals as variables, see ``constraints``).
+        constraints: {name: constraints}; the names in ``structural`` belong to the formulation, the others to the user.
+        variables: {name: CVXPY variable}.
+        start: {name: array}: a point to start from; never zero for a bilinear programme, where zero is a saddle.
+        recover: values -> model.
+        view: the expressions constraints may speak about.
+        structural: names of constraints that belong to the formulation.
+        parameters: {name: CVXPY parameter} that may change between solves without recompiling.
+        rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
+        certify: (program, values, duals) -> (Bound, better values or None), or None where no certificate exists.
+        scale: objective of the zero model, the yardstick of gaps.
+        note: why there can be no proof, where that is known beforehand.
+    """
+
+    name: str
+    objective: cp.Minimize
+    constraints: Mapping[str, tuple[Constraint, ...]]
+    variables: Mapping[str, cp.Variable]
+    start: Values
+    recover: Callable[[Values], Any]
+    view: View
+    structural: frozenset[str] = frozenset()
+    parameters: Mapping[str, cp.Parameter] = field(default_factory=dict)
+    rank_one: RankOneForm | None = None
+    certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
+    scale: float = 1.0
+    note: str = ""
+
+    @cached_property
+    def problem(self) -> cp.Problem:
+        """The CVXPY problem; compiled once and re-used when parameters change."""
+        return cp.Problem(self.objective, [c for group in self.constraints.values() for c in group])
+
+    @cached_property
+    def kind(self) -> str:
+        """The class of the programme: "LP", "QP", "SOCP", "SDP", "conic" or "NLP".
+
+        Raises:
+            StructureError: naming the part that is neither convex nor smooth.
+        """
+        if self.problem.is_dcp():
+            return _convex_class(self.problem)
+        for name, part in self._parts():
+            if not part.is_dnlp():
+                raise StructureError(
+                    f"{name} of {self.name!r} is neither convex nor a smooth expression that an NLP solver accepts: {part}"
+                )
+        return "NLP"
+
+    @property
+    def user_constraints(self) -> dict[str, tuple[Constraint, ...]]:
+        """The constraints that are not part of the formulation itself."""
+        return {name: group for name, group in self.constraints.items() if name not in self.structural}
+
+    def nonconvex_parts(self) -> list[str]:
+        """Names of the parts that break convexity."""
+        return [name for name, part in self._parts() if not part.is_dcp()]
+
+    def _parts(self) -> Iterable[tuple[str, Any]]:
+        yield "the objective", self.objective
+        for name, group in self.constraints.items():
+            for member in group:
+                yield f"constraint {name!r}", member
+
+    def subject_to(self, *builders: Any, convex: bool | None = None) -> "Program":
+        """Return the programme with further constraints.
+
+        Args:
+            builders: callables of the `View` (such as those of ``formulations.shape`` or a lambda that returns a
+                dictionary of CVXPY constraints), or such dictionaries.
+            convex: True refuses constraints that are not convex; default: True when the programme is convex.
+
+        Raises:
+            StructureError: unknown variable, name used twice, or a nonconvex constraint in a convex formulation.
+        """
+        demand = self.problem.is_dcp() if convex is None else convex
+        known = set(self.variables.values())
+        constraints = dict(self.constraints)
+        for position, builder in enumerate(builders):
+            default = getattr(builder, "name", None) or f"constraint {position + 1}"
+            built = builder(self.view) if callable(builder) else builder
+            for name, group in named(built, default).items():
+                if name in constraints:
+                    raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
+                for member in group:
+                    foreign = set(member.variables()) - known
+                    if foreign:
+                        raise StructureError(
+                            f"constraint {name!r} uses {', '.join(sorted(v.name() for v in foreign))}, "
+                            f"which is not a variable of {self.name!r} ({', '.join(self.variables)})"
+                        )
+                    if demand and not member.is_dcp():
+                        raise StructureError(
+                            f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
+                            "State it in the named variables of the relaxation or use an exact formulation."
+                        )
+                constraints[name] = group
+        return replace(self, constraints=constraints)
+
+    def freeze(self, **values: Any) -> "Program":
+        """Return the programme with some variables held at values, as parameters that may be changed later.
+
+        Freezing ``b`` (or ``mu``) of a bilinear programme leaves a convex one. Structural constraints in which
+        nothing is left to choose are dropped.
+
+        Args:
+            values: variable name (brackets allowed through ``**{"mu[u1]": value}``) -> array of its shape.
+
+        Raises:
+            StructureError: unknown name or wrong shape.
+        """
+        swap: dict[int, Any] = {}
+        parameters = dict(self.parameters)
+        for name, value in values.items():
+            if name not in self.variables:
+                raise StructureError(f"cannot freeze {name!r}. {nearest(name, self.variables)}")
+            variable = self.variables[name]
+            array = np.asarray(value, dtype=float)
+            if array.shape != variable.shape:
+                raise StructureError(f"{name!r} has shape {variable.shape}, the value given has {array.shape}")
+            parameters[name] = swap[id(variable)] = cp.Parameter(variable.shape, name=name, value=array)
+        constraints = {}
+        for name, group in self.constraints.items():
+            kept = tuple(c.tree_copy(swap) for c in group)
+            if name in self.structural and not any(c.variables() for c in kept):
+                continue
+            constraints[name] = kept
+        view = View({name: self.view[name].tree_copy(swap) for name in self.view}, kind=self.view.kind,
+                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge)
+        left = {name: v for name, v in self.variables.items() if name not in values}
+        held = {name: parameters[name] for name in values}
+
+        def recover(found: Values) -> Any:
+            return self.recover({**found, **{name: p.value for name, p in held.items()}})
+
+        return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
+                       parameters=parameters, view=view, recover=recover, rank_one=None, certify=None,
+                       start={name: v for name, v in self.start.items() if name in left})
+
+    def soften(self, name: str, weight: float) -> "Program":
+        """Return the programme with one constraint turned into a quadratic penalty on its violation.
+
+        Args:
+            name: a user's constraint (equality or inequality).
+            weight: penalty per squared unit of violation.
+
+        Raises:
+            StructureError: unknown name, or a constraint that is neither an equality nor an inequality.
+        """
+        if name not in self.user_constraints:
+            raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
+        penalty: Any = 0.0
+        for member in self.constraints[name]:
+            if isinstance(member, cp.constraints.Zero | cp.constraints.Equality):
+                penalty = penalty + cp.sum_squares(member.expr)
+            elif isinstance(member, cp.constraints.NonPos | cp.constraints.Inequality):
+                penalty = penalty + cp.sum_squares(cp.pos(member.expr))
+            else:
+                raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
+                                     "only equalities and inequalities can be softened")
+        rest = {key: group for key, group in self.constraints.items() if key != name}
+        return replace(self, objective=cp.Minimize(self.objective.expr + weight * penalty), constraints=rest,
+                       rank_one=None, certify=None, note=f"constraint {name!r} is a penalty here")
+
+    def without(self, *names: str) -> "Program":
+        """Return the programme without the named constraints."""
+        return replace(self, constraints={k: g for k, g in self.constraints.items() if k not in names})
+
+    def assign(self, values: Values) -> None:
+        """Write values into the CVXPY variables; variables that are not named keep what they had."""
+        for name, value in values.items():
+            self.variables[name].value = np.asarray(value, dtype=float).reshape(self.variables[name].shape, order="F")
+
+    def clear_duals(self) -> None:
+        """Forget the multipliers of an earlier solve, so that they cannot be mistaken for new ones."""
+        for group in self.constraints.values():
+            for member in group:
+                for dual in member.dual_variables:
+                    dual.value = None
+
+    @property
+    def size(self) -> int:
+        """Number of scalar unknowns."""
+        return sum(v.size for v in self.variables.values())
+
+
+def _convex_class(problem: cp.Problem) -> str:
+    if problem.is_lp():
+        return "LP"
+    if problem.is_qp():
+        return "QP"
+    atoms = {type(atom).__name__ for atom in problem.atoms()}
+    cones = {type(c).__name__ for c in problem.constraints}
+    if cones & {"PSD"} or atoms & {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac"} or any(
+        v.attributes["PSD"] or v.attributes["NSD"] for v in problem.variables()
+    ):
+        return "SDP"
+    if cones & {"ExpCone", "PowCone3D", "PowConeND"} or atoms & {"exp", "log", "log_sum_exp", "logistic", "entr",
+                                                               "kl_div", "rel_entr", "log_det", "power", "geo_mean"}:
+        return "conic"
+    return "SOCP"
