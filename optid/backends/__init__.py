@@ -1,0 +1,150 @@
+"""Back ends: the only place that knows a solver.
+
+A back end is one function ``run(program, settings) -> Answer`` with its capabilities as data. It registers in the
+entry-point group ``optid.backends``; the target is a `BackEnd` or a function that returns several. What it answers is
+a claim: `optid.solving` measures the point and decides the status.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+
+from optid.errors import LookupFailed, SolverMissing, StructureError, nearest
+from optid.program import Program
+from optid.solution import Status
+
+GROUP = "optid.backends"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked of a solver, in words that do not depend on the solver.
+
+    Attributes:
+        accuracy: requested relative accuracy; every back end translates it into its own tolerances.
+        time_limit: seconds, or None.
+        warm: start from the programme's ``start`` (or the previous solution) where the solver can.
+        verbose: let the solver print.
+        options: native options, passed through.
+    """
+
+    accuracy: float = 1e-8
+    time_limit: float | None = None
+    warm: bool = True
+    verbose: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A solver's claim.
+
+    Attributes:
+        status: its own status in our words; a claim of success is ``Status.LOCAL`` or ``Status.OPTIMAL``.
+        word: its own word.
+        values: {variable: array}, empty without a point.
+        duals: {constraint: flat multipliers}; may be incomplete.
+        iterations: -1 where unknown.
+    """
+
+    status: Status
+    word: str
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+    duals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    iterations: int = -1
+
+
+@dataclass(frozen=True)
+class BackEnd:
+    """One solver under one word.
+
+    Attributes:
+        name: the word, in lower case.
+        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one".
+        run: (program, settings) -> Answer.
+        installed: whether it can run here.
+        pip: what to install where it cannot.
+        duals: whether it returns multipliers.
+        warm: whether it can start from a given point.
+        about: one line for the table of solvers.
+    """
+
+    name: str
+    classes: frozenset[str]
+    run: Callable[[Program, Settings], Answer] = field(repr=False)
+    installed: bool = True
+    pip: str = ""
+    duals: bool = True
+    warm: bool = False
+    about: str = ""
+
+    def refuses(self, program: Program) -> str:
+        """Return why this back end cannot take the programme, or an empty string."""
+        if program.rank_one is not None and "rank-one" in self.classes:
+            return ""
+        kind = program.kind
+        if kind in self.classes:
+            return ""
+        if kind == "NLP":
+            parts = ", ".join(program.nonconvex_parts())
+            return (f"{self.name} solves {_listed(self.classes)}; {program.name!r} is not convex in {parts}. "
+                    "Use an NLP back end (gauss_newton, ipopt, uno) or a relaxed formulation")
+        return f"{self.name} solves {_listed(self.classes)}; {program.name!r} is of class {kind}"
+
+
+@cache
+def back_ends() -> dict[str, BackEnd]:
+    """Return every registered back end by name, installed or not."""
+    found: dict[str, BackEnd] = {}
+    for point in entry_points(group=GROUP):
+        target = point.load()
+        several: Iterable[BackEnd] = (target,) if isinstance(target, BackEnd) else target()
+        for back_end in several:
+            found[back_end.name] = back_end
+    return found
+
+
+def find(name: str) -> BackEnd:
+    """Look a back end up by its word, in any case.
+
+    Raises:
+        LookupFailed: unknown word; names the nearest.
+        SolverMissing: known but not installed; the message has the pip line.
+    """
+    known = back_ends()
+    back_end = known.get(name.lower())
+    if back_end is None:
+        raise LookupFailed(f"no solver is called {name!r}. {nearest(name.lower(), known)}")
+    if not back_end.installed:
+        how = f"pip install {back_end.pip}" if back_end.pip else "it needs its vendor's package and licence"
+        raise SolverMissing(f"solver {back_end.name!r} is not installed: {how}")
+    return back_end
+
+
+def choose(program: Program) -> tuple[BackEnd, str]:
+    """Choose a back end by class and size of the programme, and say why.
+
+    Raises:
+        StructureError: when no installed back end accepts the programme.
+    """
+    if program.rank_one is not None:
+        return find("gauss_newton"), (
+            f"gauss_newton: rank-one least squares with {program.rank_one.problem.root.shape[0]} lifted unknowns"
+        )
+    kind = program.kind
+    order = ("uno", "ipopt") if kind == "NLP" and program.size <= 200 else ("ipopt", "uno")
+    if kind != "NLP":
+        order = ("clarabel", "scs")
+    for name in order:
+        back_end = back_ends().get(name)
+        if back_end is not None and back_end.installed and kind in back_end.classes:
+            return back_end, f"{name}: class {kind}, {program.size} unknowns"
+    raise StructureError(f"no installed back end accepts a programme of class {kind}; see `optid solvers`")
+
+
+def _listed(classes: frozenset[str]) -> str:
+    return ", ".join(sorted(classes))

@@ -1,0 +1,57 @@
+"""Run a back end in a process of its own, so that a crash or an endless loop is an outcome and not the end of the program."""
+
+import multiprocessing
+import signal
+import time
+from multiprocessing.connection import Connection
+
+from optid.backends import Answer, BackEnd, Settings
+from optid.program import Program
+from optid.solution import Status
+
+GRACE = 0.5  # seconds a solver has to notice its own time limit before it is killed
+
+
+def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
+    """Run ``back_end`` in a forked child; kill it shortly after the time limit.
+
+    Args:
+        back_end: what to run.
+        program: the programme; the child works on its own copy.
+        settings: what is asked; ``time_limit`` None means no limit.
+
+    Returns:
+        The child's answer; ``Status.LIMIT`` when it was killed, ``Status.FAILED`` when it died.
+    """
+    if "fork" not in multiprocessing.get_all_start_methods():
+        return back_end.run(program, settings)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_work, args=(sender, back_end, program, settings), daemon=True)
+    started = time.monotonic()
+    child.start()
+    sender.close()
+    limit = None if settings.time_limit is None else settings.time_limit + GRACE
+    try:
+        if receiver.poll(limit):
+            return receiver.recv()
+        return Answer(Status.LIMIT, f"stopped after {time.monotonic() - started:.1f} s: it did not keep its time limit")
+    except EOFError:
+        child.join()
+        code = child.exitcode or 0
+        word = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return Answer(Status.FAILED, f"the solver's process died: {word}")
+    finally:
+        if child.is_alive():
+            child.kill()
+        child.join()
+        receiver.close()
+
+
+def _work(sender: Connection, back_end: BackEnd, program: Program, settings: Settings) -> None:
+    try:
+        answer = back_end.run(program, settings)
+    except Exception as error:
+        answer = Answer(Status.FAILED, f"{type(error).__name__}: {error}")
+    sender.send(answer)
+    sender.close()

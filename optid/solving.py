@@ -1,0 +1,175 @@
+"""Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, ask for a proof."""
+
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optid.backends import Answer, BackEnd, Settings, choose, find
+from optid.errors import StructureError
+from optid.isolated import run_isolated
+from optid.judging import judge
+from optid.program import Program, Values
+from optid.solution import Bound, Residuals, Solution, Status, Times
+
+Procedure = Generator[Program, Solution, Any]
+
+LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+
+
+def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
+          time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
+          verbose: bool = False, **options: Any) -> Solution:
+    """Solve one programme with one back end and judge the answer.
+
+    Args:
+        program: what to solve.
+        solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
+        accuracy: requested relative accuracy, translated for each solver.
+        time_limit: seconds; implies a process of its own, which is killed when it does not stop.
+        isolate: run in a process of its own (default: only with a time limit), so that a crash is an outcome.
+        warm: start from the programme's ``start``.
+        prove: ask the programme's certificate for a proof of global optimality.
+        verbose: let the solver print.
+        options: native options of the solver.
+
+    Returns:
+        The outcome, always as a value: infeasible, failed and limit are statuses here.
+
+    Raises:
+        LookupFailed: no such solver.
+        SolverMissing: not installed (with the pip line).
+        StructureError: the solver cannot take this class of programme; the message names the nonconvex part.
+    """
+    chosen = ""
+    if solver == "auto":
+        back_end, chosen = choose(program)
+    elif isinstance(solver, str):
+        back_end = find(solver)
+    else:
+        back_end = solver if isinstance(solver, BackEnd) else BackEnd(
+            getattr(solver, "__name__", "callable"), frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"}), solver)
+    refusal = back_end.refuses(program)
+    if refusal:
+        raise StructureError(refusal)
+    settings = Settings(accuracy, time_limit, warm, verbose, options)
+
+    program.clear_duals()
+    if warm and program.start:
+        program.assign(program.start)
+    clock = time.perf_counter()
+    separate = (time_limit is not None) if isolate is None else isolate
+    try:
+        answer = run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
+    except Exception as error:  # a solver that crashes is an outcome, not a traceback
+        answer = Answer(Status.FAILED, f"{type(error).__name__}: {error}")
+    solved = time.perf_counter()
+    return _verdict(program, back_end, answer, chosen, settings, solved - clock, prove)
+
+
+def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, settings: Settings, seconds: float,
+             prove: bool) -> Solution:
+    base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
+                    iterations=answer.iterations, times=Times(solve=seconds))
+    values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
+    if not values:
+        status = answer.status if answer.status not in (Status.OPTIMAL, Status.LOCAL) else Status.FAILED
+        return replace(base, status=status, reason=answer.word)
+    if not all(np.all(np.isfinite(value)) for value in values.values()):
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned non-finite numbers")
+
+    clock = time.perf_counter()
+    objective, residuals = judge(program, values, answer.duals)
+    judged = time.perf_counter()
+    values, duals = program.values(), dict(answer.duals)
+    status, reason = _status(answer, residuals, settings.accuracy, back_end.name)
+    bound: Bound | None = None
+    if status in (Status.LOCAL, Status.INACCURATE) and prove:
+        values, objective, residuals, bound = _proof(program, values, duals, objective, residuals)
+        if bound is not None and bound.proved and status is Status.LOCAL:
+            status = Status.OPTIMAL
+    done = time.perf_counter()
+    return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
+                   values=values, duals=duals, objective=objective, bound=bound, residuals=residuals,
+                   times=Times(solve=seconds, judge=judged - clock, prove=done - judged))
+
+
+def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
+    """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
+    tolerance = max(100.0 * accuracy, 1e-7)
+    claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
+    if residuals.violation > tolerance:
+        amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)"
+        if residuals.violation > LIE:
+            return Status.FAILED, (f"{name} claims success, but {amount}" if claims else amount)
+        return Status.INACCURATE, amount
+    if answer.status is Status.INFEASIBLE and np.isfinite(residuals.stationarity):
+        return Status.INACCURATE, f"{name} says infeasible at a point that satisfies every constraint"
+    if not claims:
+        return answer.status, answer.word
+    if residuals.stationarity > 100.0 * tolerance or residuals.complementarity > 100.0 * tolerance:
+        return Status.INACCURATE, (
+            f"{name} claims success, but the point is not stationary: residual {residuals.stationarity:.1e}, "
+            f"complementarity {residuals.complementarity:.1e}")
+    return Status.LOCAL, ""
+
+
+def _proof(program: Program, values: Values, duals: Values, objective: float, residuals: Residuals
+           ) -> tuple[Values, float, Residuals, Bound | None]:
+    if program.certify is not None:
+        bound, better = program.certify(program, values, duals)
+        if better is not None:  # the proof attempt found a better point: judge that one instead
+            program.assign(better)
+            objective, residuals = judge(program, better, {})
+            values = program.values()
+        return values, objective, residuals, bound
+    if not program.problem.is_dcp() or not np.isfinite(residuals.stationarity):
+        return values, objective, residuals, None
+    error = max(residuals.violation, residuals.stationarity, residuals.complementarity)
+    proved = error < 1e-6
+    reason = f"convex programme; optimality conditions hold to {error:.0e}"
+    return values, objective, residuals, Bound(objective - residuals.complementarity * (1.0 + abs(objective)), proved,
+                                               "convex optimality conditions", reason)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a formulation ended with.
+
+    Attributes:
+        model: the model, or None where no programme had a point.
+        solution: the last solution.
+        program: the last programme.
+        steps: every (name, solution) on the way; one entry for a plain programme.
+    """
+
+    model: Any
+    solution: Solution
+    program: Program
+    steps: tuple[tuple[str, Solution], ...]
+
+
+def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
+    """Solve a programme, or drive a procedure that yields programmes, with one solver.
+
+    Args:
+        problem: a `Program`, or a generator that yields programmes, receives their solutions and returns the model.
+        solver: as in `solve`.
+        settings: as in `solve`.
+    """
+    if isinstance(problem, Program):
+        solution = solve(problem, solver, **settings)
+        model = problem.recover(solution.values) if solution.has_point else None
+        return Outcome(model, solution, problem, ((problem.name, solution),))
+    steps: list[tuple[str, Solution]] = []
+    program = next(problem)
+    while True:
+        solution = solve(program, solver, **settings)
+        steps.append((program.name, solution))
+        try:
+            program_next = problem.send(solution)
+        except StopIteration as stop:
+            return Outcome(stop.value, solution, program, tuple(steps))
+        program = program_next
