@@ -1,0 +1,159 @@
+"""Channels: their names and units, what they look like, and the way back to raw units."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.errors import DataError
+
+MOST_LEVELS = 1000
+"""Counting of distinct values stops here: above it a channel counts as continuous."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Affine maps back to the units of the source: raw = value * scale + offset, one pair per channel.
+
+    Attributes:
+        u_scale: one positive factor per input.
+        u_offset: one offset per input, in raw units.
+        y_scale: one positive factor per output.
+        y_offset: one offset per output, in raw units.
+    """
+
+    u_scale: tuple[float, ...]
+    u_offset: tuple[float, ...]
+    y_scale: tuple[float, ...]
+    y_offset: tuple[float, ...]
+
+    @classmethod
+    def identity(cls, m: int, l: int) -> "Transform":  # noqa: E741 - l is the field's letter for outputs
+        """Return the transform of data that were never changed, for m inputs and l outputs."""
+        return cls((1.0,) * m, (0.0,) * m, (1.0,) * l, (0.0,) * l)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether the data are in raw units."""
+        return self == Transform.identity(len(self.u_scale), len(self.y_scale))
+
+    def raw_u(self, u: np.ndarray) -> np.ndarray:
+        """Return inputs (..., m) in raw units."""
+        return u * np.array(self.u_scale) + np.array(self.u_offset)
+
+    def raw_y(self, y: np.ndarray) -> np.ndarray:
+        """Return outputs (..., l) in raw units."""
+        return y * np.array(self.y_scale) + np.array(self.y_offset)
+
+    def apply_u(self, raw: np.ndarray) -> np.ndarray:
+        """Return raw inputs (..., m) in the units of the data; the inverse of `raw_u`."""
+        return (raw - np.array(self.u_offset)) / np.array(self.u_scale)
+
+    def apply_y(self, raw: np.ndarray) -> np.ndarray:
+        """Return raw outputs (..., l) in the units of the data; the inverse of `raw_y`."""
+        return (raw - np.array(self.y_offset)) / np.array(self.y_scale)
+
+    def before(self, scale: np.ndarray, shift: np.ndarray) -> "Transform":
+        """Return the transform of new data where old = new * scale + shift, inputs first, then outputs."""
+        m = len(self.u_scale)
+        old_scale, old_offset = np.array(self.u_scale + self.y_scale), np.array(self.u_offset + self.y_offset)
+        gain, offset = (scale * old_scale).tolist(), (shift * old_scale + old_offset).tolist()
+        return Transform(tuple(gain[:m]), tuple(offset[:m]), tuple(gain[m:]), tuple(offset[m:]))
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What one channel looks like over all experiments; missing samples do not count.
+
+    Attributes:
+        name: name of the channel.
+        unit: its unit, or "".
+        role: "input" or "output".
+        low: smallest sample.
+        high: largest sample.
+        mean: mean of the samples.
+        std: standard deviation of the samples.
+        levels: number of distinct values; counting stops above `MOST_LEVELS`.
+        missing: share of missing samples, 0 to 1.
+    """
+
+    name: str
+    unit: str
+    role: str
+    low: float
+    high: float
+    mean: float
+    std: float
+    levels: int
+    missing: float
+
+    @classmethod
+    def of(cls, x: np.ndarray, name: str, unit: str, role: str) -> "Channel":
+        """Summarise the samples x (N,); the figures are NaN where every sample is missing."""
+        here = x[~np.isnan(x)]
+        figures = (here.min(), here.max(), here.mean(), here.std()) if here.size else (np.nan,) * 4
+        return cls(name, unit, role, *map(float, figures), count_levels(here), 1.0 - here.size / x.size)
+
+
+def count_levels(x: np.ndarray, most: int = MOST_LEVELS) -> int:
+    """Count the distinct values of x (N,); counting stops above `most`, so that long records stay cheap."""
+    seen = np.empty(0)
+    for first in range(0, x.size, 65536):
+        seen = np.union1d(seen, x[first : first + 65536])
+        if seen.size > most:
+            break
+    return int(seen.size)
+
+
+def listed(names: str | Sequence[str] | None) -> list[str] | None:
+    """Return one name or several as a list; None stays None."""
+    return [names] if isinstance(names, str) else None if names is None else list(names)
+
+
+def channel_names(given: str | Sequence[str] | None, letter: str, count: int, what: str) -> tuple[str, ...]:
+    """Return one name per channel, the default being the letter, numbered from 1 when there are several.
+
+    Raises:
+        DataError: wrong number of names, or an empty one; `what` names the argument.
+    """
+    names = listed(given)
+    if names is None:
+        return (letter,) if count == 1 else tuple(f"{letter}{c + 1}" for c in range(count))
+    if len(names) != count or not all(isinstance(name, str) and name for name in names):
+        raise DataError(f"{what} {names}: one non-empty name for each of the {count} channels is needed.")
+    return tuple(names)
+
+
+def channel_units(given: str | Sequence[str] | None, count: int, what: str) -> tuple[str, ...]:
+    """Return one unit per channel, "" when not given.
+
+    Raises:
+        DataError: wrong number of units; `what` names the argument.
+    """
+    units = listed(given) or [""] * count
+    if len(units) != count:
+        raise DataError(f"{what} {units}: one unit for each of the {count} channels is needed.")
+    return tuple(str(unit) for unit in units)
+
+
+def check_distinct(names: Sequence[str]) -> None:
+    """Refuse two channels of one name.
+
+    Raises:
+        DataError: names the name.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
+
+
+def sampling_time(dt: Any) -> float:
+    """Return dt as a float.
+
+    Raises:
+        DataError: dt is not a positive number.
+    """
+    if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
+        raise DataError(f"dt = {dt!r}: the sampling time is a positive number.")
+    return float(dt)
