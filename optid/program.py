@@ -119,6 +119,8 @@ class Program:
         view: the expressions constraints may speak about.
         structural: names of constraints that belong to the formulation.
         parameters: {name: CVXPY parameter} that may change between solves without recompiling.
+        derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
+            variables; they are recomputed at every point before it is judged.
         rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
         certify: (program, values, duals) -> (Bound, better values or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
@@ -134,6 +136,7 @@ class Program:
     view: View
     structural: frozenset[str] = frozenset()
     parameters: Mapping[str, cp.Parameter] = field(default_factory=dict)
+    derived: Mapping[str, cp.Expression] = field(default_factory=dict)
     rank_one: RankOneForm | None = None
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
@@ -248,6 +251,7 @@ class Program:
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, rank_one=None, certify=None,
+                       derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
     def soften(self, name: str, weight: float) -> "Program":
@@ -280,9 +284,27 @@ class Program:
         return replace(self, constraints={k: g for k, g in self.constraints.items() if k not in names})
 
     def assign(self, values: Values) -> None:
-        """Write values into the CVXPY variables; variables that are not named keep what they had."""
+        """Write values into the CVXPY variables and recompute the derived ones."""
         for name, value in values.items():
             self.variables[name].value = np.asarray(value, dtype=float).reshape(self.variables[name].shape, order="F")
+        for name, expression in self.derived.items():
+            self.variables[name].value = np.asarray(expression.value)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Return a copy of what the CVXPY variables hold, without variables that hold nothing."""
+        return {name: np.array(v.value, dtype=float) for name, v in self.variables.items() if v.value is not None}
+
+    def duals(self) -> dict[str, np.ndarray]:
+        """Return the multipliers the constraints hold: {name: flat array over the members of the group}.
+
+        Names whose constraints hold no multiplier are absent.
+        """
+        found = {}
+        for name, group in self.constraints.items():
+            parts = [d.value for member in group for d in member.dual_variables]
+            if parts and all(part is not None for part in parts):
+                found[name] = np.concatenate([np.ravel(part, order="F") for part in parts]).astype(float)
+        return found
 
     def clear_duals(self) -> None:
         """Forget the multipliers of an earlier solve, so that they cannot be mistaken for new ones."""
