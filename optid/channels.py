@@ -92,8 +92,10 @@ class Channel:
     def of(cls, x: np.ndarray, name: str, unit: str, role: str) -> "Channel":
         """Summarise the samples x (N,); the figures are NaN where every sample is missing."""
         here = x[~np.isnan(x)]
-        figures = (here.min(), here.max(), here.mean(), here.std()) if here.size else (np.nan,) * 4
-        return cls(name, unit, role, *map(float, figures), count_levels(here), 1.0 - here.size / x.size)
+        if not here.size:
+            return cls(name, unit, role, np.nan, np.nan, np.nan, np.nan, 0, 1.0)
+        low, high, mean, std = float(here.min()), float(here.max()), float(here.mean()), float(here.std())
+        return cls(name, unit, role, low, high, mean, std, count_levels(here), 1.0 - here.size / x.size)
 
 
 def count_levels(x: np.ndarray, most: int = MOST_LEVELS) -> int:
@@ -111,6 +113,11 @@ def listed(names: str | Sequence[str] | None) -> list[str] | None:
     return [names] if isinstance(names, str) else None if names is None else list(names)
 
 
+def numbered_names(letter: str, count: int) -> tuple[str, ...]:
+    """Return the letter alone for one channel, numbered from 1 for several."""
+    return (letter,) if count == 1 else tuple(f"{letter}{c + 1}" for c in range(count))
+
+
 def channel_names(given: str | Sequence[str] | None, letter: str, count: int, what: str) -> tuple[str, ...]:
     """Return one name per channel, the default being the letter, numbered from 1 when there are several.
 
@@ -119,7 +126,7 @@ def channel_names(given: str | Sequence[str] | None, letter: str, count: int, wh
     """
     names = listed(given)
     if names is None:
-        return (letter,) if count == 1 else tuple(f"{letter}{c + 1}" for c in range(count))
+        return numbered_names(letter, count)
     if len(names) != count or not all(isinstance(name, str) and name for name in names):
         raise DataError(f"{what} {names}: one non-empty name for each of the {count} channels is needed.")
     return tuple(names)

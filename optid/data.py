@@ -15,7 +15,6 @@ from optid.channels import (
     channel_names,
     channel_units,
     check_distinct,
-    count_levels,
     listed,
     sampling_time,
 )
@@ -109,11 +108,13 @@ class Data:
         ys = _as_records(y, "y", listed(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
-        starts = [float(s) for s in np.broadcast_to(np.asarray(start, dtype=float), len(us))]
+        starts = np.atleast_1d(np.asarray(start, dtype=float))
+        if starts.shape not in ((1,), (len(us),)) or not np.isfinite(starts).all():
+            raise DataError(f"start = {start!r}: one finite time, or one for each of the {len(us)} experiments.")
         experiments = []
-        for k, (ue, ye, s) in enumerate(zip(us, ys, starts)):
+        for k, (ue, ye, s) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)))):
             try:
-                experiments.append(Experiment(ue, ye, s))
+                experiments.append(Experiment(ue, ye, float(s)))
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
         m, l = us[0].shape[1], ys[0].shape[1]  # noqa: E741
