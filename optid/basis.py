@@ -1,0 +1,251 @@
+"""What every basis of a static nonlinearity offers, and the rules all of them share.
+
+A basis spans f(u) = eta(u)^T mu and never contains the constant function: hats and cosines contain it, and then the
+regressor matrix of a model with two or more numerator lags is singular whatever the data. The model carries one offset.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, Protocol, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from optid.errors import DataError, StructureError
+
+Array = NDArray[np.float64]
+Outside = Literal["clamp", "extrapolate", "error"]
+OUTSIDE = ("clamp", "extrapolate", "error")
+
+
+class Basis(Protocol):
+    """A family of P functions eta(u) without the constant, on an interval of the input.
+
+    A frozen dataclass that inherits from it supplies `full_size`, `local`, `slopes`, `penalty` and `to_dict`, and
+    better shape matrices where it has them.
+
+    Attributes:
+        interval: (lower, upper) in units of the input; None until `fitted`.
+        outside: what happens beyond the interval: "clamp" (f stays at its end value), "extrapolate" or "error".
+        size: number P of functions.
+        full_size: number of functions of the complete family that `local` evaluates.
+        contrast: (full_size, P) matrix T with values(u) = complete(u) @ T.
+        shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient.
+    """
+
+    @property
+    def interval(self) -> tuple[float, float] | None: ...  # noqa: D102
+    @property
+    def outside(self) -> Outside: ...  # noqa: D102
+    @property
+    def full_size(self) -> int: ...  # noqa: D102
+    @property
+    def shape_exact(self) -> bool:
+        """True when the shape rows are necessary and sufficient on the whole interval."""
+        return False
+
+    @property
+    def dropped(self) -> int | None:
+        """Index of the function left out of a complete family that sums to one; None when nothing is redundant."""
+        return None
+
+    @property
+    def size(self) -> int:
+        """Number P of functions, the constant excluded."""
+        return self.full_size - (self.dropped is not None)
+
+    @property
+    def contrast(self) -> Array:
+        """(full_size, P) matrix T with values(u) = complete(u) @ T; the identity where nothing is redundant."""
+        return self._reduced(np.eye(self.full_size))
+
+    def fitted(self, lo: float, hi: float) -> Self:
+        """Return the same basis on [lo, hi], or itself when it already has an interval.
+
+        Raises:
+            DataError: when hi <= lo, as for a constant input.
+        """
+        if self.interval is not None:
+            return self
+        if not (np.isfinite(lo) and np.isfinite(hi)):
+            raise DataError(f"The range of the input is [{lo}, {hi}]: it needs finite samples.")
+        if hi <= lo:
+            raise DataError(
+                f"The input is constant at {lo:g}: a nonlinearity cannot be identified from it. "
+                "Use a record in which the input moves, or give the basis its interval."
+            )
+        return replace(cast(Any, self), interval=(float(lo), float(hi)))
+
+    def mapped(self, scale: float, offset: float) -> tuple["Basis", Array, Array]:
+        """Express the basis in the units v = scale * u + offset.
+
+        Returns:
+            (basis in v, matrix M (P, P), constant c (P,)) with eta(u) = eta_v(v) @ M + c, inside and outside.
+
+        Raises:
+            StructureError: when scale <= 0.
+        """
+        if not scale > 0:
+            raise StructureError(f"A change of units needs a positive scale; got {scale!r}.")
+        lo, hi = span(self)
+        new = replace(cast(Any, self), interval=(scale * lo + offset, scale * hi + offset))
+        if new.dropped == self.dropped:
+            return new, np.eye(self.size), np.zeros(self.size)
+        lost = self.contrast[new.dropped]
+        return new, np.delete(self.contrast - lost, new.dropped, axis=0), lost
+
+    def local(self, u: ArrayLike) -> tuple[NDArray[np.int32], Array]:
+        """Evaluate the complete family where it does not vanish.
+
+        Args:
+            u: (N,) input; NaN is a missing sample and gets weights 0 at position 0.
+
+        Returns:
+            first (N,), weights (N, s): function first[k] + i of the complete family has the value weights[k, i].
+        """
+        ...
+
+    def values(self, u: ArrayLike) -> Array:
+        """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN.
+
+        Raises:
+            DataError: outside="error" and a sample lies outside the interval.
+            StructureError: the basis has no interval yet.
+        """
+        u = samples(u)
+        first, weights = self.local(u)
+        complete = np.zeros((u.size, self.full_size))
+        columns = first[:, None] + np.arange(weights.shape[1])
+        np.put_along_axis(complete, columns, weights, axis=1)
+        complete[np.isnan(u)] = np.nan
+        return self._reduced(complete)
+
+    def slopes(self, u: ArrayLike) -> Array:
+        """Evaluate d eta / du, (N, P); zero where the value is clamped, the slope to the right at kinks."""
+        ...
+
+    def increments(self) -> Array:
+        """(r, P): all rows @ mu >= 0 makes f nondecreasing; here the steps of f between points of `grid`."""
+        return np.diff(self.values(self.grid()), axis=0)
+
+    def slope_rows(self) -> Array:
+        """(r, P): bounds on all rows @ mu bound the slope of f; here the slopes at the points of `grid`."""
+        return self.slopes(self.grid())
+
+    def curvature(self) -> Array:
+        """(r, P): all rows @ mu >= 0 makes f convex; here second differences at the points of `grid`."""
+        points = self.grid()
+        return np.diff(self.values(points), n=2, axis=0) / (points[1] - points[0]) ** 2
+
+    def penalty(self, order: int = 2) -> Array:
+        """(P, P) psd matrix of the integral of (f^(order))^2 over the interval, order 1 or 2.
+
+        Where that derivative does not exist as a function, differences take its place.
+        """
+        ...
+
+    def value_rows(self, points: ArrayLike) -> Array:
+        """(len(points), P): rows @ mu are the values of f at the points."""
+        return self.values(points)
+
+    def grid(self, n: int = 201) -> Array:
+        """(n,) points that cover the interval evenly."""
+        return np.linspace(*span(self), n)
+
+    def n_outside(self, u: ArrayLike) -> int:
+        """Count the samples of u (N,) that lie outside the interval (none when there is no interval)."""
+        return 0 if self.interval is None else int(beyond(samples(u), self.interval).sum())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the basis in JSON types; `optid.bases.from_dict` is the inverse."""
+        ...
+
+    def _reduced(self, complete: Array) -> Array:
+        """Multiply the complete family by the contrast: remove the column that is redundant."""
+        return complete if self.dropped is None else np.delete(complete, self.dropped, axis=1)
+
+
+def samples(u: ArrayLike) -> Array:
+    """Return u as (N,) float64, or refuse its shape."""
+    array = np.asarray(u, dtype=float)
+    if array.ndim != 1:
+        raise DataError(f"A basis is evaluated on one channel, an array (N,); got shape {array.shape}.")
+    return array
+
+
+def check_interval(interval: tuple[float, float] | None, outside: str) -> None:
+    """Refuse an empty interval and an unknown rule for values outside it."""
+    if outside not in OUTSIDE:
+        raise StructureError(f"outside={outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
+    if interval is None:
+        return
+    if len(interval) != 2 or not np.all(np.isfinite(interval)):
+        raise StructureError(f"interval={interval!r}: give two finite numbers (lower, upper).")
+    if interval[1] <= interval[0]:
+        raise StructureError(f"interval={interval!r} is empty: the upper end must exceed the lower end.")
+
+
+def check_count(p: int, smallest: int, meaning: str) -> None:
+    """Refuse a number of functions or cells that is not an integer >= smallest."""
+    if isinstance(p, bool) or not isinstance(p, (int, np.integer)) or p < smallest:
+        raise StructureError(f"The number of {meaning} must be an integer >= {smallest}; got {p!r}.")
+
+
+def span(basis: Basis) -> tuple[float, float]:
+    """Return the interval of a basis, or refuse when it has none yet."""
+    if basis.interval is None:
+        raise StructureError(
+            f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give interval=(lower, upper)."
+        )
+    return basis.interval
+
+
+def beyond(u: Array, interval: tuple[float, float]) -> NDArray[np.bool_]:
+    """Mark samples outside the interval; a change of units may move an end by a few ulp, which does not count."""
+    lo, hi = interval
+    slack = 1e-12 * max(abs(lo), abs(hi))
+    return (u < lo - slack) | (u > hi + slack)
+
+
+def brought_inside(u: Array, interval: tuple[float, float], outside: Outside) -> Array:
+    """Apply the rule for values outside the interval; NaN stays NaN."""
+    if outside == "extrapolate":
+        return u
+    if outside == "error":
+        out = beyond(u, interval)
+        if out.any():
+            k = int(np.argmax(out))
+            raise DataError(
+                f"Sample {k} of the input is {u[k]:g}, outside the interval [{interval[0]:g}, {interval[1]:g}] of the "
+                f"basis ({int(out.sum())} such samples). Use data inside it, or outside='clamp' or 'extrapolate'."
+            )
+    return np.clip(u, *interval)
+
+
+def frozen_outside(slopes: Array, u: Array, interval: tuple[float, float], outside: Outside) -> Array:
+    """Set the slopes of clamped samples to zero; NaN rows for missing samples."""
+    if outside == "clamp":
+        slopes[(u < interval[0]) | (u > interval[1])] = 0.0
+    slopes[np.isnan(u)] = np.nan
+    return slopes
+
+
+def integral_of_squares(derivative: Callable[[Array], Array], edges: Array, nodes: int) -> Array:
+    """Integrate derivative(u)^T derivative(u) over the cells between edges by Gauss-Legendre quadrature.
+
+    Args:
+        derivative: maps points (n,) to rows (n, P).
+        edges: (c + 1,) increasing ends of the cells.
+        nodes: points per cell; exact for products of degree 2 nodes - 1.
+    """
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    half = np.diff(edges)[:, None] / 2
+    points = ((edges[:-1] + edges[1:])[:, None] / 2 + half * x).ravel()
+    rows = derivative(points)
+    return rows.T @ ((half * w).ravel()[:, None] * rows)
+
+
+def check_order(order: int) -> None:
+    """Refuse a penalty order other than 1 or 2."""
+    if order not in (1, 2):
+        raise StructureError(f"penalty(order={order!r}): the order is 1 (slope) or 2 (curvature).")
