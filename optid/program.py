@@ -125,6 +125,8 @@ class Program:
         certify: (program, values, duals) -> (Bound, better values or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
+        compressed: the compressed data the programme was built from, for uncertainty and figures; its class belongs
+            to the formulation.
     """
 
     name: str
@@ -141,6 +143,7 @@ class Program:
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
     note: str = ""
+    compressed: Any = field(default=None, repr=False)
 
     @cached_property
     def problem(self) -> cp.Problem:

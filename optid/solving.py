@@ -135,6 +135,25 @@ def _proof(program: Program, values: Values, duals: Values, objective: float, re
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What a procedure returns when its objective is not that of its last programme.
+
+    Attributes:
+        model: the model.
+        objective: value of the procedure's own objective.
+        bound: bound on that objective, with the reason where there can be none.
+        status: status of the procedure as a whole.
+        reason: one sentence for people.
+    """
+
+    model: Any
+    objective: float
+    bound: Bound
+    status: Status
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What a formulation ended with.
 
@@ -171,5 +190,10 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         try:
             program_next = problem.send(solution)
         except StopIteration as stop:
+            if isinstance(stop.value, Evidence):
+                found = stop.value
+                solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
+                                   reason=found.reason)
+                return Outcome(found.model, solution, program, tuple(steps))
             return Outcome(stop.value, solution, program, tuple(steps))
         program = program_next

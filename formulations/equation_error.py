@@ -1,0 +1,296 @@
+"""The compressed equation-error least squares that the ARX-type formulations share.
+
+``A(q) y = sum_c B_c(q) f_c(u_c) + d + e`` is linear in ``z = [vec a; offset; vec Theta_1; ...]`` with
+``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from optid.bases import parse
+from optid.basis import Basis
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.models import HammersteinARX, Nonlinearity
+from optid.program import Program, View
+from optid.rank_one import Block, RankOne
+from optid.streams import Stream
+from optid.regressors import Layout, Statistics, collect
+
+
+@dataclass(frozen=True)
+class EquationError:
+    """Least squares in z with the names needed to read it.
+
+    Attributes:
+        statistics: what one pass over the record left.
+        problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
+        meta: dt, names and units for the model.
+    """
+
+    statistics: Statistics
+    problem: RankOne
+    meta: Mapping[str, Any]
+
+    @property
+    def layout(self) -> Layout:
+        """Column layout of the regressor."""
+        return self.statistics.layout
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.layout.inputs
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.layout.outputs)
+
+    def key(self, name: str, channel: int) -> str:
+        """Name of a per-channel variable: plain with one input, ``name[input]`` with several."""
+        return name if len(self.channels) == 1 else f"{name}[{self.channels[channel]}]"
+
+    def linear_variables(self) -> dict[str, cp.Variable]:
+        """Return new CVXPY variables ``a`` ((na,) or (l, na l) = [A_1 .. A_na]) and ``offset`` (l,)."""
+        l, na = self.outputs, self.layout.na
+        found = {}
+        if na:
+            found["a"] = cp.Variable(na if l == 1 else (l, na * l), name="a")
+        found["offset"] = cp.Variable(l, name="offset")
+        return found
+
+    def b_shape(self, channel: int) -> tuple[int, ...]:
+        """Shape of b: (nb,) with one output, (nb, l) with several."""
+        nb = self.layout.nb[channel]
+        return (nb,) if self.outputs == 1 else (nb, self.outputs)
+
+    def residual(self, linear: Mapping[str, cp.Expression], thetas: Sequence[cp.Expression]) -> cp.Expression:
+        """Return ``R z - s`` for given linear variables and matrices Theta_c (P_c, nb_c l)."""
+        parts = [flat(linear[name]) for name in ("a", "offset") if name in linear] + [flat(t) for t in thetas]
+        return self.problem.root @ cp.hstack(parts) - self.problem.target
+
+    def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
+        """Return what constraints may speak about."""
+        return View(expressions, kind=kind, channels=self.channels,
+                    bases=dict(zip(self.channels, self.layout.bases)), gauge=gauge)
+
+    def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
+        """Split the linear part of z into values of ``a`` and ``offset``."""
+        l, na = self.outputs, self.layout.na
+        found = {"offset": np.array(w[na * l * l :])}
+        if na:
+            found["a"] = np.array(w[:na]) if l == 1 else np.reshape(w[: na * l * l], (l, na * l), order="F")
+        return found
+
+    def matrices(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Return Theta_c (P_c, nb_c l) of every input, whatever variables the formulation uses."""
+        found = []
+        for c, block in enumerate(self.problem.blocks):
+            theta, mu, b = (values.get(self.key(name, c)) for name in ("Theta", "mu", "b"))
+            if theta is None:
+                theta = np.outer(np.ones(1) if mu is None else mu, np.ravel(np.asarray(b), order="F"))
+            found.append(np.reshape(theta, (block.rows, block.cols)))
+        return found
+
+    def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the coefficients (n_columns, l) of the regressor's columns in the order of the layout."""
+        l, na = self.outputs, self.layout.na
+        theta = np.zeros((self.layout.n_columns, l))
+        if na:
+            theta[: na * l] = np.reshape(values["a"], (l, na * l), order="F" if l > 1 else "C").T
+        for c, matrix in enumerate(self.matrices(values)):
+            theta[self.layout.block(c)] = matrix.reshape(-1, l, order="F")
+        theta[-1] = values["offset"]
+        return theta
+
+    def one_step_fit(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the one-step fit in % of every output over the rows used, from the statistics alone."""
+        n, root = self.layout.n_columns, self.statistics.root
+        theta, found = self.regression(values), []
+        for o in range(self.outputs):
+            column = root[:, n + o]
+            rest = float(np.sum((root[:n, :n] @ theta[:, o] - column[:n]) ** 2) + np.sum(column[n:] ** 2))
+            total = float(np.sum(column**2)) - float(root[:n, n - 1] @ column[:n]) ** 2 / self.statistics.rows
+            found.append(100.0 * (1.0 - np.sqrt(rest / total)) if total > 0 else np.nan)
+        return np.array(found)
+
+    def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
+              gauge: str, flip: bool = True) -> HammersteinARX:
+        """Build the model from one (mu, b) per input, b of shape `b_shape`.
+
+        Args:
+            values: holds ``a`` and ``offset``.
+            mus: coefficients of the nonlinearities, one array per input.
+            bs: numerator coefficients, one array per input.
+            gauge: the gauge to report in.
+            flip: make the first non-zero of every b positive.
+        """
+        l, na = self.outputs, self.layout.na
+        a = np.asarray(values.get("a", np.zeros(0)))
+        if l > 1:
+            a = np.stack([a[:, i * l : (i + 1) * l] for i in range(na)]) if na else np.zeros((0, l, l))
+        signs = [leading_sign(b) if flip else 1.0 for b in bs]
+        model = HammersteinARX(
+            a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
+            nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
+                                 for s, basis, mu in zip(signs, self.layout.bases, mus)),
+            nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), gauge=gauge, **self.meta)
+        return model
+
+
+def flat(expression: cp.Expression) -> cp.Expression:
+    """Stack the columns of an expression."""
+    return expression if expression.ndim == 1 else cp.vec(expression, order="F")
+
+
+def leading_sign(b: np.ndarray) -> float:
+    """Sign of the first entry that is not negligible."""
+    entries = np.ravel(b, order="F")
+    large = np.flatnonzero(np.abs(entries) > 1e-12 * max(float(np.max(np.abs(entries), initial=0.0)), 1e-300))
+    return float(np.sign(entries[large[0]])) if large.size else 1.0
+
+
+def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
+             basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
+             weights: Sequence[np.ndarray] | None = None) -> EquationError:
+    """Read the record once and return the compressed problem.
+
+    Args:
+        data: the record.
+        na: order of A; nb: number of numerator coefficients per input; nk: delay per input.
+        basis: one basis for all inputs or one per input; a basis without interval takes the range of its input.
+        ridge: weight of ``‖Theta‖²``.
+        curvature: weight of the integral of ``f''²`` summed over the columns of Theta.
+        weights: nonnegative row weights per experiment, or None.
+
+    Raises:
+        StructureError: impossible orders.
+        RankError: the record does not determine the parameters.
+    """
+    inputs, outputs = data.inputs, data.outputs
+    nbs = per_channel("nb", nb, inputs, low=1)
+    nks = per_channel("nk", nk, inputs, low=0)
+    if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
+        raise StructureError(f"na is the number of past outputs, a whole number from 0; got {na!r}")
+    bases = fitted_bases(data, basis)
+    layout = Layout(na=int(na), nb=nbs, nk=nks, bases=bases, outputs=tuple(outputs), inputs=tuple(inputs))
+    if ridge < 0 or curvature < 0:
+        raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
+    statistics = collect(data, layout, weights=weights)
+    return EquationError(statistics, lifted_problem(statistics, ridge, curvature), model_meta(data))
+
+
+def model_meta(data: Data | Stream) -> dict[str, Any]:
+    """Names, units and sampling time that a model carries."""
+    return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
+            "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
+            "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
+
+
+def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
+    """Expand a scalar to one whole number per input and check it."""
+    values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
+    if len(values) != len(inputs):
+        raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
+    for channel, entry in zip(inputs, values):
+        if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or entry < low:
+            raise StructureError(f"{name} of input {channel!r} must be a whole number from {low}; got {entry!r}")
+    return tuple(int(v) for v in values)
+
+
+def fitted_bases(data: Data | Stream, basis: Basis | str | Sequence[Basis | str]) -> tuple[Basis, ...]:
+    """Return one basis per input, with its interval set from the record where the user gave none."""
+    several = list(basis) if isinstance(basis, list | tuple) else [basis] * len(data.inputs)
+    if len(several) != len(data.inputs):
+        raise StructureError(f"{len(several)} bases for {len(data.inputs)} inputs ({', '.join(data.inputs)})")
+    low, high = input_ranges(data)
+    fitted = []
+    for channel, one, lo, hi in zip(data.inputs, several, low, high):
+        one = parse(one) if isinstance(one, str) else one
+        if not np.isfinite(lo):
+            raise DataError(f"input {channel!r} has no sample at all")
+        if lo == hi and one.interval is None:
+            raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
+                            "excite the input or drop the channel")
+        fitted.append(one.fitted(float(lo), float(hi)))
+    return tuple(fitted)
+
+
+def input_ranges(data: Data | Stream) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest sample of every input over all experiments."""
+    if isinstance(data, Stream):
+        return data.ranges()
+    stacked = [e.u for e in data.experiments]
+    empty = np.array([all(np.all(np.isnan(u[:, c])) for u in stacked) for c in range(data.m)])
+    pick: Callable[[Any], np.ndarray] = lambda f: np.array(  # noqa: E731
+        [np.nan if empty[c] else f([f(u[:, c][~np.isnan(u[:, c])]) for u in stacked if not np.all(np.isnan(u[:, c]))])
+         for c in range(data.m)])
+    return pick(np.min), pick(np.max)
+
+
+def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> RankOne:
+    """Order the triangular system of the statistics by z and add the quadratic penalties on Theta."""
+    layout, l = statistics.layout, len(statistics.layout.outputs)
+    n, na = layout.n_columns, layout.na
+    sizes = [b.size for b in layout.bases]
+    blocks = tuple(Block(p, q * l) for p, q in zip(sizes, layout.nb))
+    linear = na * l * l + l
+    total = linear + sum(p * q for p, q in zip(sizes, layout.nb)) * l
+    where = np.zeros((l, n), dtype=int)
+    for o in range(l):
+        where[o, : na * l] = np.arange(na * l) * l + o
+        where[o, n - 1] = na * l * l + o
+        position = linear
+        for c, (p, q) in enumerate(zip(sizes, layout.nb)):
+            where[o, layout.block(c)] = position + o * p * q + np.arange(p * q)
+            position += p * q * l
+    root = statistics.root
+    system = np.zeros((l * n + (total - linear if ridge else 0), total + 1))
+    remainder = 0.0
+    for o in range(l):
+        rows = slice(o * n, (o + 1) * n)
+        system[rows, where[o]] = root[:n, :n]
+        system[rows, -1] = root[:n, n + o]
+        remainder += float(np.sum(root[n:, n + o] ** 2))
+    if ridge:
+        system[l * n :, linear:-1] = np.sqrt(ridge) * np.eye(total - linear)
+    if curvature:
+        extra = np.zeros((total - linear, total + 1))
+        position = linear
+        for block, basis in zip(blocks, layout.bases):
+            factor = _square_root(np.asarray(basis.penalty(2)))
+            for _ in range(block.cols):
+                span = slice(position, position + block.rows)
+                extra[position - linear : position - linear + block.rows, span] = np.sqrt(curvature) * factor
+                position += block.rows
+        system = np.vstack([system, extra])
+    triangle = np.linalg.qr(system, mode="r")
+    remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
+    scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(l)))
+    return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,
+                   blocks=blocks, scale=scale)
+
+
+def _square_root(matrix: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def residual_programme(problem: EquationError, name: str, variables: dict[str, cp.Variable],
+                       residual: cp.Expression, **parts: Any) -> Program:
+    """Assemble a programme ``minimise ‖r‖² + remainder (+ penalty)`` with the residual passed as a variable.
+
+    The remainder is kept in the objective, so that objectives and gaps are in units of the data.
+    """
+    r = cp.Variable(residual.size, name="residual")
+    penalty = parts.pop("penalty", 0.0)
+    constraints = {"residual": (r == residual,), **parts.pop("constraints", {})}
+    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + penalty)
+    return Program(name=name, objective=objective, constraints=constraints, variables={**variables, "residual": r},
+                   structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale, compressed=problem,
+                   **parts)

@@ -1,0 +1,231 @@
+"""Hammerstein-ARX: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + e`` with ``f_c = mu_cᵀ eta_c``.
+
+Three formulations of one problem (Luo, chapter 3; Bai 1998 for the over-parametrisation):
+
+* `exact`: the bilinear least-squares problem itself. Named variables: ``a``, ``b``, ``mu``, ``offset``, and the
+  expression ``Theta = mu bᵀ``.
+* `nuclear`: the rank constraint on Theta relaxed to a nuclear-norm penalty. Named variables: ``a``, ``Theta``,
+  ``offset``.
+* `overparametrised`: the rank constraint dropped, the rank-one factor split off afterwards (Algorithm 3.1). Named
+  variables as for `nuclear`.
+
+With several inputs the per-channel names carry the input, as in ``mu[valve]``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.equation_error import EquationError, compress, leading_sign, residual_programme
+from formulations.losses import with_loss
+from optid.basis import Basis
+from optid.data import Data
+from optid.errors import StructureError
+from optid.lifting import certify_nuclear, certify_rank_one
+from optid.models import HammersteinARX
+from optid.program import Program, RankOneForm, Values
+from optid.rank_one import split, starts
+from optid.streams import Stream
+from optid.solving import Procedure
+
+GAUGES = ("norm", "gain", "b0")
+
+
+def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
+          curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+    """Pose the bilinear least-squares problem ``min ‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
+
+    Args:
+        data: the record (or a stream larger than memory).
+        na: number of past outputs in A.
+        nb: number of coefficients of B, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (reweighted passes; no proof).
+        ridge: weight of ``‖mu‖² ‖b‖²``.
+        curvature: weight of ``‖b‖²`` times the integral of ``f''²``.
+        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+
+    Returns:
+        The programme, or a procedure of reweighted programmes for a loss other than squares.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge, constraints that do not fit.
+        RankError: the record does not determine the parameters.
+    """
+    if gauge not in GAUGES:
+        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    options = {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature}
+
+    def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
+        problem = compress(data, weights=weights, **options)
+        return _exact(problem, constraints, gauge), problem
+
+    return with_loss(loss, data, pose, convex=False)
+
+
+def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Program:
+    linear = problem.linear_variables()
+    variables, expressions = dict(linear), dict(linear)
+    thetas, gauges, blocks, start = [], [], [], {}
+    point = starts(problem.problem, count=1)[0]
+    start.update(problem.linear_part(point.w))
+    for c in range(len(problem.channels)):
+        names = problem.key("mu", c), problem.key("b", c)
+        mu = cp.Variable(problem.layout.bases[c].size, name=names[0])
+        b = cp.Variable(problem.b_shape(c), name=names[1])
+        theta = cp.outer(mu, cp.vec(b, order="F") if b.ndim == 2 else b)
+        gauges.append(_gauge(gauge, b, linear.get("a"), problem))
+        blocks.append(names)
+        thetas.append(theta)
+        variables.update({names[0]: mu, names[1]: b})
+        expressions.update({names[0]: mu, names[1]: b, problem.key("Theta", c): theta})
+        values = to_gauge(gauge, point.mus[c], point.bs[c].reshape(b.shape, order="F"), start.get("a"))
+        start.update(dict(zip(names, values)))
+    program = residual_programme(
+        problem, "hammerstein_arx.exact", variables, problem.residual(linear, thetas),
+        constraints={"gauge": tuple(gauges)}, start=start, recover=lambda values: None,
+        view=problem.view(expressions, "exact", gauge),
+        rank_one=RankOneForm(problem.problem, tuple(linear), tuple(blocks), gauge),
+        certify=certify_rank_one)
+    program = program.subject_to(*constraints)
+    scaled = {v.id for mu, b in blocks for v in (variables[mu], variables[b])}
+    signed = any(v.id in scaled for group in program.user_constraints.values() for c in group for v in c.variables())
+
+    def recover(values: Values) -> HammersteinARX:
+        return problem.model(values, [values[mu] for mu, _ in blocks], [values[b] for _, b in blocks],
+                             gauge=gauge, flip=gauge == "norm" and not signed)
+
+    return replace(program, recover=recover)
+
+
+def _gauge(gauge: str, b: cp.Variable, a: cp.Variable | None, problem: EquationError) -> Any:
+    if gauge == "norm":
+        return cp.sum_squares(b) == 1
+    if gauge == "b0":
+        return (b[0] if b.ndim == 1 else b[0, 0]) == 1
+    if problem.outputs > 1:
+        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
+    return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
+
+
+def to_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Move the scale between mu and b so that b satisfies the gauge; ``mu bᵀ`` does not change.
+
+    Raises:
+        StructureError: the gauge cannot be reached (zero first coefficient or zero gain).
+    """
+    if gauge == "norm":
+        size = leading_sign(b) * float(np.linalg.norm(b))
+        if size == 0:
+            return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
+    else:
+        size = float(b.flat[0]) if gauge == "b0" else float(np.sum(b)) / (1 + float(np.sum(a if a is not None else 0)))
+        if abs(size) < 1e-9 * np.linalg.norm(b):
+            raise StructureError(f"gauge {gauge!r} cannot be reached: the quantity it sets to one is zero; use 'norm'")
+    return mu * size, b / size
+
+
+def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+            nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
+            ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+    """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
+
+    The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
+    shrinks Theta, so a rank-one answer is a start for `exact` rather than its solution.
+
+    Args:
+        data: the record.
+        na: number of past outputs in A.
+        nb: number of coefficients of B, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay in samples, one per input or one for all.
+        weight: weight of the penalty, in units of the objective per unit of Theta.
+        constraints: builders in the variables ``a``, ``Theta``, ``offset``.
+        loss: as in `exact`; the convex forms carry a dual bound.
+        ridge: weight of ``‖Theta‖²``.
+        curvature: weight of the integral of ``f''²``.
+        gauge: gauge of the reported model.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge, nonconvex constraints.
+        RankError: the record does not determine the parameters.
+    """
+    return _relaxed("hammerstein_arx.nuclear", data, constraints, loss, gauge, weight, "whitened",
+                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature})
+
+
+def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
+                     basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
+                     constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
+                     curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+    """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
+
+    Args:
+        data: the record.
+        na: number of past outputs in A.
+        nb: number of coefficients of B, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay in samples, one per input or one for all.
+        svd: "whitened" (in the Kronecker metric of the Gram matrix) or "plain" (as in the dissertation).
+        constraints: builders in the variables ``a``, ``Theta``, ``offset``.
+        loss: as in `exact`.
+        ridge: weight of ``‖Theta‖²``.
+        curvature: weight of the integral of ``f''²``.
+        gauge: gauge of the reported model.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge or split, nonconvex constraints.
+        RankError: the record does not determine the parameters.
+    """
+    if svd not in ("whitened", "plain"):
+        raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
+    return _relaxed("hammerstein_arx.overparametrised", data, constraints, loss, gauge, 0.0, svd,
+                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature})
+
+
+def _relaxed(name: str, data: Data | Stream, constraints: Sequence[Any], loss: str, gauge: str, weight: float,
+             svd: str, options: dict[str, Any]) -> Program | Procedure:
+    if gauge not in GAUGES:
+        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    if not weight >= 0:
+        raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
+
+    def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
+        problem = compress(data, weights=weights, **options)
+        return _matrix_programme(name, problem, constraints, gauge, weight, svd), problem
+
+    return with_loss(loss, data, pose, convex=True)
+
+
+def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[Any], gauge: str, weight: float,
+                      svd: str) -> Program:
+    linear = problem.linear_variables()
+    keys = [problem.key("Theta", c) for c in range(len(problem.channels))]
+    thetas = {key: cp.Variable((block.rows, block.cols), name=key)
+              for key, block in zip(keys, problem.problem.blocks)}
+    tau = cp.Parameter(nonneg=True, name="weight", value=float(weight))
+    penalty = 2 * tau * sum(cp.normNuc(t) for t in thetas.values()) if name.endswith("nuclear") else 0.0
+    program = residual_programme(
+        problem, name, {**linear, **thetas}, problem.residual(linear, list(thetas.values())), penalty=penalty,
+        start={}, recover=partial(_split_model, problem, keys, gauge, svd),
+        view=problem.view({**linear, **thetas}, "relaxed"),
+        parameters={"weight": tau} if name.endswith("nuclear") else {},
+        certify=partial(certify_nuclear, problem.problem) if name.endswith("nuclear") else None)
+    return program.subject_to(*constraints)
+
+
+def _split_model(problem: EquationError, keys: Sequence[str], gauge: str, svd: str, values: Values) -> HammersteinARX:
+    mus, bs = [], []
+    for c, key in enumerate(keys):
+        mu, b = split(problem.problem, c, np.asarray(values[key]), whitened=svd == "whitened")
+        mu, b = to_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"))
+        mus.append(mu)
+        bs.append(b)
+    return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")

@@ -1,0 +1,329 @@
+"""Own Gauss-Newton for rank-one least squares; with constraints its steps are QPs of the same layer.
+
+Without constraints the numbers are handled by `optid.rank_one`. With constraints every step minimises the quadratic
+model of the residual (with the exact second-order term of ``mu bᵀ`` where that is positive definite) subject to the
+programme's own convex constraints; constraints that are bilinear are linearised. The QP is compiled once: its matrix
+and right-hand side are parameters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+
+from optid.backends import Answer, BackEnd, Settings, find
+from optid.program import Program, RankOneForm
+from optid.rank_one import Point, RankOne, local_solution, starts
+from optid.solution import Status
+
+STEPS = 100
+CANDIDATES = 4  # different directions b that are tried, each with both signs, before the full steps
+
+
+def run(program: Program, settings: Settings) -> Answer:
+    """Solve a programme that carries a `RankOneForm`.
+
+    Options: ``inner`` (conic back end of the step QPs, default clarabel), ``starts`` (number of starts, default 8),
+    ``seed`` of the random ones.
+    """
+    form = program.rank_one
+    if form is None:
+        return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
+    options = dict(settings.options)
+    count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
+    if not program.user_constraints:
+        return _unconstrained(program, form, count, seed)
+    return _Constrained(program, form, settings, str(options.get("inner", "clarabel"))).solve(count, seed)
+
+
+def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
+    found = local_solution(form.problem, count=count, seed=seed)
+    values = to_values(program, form, found.point)
+    r = form.problem.root @ lifted(form.problem, found.point) - form.problem.target
+    duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
+    return Answer(Status.LOCAL if found.converged else Status.LIMIT,
+                  "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
+
+
+def lifted(problem: RankOne, point: Point) -> np.ndarray:
+    """Return z = [w; vec(mu_i b_iᵀ)]."""
+    return np.concatenate([point.w, *(np.kron(b, mu) for mu, b in zip(point.mus, point.bs))])
+
+
+def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
+    """Name the parts of a point, in the programme's gauge."""
+    values: dict[str, np.ndarray] = {}
+    position = 0
+    for name in form.linear:
+        variable = program.variables[name]
+        values[name] = np.reshape(point.w[position : position + variable.size], variable.shape, order="F")
+        position += variable.size
+    for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
+        size = _gauge_size(form.gauge, b, program.variables[b_name].shape, values.get("a"))
+        values[mu_name] = mu * size
+        values[b_name] = np.reshape(b / size, program.variables[b_name].shape, order="F")
+    return values
+
+
+def _gauge_size(gauge: str, b: np.ndarray, shape: tuple[int, ...], a: np.ndarray | None) -> float:
+    norm = float(np.linalg.norm(b))
+    if gauge == "norm":
+        size = norm
+    elif gauge == "b0":
+        size = float(b[0])
+    else:
+        size = float(np.sum(b)) / (1.0 + float(np.sum(a if a is not None else 0.0)))
+    if abs(size) <= 1e-12 * norm or norm == 0:
+        raise ValueError(f"gauge {gauge!r} cannot be reached at this point: the quantity it fixes is zero")
+    return size
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A compiled QP: minimise ``‖U x - t‖²`` over the programme's own variables and constraints."""
+
+    program: Program
+    matrix: cp.Parameter
+    target: cp.Parameter
+    pinned: tuple[cp.Parameter, ...] = ()
+    slopes: tuple[tuple[cp.Parameter, cp.Parameter, cp.Expression], ...] = ()
+
+
+class _Constrained:
+    """The constrained iteration on one programme."""
+
+    def __init__(self, program: Program, form: RankOneForm, settings: Settings, inner: str) -> None:
+        self.program, self.form, self.problem = program, form, form.problem
+        self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-9), warm=False)
+        names = [*form.linear, *(name for pair in form.blocks for name in pair)]
+        self.variables = [program.variables[name] for name in names]
+        self.names, self.size = names, sum(v.size for v in self.variables)
+        self.x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in self.variables])
+        self.linear = sum(program.variables[name].size for name in form.linear)
+
+    def solve(self, count: int, seed: int) -> Answer:
+        half, step = self._compile(pinned=True), self._compile(pinned=False)
+        points = self._candidates(count, seed)
+        tried = [t for t in (self._half_step(half, point) for point in points) if t is not None]
+        if not tried:
+            answer = self.inner.run(step.program, self.settings)
+            status = answer.status if answer.status in (Status.INFEASIBLE, Status.UNBOUNDED) else Status.FAILED
+            return Answer(status, f"the first step is {answer.word} (by {self.inner.name})")
+        tried.sort(key=lambda pair: pair[0])
+        best: Answer | None = None
+        value = np.inf
+        for _, x in tried[:2]:
+            answer, reached = self._iterate(step, x)
+            if answer is not None and (best is None or reached < value):
+                best, value = answer, reached
+        return best or Answer(Status.FAILED, f"the step QP failed (by {self.inner.name})")
+
+    # the compiled problems
+
+    def _compile(self, *, pinned: bool) -> _Step:
+        matrix = cp.Parameter((self.size, self.size), value=np.eye(self.size))
+        target = cp.Parameter(self.size, value=np.zeros(self.size))
+        r = cp.Variable(self.size)
+        constraints: dict[str, tuple] = {"model": (r == matrix @ self.x - target,)}
+        slopes = []
+        pins: list[cp.Parameter] = []
+        if pinned:
+            for _, name in self.form.blocks:
+                variable = self.program.variables[name]
+                pin = cp.Parameter(variable.shape, value=np.zeros(variable.shape))
+                pins.append(pin)
+                constraints[f"pinned {name}"] = (variable == pin,)
+        for name, group in self.program.constraints.items():
+            if name == "residual" or (pinned and name == "gauge"):
+                continue
+            members = []
+            for member in group:
+                if member.is_dcp():
+                    members.append(member)
+                    continue
+                slope = cp.Parameter((member.size, self.size), value=np.zeros((member.size, self.size)))
+                level = cp.Parameter(member.size, value=np.zeros(member.size))
+                expression = slope @ self.x + level
+                equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
+                members.append(expression == 0 if equal else expression <= 0)
+                slopes.append((slope, level, member.expr))
+            constraints[name] = tuple(members)
+        inner = Program("step", cp.Minimize(cp.sum_squares(r)), constraints,
+                        {**{n: v for n, v in zip(self.names, self.variables)}, "_r": r}, {}, dict,
+                        self.program.view)
+        return _Step(inner, matrix, target, tuple(pins), tuple(slopes))
+
+    def _run(self, step: _Step) -> Answer | None:
+        answer = self.inner.run(step.program, self.settings)
+        usable = answer.values and answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
+        return answer if usable else None
+
+    # points
+
+    def _candidates(self, count: int, seed: int) -> list[Point]:
+        best = local_solution(self.problem, count=count, seed=seed).point
+        points = [best, *starts(self.problem, count=CANDIDATES, seed=seed)]
+        distinct: list[Point] = []
+        for point in points:
+            directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
+            if not any(all(abs(float(d @ e)) > 0.999 for d, e in zip(directions, kept.bs)) for kept in distinct):
+                distinct.append(Point(point.w, point.mus, tuple(directions)))
+        signed = []
+        for point in distinct[:CANDIDATES]:
+            for pattern in range(2 ** min(len(point.bs), 3)):
+                signs = [-1.0 if pattern >> i & 1 else 1.0 for i in range(len(point.bs))]
+                signed.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
+                                    tuple(s * b for s, b in zip(signs, point.bs))))
+        return signed
+
+    def _half_step(self, half: _Step, point: Point) -> tuple[float, np.ndarray] | None:
+        """Solve for everything but b, which is held in its gauge; None where the constraints forbid this b."""
+        try:
+            values = to_values(self.program, self.form, point)
+        except ValueError:
+            return None
+        for (_, name), pin in zip(self.form.blocks, half.pinned):
+            pin.value = values[name]
+        x = self._pack(values)
+        # with b fixed the residual is affine, so that one linearisation is exact
+        self._set_model(half, x, second_order=False, damping=0.0)
+        answer = self._run(half)
+        if answer is None:
+            return None
+        x = self._pack(answer.values)
+        return self._merit(x, 0.0), x
+
+    def _pack(self, values) -> np.ndarray:
+        return np.concatenate([np.ravel(values[name], order="F") for name in self.names]).astype(float)
+
+    def _parts(self, x: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+        position, pairs = self.linear, []
+        for block in self.problem.blocks:
+            mu = x[position : position + block.rows]
+            b = x[position + block.rows : position + block.rows + block.cols]
+            pairs.append((mu, b))
+            position += block.rows + block.cols
+        return x[: self.linear], pairs
+
+    def _lift(self, x: np.ndarray) -> np.ndarray:
+        w, pairs = self._parts(x)
+        return np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
+
+    def _set_model(self, step: _Step, x: np.ndarray, *, second_order: bool, damping: float) -> None:
+        """Write the quadratic model of the residual at x into the QP's parameters."""
+        w, pairs = self._parts(x)
+        root = self.problem.root
+        residual = root @ self._lift(x) - self.problem.target
+        columns, position = [root[:, : self.linear]], self.linear
+        curvature = np.zeros((self.size, self.size))
+        pull = root.T @ residual
+        at = self.linear
+        for mu, b in pairs:
+            p, q = mu.size, b.size
+            block = root[:, position : position + p * q].reshape(-1, p, q, order="F")
+            columns += [block @ b, np.einsum("npq,p->nq", block, mu)]
+            cross = pull[position : position + p * q].reshape(p, q, order="F")
+            curvature[at : at + p, at + p : at + p + q] = cross
+            curvature[at + p : at + p + q, at : at + p] = cross.T
+            if self.form.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
+                curvature[at + p : at + p + q, at + p : at + p + q] += np.outer(b, b) * float(mu @ mu) / max(q, 1)
+            at, position = at + p + q, position + p * q
+        jacobian = np.hstack(columns)
+        gradient = jacobian.T @ residual
+        gram = jacobian.T @ jacobian
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-14 * max(float(np.max(np.diag(gram))), 1e-300)))
+        hessian = gram + curvature if second_order else gram
+        shift = max(damping, 1e-12)
+        for _ in range(40):
+            try:
+                factor = np.linalg.cholesky(hessian / np.outer(scale, scale) + shift * np.eye(self.size))
+                break
+            except np.linalg.LinAlgError:
+                if second_order:
+                    hessian, second_order = gram, False
+                else:
+                    shift = max(10.0 * shift, 1e-12)
+        else:
+            raise ValueError("the quadratic model cannot be made definite")
+        upper = factor.T * scale
+        unit = max(float(np.max(np.abs(upper))), 1e-300)
+        step.matrix.value = upper / unit
+        step.target.value = (upper @ x - np.linalg.solve(factor, gradient / scale)) / unit
+        self.unit = unit
+        self._assign(x)
+        for slope, level, expression in step.slopes:
+            jac = np.zeros((expression.size, self.size))
+            position = 0
+            gradients = expression.grad
+            for variable in self.variables:
+                part = gradients.get(variable)
+                if part is not None:
+                    jac[:, position : position + variable.size] = np.asarray(
+                        part.toarray() if hasattr(part, "toarray") else part).reshape(variable.size, -1).T
+                position += variable.size
+            slope.value = jac
+            level.value = np.ravel(expression.value, order="F") - jac @ x
+
+    def _assign(self, x: np.ndarray) -> None:
+        position = 0
+        for variable in self.variables:
+            variable.value = np.reshape(x[position : position + variable.size], variable.shape, order="F")
+            position += variable.size
+
+    def _merit(self, x: np.ndarray, weight: float) -> float:
+        value = float(np.sum((self.problem.root @ self._lift(x) - self.problem.target) ** 2))
+        if weight:
+            self._assign(x)
+            value += weight * sum(float(np.sum(np.abs(np.asarray(member.violation()))))
+                                  for name, group in self.program.constraints.items() if name != "residual"
+                                  for member in group if not member.is_dcp())
+        return value
+
+    def _iterate(self, step: _Step, x: np.ndarray) -> tuple[Answer | None, float]:
+        weight, damping = 1e-3 * self.problem.scale + 1e-300, 0.0
+        answer: Answer | None = None
+        status, word, count = Status.LIMIT, "iteration limit", 0
+        for count in range(1, STEPS + 1):
+            self._set_model(step, x, second_order=True, damping=damping)
+            found = self._run(step)
+            if found is None:
+                if damping > 1e6:
+                    return answer, self._merit(x, weight)
+                damping = max(10.0 * damping, 1e-6)
+                continue
+            new = self._pack(found.values)
+            multipliers = self._duals(step, found)
+            weight = max(weight, 2.0 * max((float(np.max(np.abs(d), initial=0.0)) for d in multipliers.values()),
+                                           default=0.0))
+            before, after = self._merit(x, weight), self._merit(new, weight)
+            size = float(np.linalg.norm(new - x)) / (1e-300 + float(np.linalg.norm(new)))
+            if after > before + 1e-11 * (before + 1e-9 * self.problem.scale) and size > 1e-7:
+                damping = max(10.0 * damping, 1e-4)
+                if damping > 1e8:
+                    status, word = Status.INACCURATE, "no descent"
+                    break
+                continue
+            x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
+            answer = Answer(Status.LIMIT, word, found.values, multipliers, count)
+            if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + 1e-9 * self.problem.scale)):
+                status, word = Status.LOCAL, "stationary"
+                break
+        if answer is None:
+            return None, np.inf
+        values = {name: answer.values[name] for name in self.names}
+        return Answer(status, word, values, self._all_duals(values, answer.duals), count), self._merit(x, weight)
+
+    def _duals(self, step: _Step, found: Answer) -> dict[str, np.ndarray]:
+        return {name: self.unit**2 * dual for name, dual in found.duals.items() if name in self.program.constraints}
+
+    def _all_duals(self, values, duals) -> dict[str, np.ndarray]:
+        r = self.problem.root @ self._lift(self._pack(values)) - self.problem.target
+        return {**duals, "residual": -2.0 * r}
+
+
+back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
+                   about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints")
+
+
+__all__: Sequence[str] = ["back_end", "lifted", "run", "to_values"]

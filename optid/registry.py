@@ -1,0 +1,83 @@
+"""Formulations and named constraints by name: entry points, so that a third party's are on equal footing."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from optid.errors import LookupFailed, StructureError, nearest
+
+FORMULATIONS = "optid.formulations"
+CONSTRAINTS = "optid.constraints"
+
+
+@cache
+def registered(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by name."""
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]]:
+    """Return (name, callable) of a formulation given by name or as a callable.
+
+    Raises:
+        LookupFailed: no such name; the message has the nearest one.
+    """
+    if callable(name):
+        return getattr(name, "__name__", "formulation"), name
+    known = registered(FORMULATIONS)
+    if name not in known:
+        raise LookupFailed(f"no formulation is called {name!r}. {nearest(name, known)}")
+    return name, known[name].load()
+
+
+def named_constraint(text: str) -> Any:
+    """Build a constraint from a word such as ``monotone:increasing`` or ``gain:1.0``.
+
+    Raises:
+        LookupFailed: no such constraint; the message has the nearest name.
+        StructureError: arguments it does not take.
+    """
+    word, *arguments = text.split(":")
+    known = registered(CONSTRAINTS)
+    if word not in known:
+        raise LookupFailed(f"no constraint is called {word!r}. {nearest(word, known)}")
+    build = known[word].load()
+    positional: list[Any] = []
+    keywords: dict[str, Any] = {}
+    for argument in ":".join(arguments).split(",") if arguments else []:
+        key, equals, value = argument.partition("=")
+        if equals:
+            keywords[key.strip()] = _number(value)
+        else:
+            positional.append(_number(argument))
+    try:
+        return build(*positional, **keywords)
+    except TypeError as error:
+        raise StructureError(f"constraint {text!r}: {error}; it is used as {word}{inspect.signature(build)}") from None
+
+
+def check_arguments(name: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Refuse arguments a formulation does not have, and name those it misses.
+
+    Raises:
+        StructureError: with the nearest known argument.
+    """
+    parameters = inspect.signature(function).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        return
+    known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
+    for key in arguments:
+        if key not in known:
+            raise StructureError(f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}")
+    missing = [key for key in known if parameters[key].default is inspect.Parameter.empty and key not in arguments]
+    if missing:
+        raise StructureError(f"formulation {name!r} needs {', '.join(missing)}")
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
