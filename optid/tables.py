@@ -75,8 +75,8 @@ def _open_file(path: Path, columns: Sequence[str] | None, delimiter: str, decima
         ".tsv": lambda: _csv_table(path, columns, "\t", decimal),
         ".parquet": lambda: _parquet_table(path),
         ".mat": lambda: _of_arrays(path.name, _mat_variables(path)),
-        ".npz": lambda: _of_arrays(path.name, _numpy_file(path)),
-        ".npy": lambda: _of_array(path.name, _numpy_file(path), columns),
+        ".npz": lambda: _npz_table(path),
+        ".npy": lambda: _of_array(path.name, _numpy_file(path, None), columns),
     }
     if kind not in readers:
         raise DataError(f"{path.name}: unknown kind of file {kind!r}. Known: {', '.join(readers)}.")
@@ -196,12 +196,24 @@ def position_names(columns: Sequence[str] | None, width: int, label: str) -> lis
     return [str(c) for c in (range(width) if columns is None else columns)]
 
 
-def _numpy_file(path: Path) -> Any:
+def _npz_table(path: Path) -> Table:
+    def load(wanted: Sequence[str], as_is: Sequence[str]) -> dict[str, Any]:
+        arrays = _numpy_file(path, wanted)
+        return {name: np.ravel(arrays[name]) if name in as_is else arrays[name] for name in wanted}
+
+    return Table(path.name, list(_numpy_file(path, ())), load)
+
+
+def _numpy_file(path: Path, wanted: Sequence[str] | None) -> Any:
+    """Return the array of an npy file, or the wanted arrays of an npz file, None for those that are not wanted."""
     from zipfile import BadZipFile
 
     try:
-        content = np.load(path, allow_pickle=False)
-        return {name: content[name] for name in content.files} if path.suffix.lower() == ".npz" else content
+        with open(path, "rb") as file:  # opened here, so that it is closed when numpy gives up
+            content = np.load(file, allow_pickle=False)
+            if wanted is None:
+                return content
+            return {name: content[name] if name in wanted else None for name in content.files}
     except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
         raise DataError(f"{path.name} is damaged, or not a NumPy file of plain numbers: {error}") from error
 
