@@ -211,8 +211,10 @@ def _numpy_file(path: Path, wanted: Sequence[str] | None) -> Any:
     try:
         with open(path, "rb") as file:  # opened here, so that it is closed when numpy gives up
             content = np.load(file, allow_pickle=False)
-            if wanted is None:
+            if wanted is None and isinstance(content, np.ndarray):
                 return content
+            if wanted is None:
+                raise ValueError("it is an archive; name it .npz")
             return {name: content[name] if name in wanted else None for name in content.files}
     except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
         raise DataError(f"{path.name} is damaged, or not a NumPy file of plain numbers: {error}") from error

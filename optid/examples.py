@@ -1,0 +1,204 @@
+"""Built-in records: simulated systems whose truth is known, so that every command can be tried without data."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid import signals
+from optid.data import Data
+from optid.errors import LookupFailed, nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """A record, the system it came from, and how to fit it.
+
+    Attributes:
+        data: the record.
+        truth: a (na,), b (one (nb,) array per input), f (one function per input), sigma (standard deviation of the
+            equation error e), noise_free (N, l) output.
+        suggestion: arguments of `fit`: na, nb, nk, basis (text, as on the command line) and constraints (texts).
+    """
+
+    data: Data
+    truth: dict[str, Any]
+    suggestion: dict[str, Any]
+
+
+def dead_zone(seed: int = 0, n: int = 1000) -> Example:
+    """Return the simulation example of chapter 3: a dead zone of half width 0.25 before second-order dynamics.
+
+    A = 1 - 1.5 q^-1 + 0.7 q^-2, b = (16/15, 0.8), f(u) = sign(u) max(|u| - 0.25, 0), u white and uniform on [-1, 1].
+    The output noise is v = e / A with white Gaussian e, and the ratio of the variances of the noise-free output and
+    of v is 22 (D. Luo, PhD dissertation, University of Central Florida, 2005, section 3.4; A, b and f are chosen here,
+    the source does not print them). The system starts at rest, dt = 0.1 s.
+
+    Args:
+        seed: seed of input and noise.
+        n: samples.
+    """
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1.0, 1.0, n)
+    variance_of_f = 0.75**3 / 3  # integral of (|u| - 0.25)^2 over the density 1/2, f has zero mean
+    power = variance_of_f * _energy(_DEAD_ZONE.b[0], _DEAD_ZONE.a)
+    return _DEAD_ZONE.example(u[:, None], power / 22, rng)
+
+
+def thruster(seed: int = 0, n: int = 600) -> Example:
+    """Return a simulated marine thruster rig: servo current to thrust.
+
+    Thrust is quadratic in the current, weaker astern (0.7), zero in a dead band of 0.1 A either way, and follows with
+    A = 1 - 1.2 q^-1 + 0.4 q^-2, b_0 = 0.2 (unit static gain), dt = 0.1 s. The input is a staircase plus a multisine, at
+    most 1.5 A; the ratio of the energies of noise-free thrust and noise is 30. Modelled on section 3.5 of the same
+    dissertation as `dead_zone`, whose data are not public.
+
+    Args:
+        seed: seed of the phases and of the noise.
+        n: samples.
+    """
+    rng = np.random.default_rng(seed)
+    staircase = signals.steps(n, -1.2, 1.2, levels=9, hold=12)
+    ripple = signals.multisine(n, -0.5, 0.5, dt=0.1, band=(0.0, 2.0), phases="random", seed=seed)
+    u = np.clip(staircase + ripple, -1.5, 1.5)[:, None]
+    power = float(np.mean(_THRUSTER.output(u) ** 2))
+    return _THRUSTER.example(u, power / 30, rng)
+
+
+def two_inputs(seed: int = 0, n: int = 2000) -> Example:
+    """Return a simulated heated tank: a valve that saturates and a heater whose power is quadratic in the voltage.
+
+    A = 1 - 1.1 q^-1 + 0.3 q^-2; valve: f(u) = tanh(2 u), b = (-0.6, -0.3), u in [-1, 1]; heater: f(u) = u^2 / 4,
+    b = (0.5, 0.4), u in [0, 2]. White uniform inputs, dt = 1 s; the ratio of the energies of the noise-free output,
+    about its mean, and of the noise is 25.
+
+    Args:
+        seed: seed of inputs and noise.
+        n: samples.
+    """
+    rng = np.random.default_rng(seed)
+    u = np.column_stack([rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0, n)])
+    return _TWO_INPUTS.example(u, float(np.var(_TWO_INPUTS.output(u))) / 25, rng)
+
+
+EXAMPLES: dict[str, Callable[..., Example]] = {
+    "thruster": thruster,
+    "dead_zone": dead_zone,
+    "two_inputs": two_inputs,
+}
+"""The built-in records by the name that the command line takes; each function takes seed and n."""
+
+
+def example(name: str, **arguments: Any) -> Example:
+    """Return a built-in record by name; `arguments` are its seed and n.
+
+    Raises:
+        LookupFailed: no such example; the message names the nearest.
+    """
+    if name not in EXAMPLES:
+        raise LookupFailed(f"no example {name!r}. {nearest(name, EXAMPLES)}")
+    return EXAMPLES[name](**arguments)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """A Hammerstein-ARX system with the names of its channels and the arguments to fit it with."""
+
+    name: str
+    dt: float
+    inputs: dict[str, str]  # name: unit
+    outputs: dict[str, str]
+    a: np.ndarray
+    b: tuple[np.ndarray, ...]
+    f: tuple[Callable[[np.ndarray], np.ndarray], ...]
+    suggestion: dict[str, Any]
+
+    def output(self, u: np.ndarray) -> np.ndarray:
+        """Return the noise-free output (N,) to the inputs (N, m), from rest."""
+        return np.sum([_filter(b, self.a, f(x)) for b, f, x in zip(self.b, self.f, u.T)], axis=0)
+
+    def example(self, u: np.ndarray, noise_power: float, rng: np.random.Generator) -> Example:
+        """Return the record with output noise e / A of the power given."""
+        clean = self.output(u)
+        sigma = float(np.sqrt(noise_power / _energy(np.ones(1), self.a)))
+        noise = _filter(np.ones(1), self.a, sigma * rng.standard_normal(clean.size))
+        data = Data(
+            u,
+            clean + noise,
+            self.dt,
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
+            input_units=list(self.inputs.values()),
+            output_units=list(self.outputs.values()),
+            name=self.name,
+        )
+        truth = {
+            "a": self.a.copy(),
+            "b": tuple(b.copy() for b in self.b),
+            "f": self.f,
+            "sigma": sigma,
+            "noise_free": clean[:, None],
+        }
+        return Example(data, truth, dict(self.suggestion))
+
+
+def _filter(b: np.ndarray, a: np.ndarray, x: np.ndarray) -> np.ndarray:
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter(b, np.concatenate([[1.0], a]), x))
+
+
+def _energy(b: np.ndarray, a: np.ndarray) -> float:
+    """Return the energy of the impulse response of B / A, its variance gain for white inputs."""
+    return float(np.sum(_filter(b, a, np.eye(1, 2000)[0]) ** 2))
+
+
+def _dead_band(u: np.ndarray) -> np.ndarray:
+    return np.sign(u) * np.maximum(np.abs(u) - 0.25, 0.0)
+
+
+def _saturation(u: np.ndarray) -> np.ndarray:
+    return np.tanh(2.0 * u)
+
+
+def _power(u: np.ndarray) -> np.ndarray:
+    return u**2 / 4
+
+
+def _thrust(u: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(u) < 0.1, 0.0, np.where(u > 0, 1.0, 0.7) * u * np.abs(u))
+
+
+_DEAD_ZONE = _System(
+    name="dead_zone",
+    dt=0.1,
+    inputs={"u": ""},
+    outputs={"y": ""},
+    a=np.array([-1.5, 0.7]),
+    b=(np.array([16 / 15, 0.8]),),
+    f=(_dead_band,),
+    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]},
+)
+
+_THRUSTER = _System(
+    name="thruster",
+    dt=0.1,
+    inputs={"current": "A"},
+    outputs={"thrust": "N"},
+    a=np.array([-1.2, 0.4]),
+    b=(np.array([0.2]),),
+    f=(_thrust,),
+    suggestion={"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10", "constraints": ["monotone:increasing"]},
+)
+
+_TWO_INPUTS = _System(
+    name="two_inputs",
+    dt=1.0,
+    inputs={"valve": "", "heater": "V"},
+    outputs={"temperature": "K"},
+    a=np.array([-1.1, 0.3]),
+    b=(np.array([-0.6, -0.3]), np.array([0.5, 0.4])),
+    f=(_saturation, _power),
+    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]},
+)

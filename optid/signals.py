@@ -1,0 +1,317 @@
+"""Excitation signals: (N,) float64 records that stay within an amplitude range low to high.
+
+A static nonlinearity is identified only where the input goes: a binary signal cannot show it (it collapses to an affine
+function), and one sinusoid of a polynomial of degree p has p harmonics only. Signals of many levels are the safe choice
+(`multisine`, `uniform_levels`, `band_limited_noise`, `steps` with at least as many levels as basis functions).
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from optid.errors import StructureError
+
+Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
+
+
+def multisine(
+    n: int,
+    low: float = -1.0,
+    high: float = 1.0,
+    *,
+    dt: float = 1.0,
+    lines: Sequence[int] | np.ndarray | None = None,
+    band: tuple[float, float] | None = None,
+    spectrum: Spectrum = None,
+    phases: str = "schroeder",
+    periods: int = 1,
+    crest_steps: int = 0,
+    seed: int = 0,
+) -> np.ndarray:
+    """Return a sum of cosines on chosen lines of the period, stretched to fill low to high.
+
+    Schroeder phases (M. R. Schroeder, IEEE Trans. Inf. Theory 16, 1970) keep the crest factor low; `crest_steps`
+    lowers it further by clipping and restoring the amplitudes in turn (Van der Ouderaa, Schoukens, Renneboog, IEEE
+    Trans. Instrum. Meas. 37, 1988). Stretching changes the amplitudes by one common factor and the mean.
+
+    Args:
+        n: samples, a multiple of `periods`.
+        low: smallest value.
+        high: largest value.
+        dt: sampling time; gives `band` and the argument of `spectrum` their unit.
+        lines: harmonics of the period, 1 up to below half the samples of a period; all when not given.
+        band: lowest and highest frequency (1/unit of dt), instead of lines.
+        spectrum: relative amplitude of each line, or a function of the frequencies (k,); flat when not given.
+        phases: "schroeder" or "random" (uniform, from the seed).
+        periods: number of periods.
+        crest_steps: rounds of crest factor reduction.
+        seed: seed of the random phases.
+
+    Raises:
+        StructureError: an argument out of its range, both lines and band, or no line in the band.
+    """
+    _check(n, low, high)
+    if periods < 1 or n % periods:
+        raise StructureError(f"n = {n} samples cannot hold {periods} whole periods; choose n as a multiple of periods.")
+    size = n // periods
+    k = _lines(size, dt, lines, band)
+    frequencies = k / (size * dt)
+    amplitudes = _amplitudes(spectrum, frequencies)
+    coefficients = np.zeros(size // 2 + 1, dtype=complex)
+    coefficients[k] = amplitudes * np.exp(1j * _phases(phases, amplitudes, seed))
+    for _ in range(crest_steps):
+        period = np.fft.irfft(coefficients, size)
+        # 0.8 of the peak: lower clips too much to converge, higher moves slowly.
+        peak = 0.8 * np.max(np.abs(period))
+        clipped = np.fft.rfft(np.clip(period, -peak, peak))[k]
+        better = coefficients.copy()
+        better[k] = amplitudes * np.exp(1j * np.angle(clipped))
+        if np.max(np.abs(np.fft.irfft(better, size))) >= np.max(np.abs(period)):
+            break
+        coefficients = better
+    return np.tile(_stretched(np.fft.irfft(coefficients, size), low, high), periods)
+
+
+def crest_factor(u: np.ndarray) -> float:
+    """Return the largest deviation of u (N,) from its mean over the standard deviation; 1 for a square wave."""
+    return float(np.max(np.abs(u - np.mean(u))) / np.std(u))
+
+
+def prbs(
+    n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: int | None = None, seed: int = 0
+) -> np.ndarray:
+    """Return a pseudo-random binary sequence of a maximum-length shift register.
+
+    The register (`scipy.signal.max_len_seq`; Golomb, Shift Register Sequences, 1967) repeats after
+    hold * (2**bits - 1) samples. A binary input cannot identify a static nonlinearity, only linear dynamics.
+
+    Args:
+        n: samples.
+        low: one value.
+        high: the other value.
+        hold: samples for which each value is held.
+        bits: length of the register, 2 to 32; the shortest that does not repeat within n when not given.
+        seed: seed of the initial state of the register.
+
+    Raises:
+        StructureError: an argument out of its range.
+    """
+    from scipy.signal import max_len_seq
+
+    _check(n, low, high)
+    draws = _held_draws(n, hold)
+    bits = max(2, int(draws).bit_length()) if bits is None else bits
+    if not 2 <= bits <= 32:
+        raise StructureError(f"bits = {bits}: a register has 2 to 32 bits.")
+    state = np.random.default_rng(seed).integers(0, 2, bits)
+    state[0] |= not state.any()  # the zero state never leaves itself
+    sequence = max_len_seq(bits, state=state, length=draws)[0]
+    return np.repeat(np.where(sequence == 1, high, low), hold)[:n].astype(np.float64)
+
+
+def chirp(
+    n: int,
+    low: float = -1.0,
+    high: float = 1.0,
+    *,
+    f0: float,
+    f1: float,
+    dt: float = 1.0,
+    method: str = "linear",
+    repeats: int = 1,
+) -> np.ndarray:
+    """Return a sine whose frequency runs from f0 to f1, several times over.
+
+    Args:
+        n: samples, a multiple of `repeats`.
+        low: smallest value.
+        high: largest value.
+        f0: frequency at the start of a sweep (1/unit of dt), positive for method "logarithmic".
+        f1: frequency at its end, at most half the sampling rate.
+        dt: sampling time.
+        method: "linear", "quadratic", "logarithmic" or "hyperbolic" (`scipy.signal.chirp`).
+        repeats: number of sweeps.
+
+    Raises:
+        StructureError: an argument out of its range.
+    """
+    from scipy.signal import chirp as swept
+
+    _check(n, low, high)
+    _check_rate(max(f0, f1), dt, "f0 and f1")
+    if repeats < 1 or n % repeats:
+        raise StructureError(f"n = {n} samples cannot hold {repeats} whole sweeps; choose n as a multiple of repeats.")
+    t = dt * np.arange(n // repeats)
+    try:
+        sweep = swept(t, f0=f0, t1=dt * t.size, f1=f1, method=method, phi=-90)
+    except ValueError as error:
+        raise StructureError(f"chirp from {f0} to {f1}, method {method!r}: {error}") from error
+    return np.tile((low + high) / 2 + (high - low) / 2 * sweep, repeats)
+
+
+def band_limited_noise(
+    n: int,
+    low: float = -1.0,
+    high: float = 1.0,
+    *,
+    cutoff: float | tuple[float, float],
+    dt: float = 1.0,
+    order: int = 4,
+    clip: float = 2.5,
+    seed: int = 0,
+) -> np.ndarray:
+    """Return white Gaussian noise through a Butterworth filter, clipped to low to high.
+
+    The filter runs in before the record starts, so that the record is stationary.
+
+    Args:
+        n: samples.
+        low: smallest value.
+        high: largest value.
+        cutoff: edge of a low-pass, or the edges of a band-pass (1/unit of dt), below half the sampling rate.
+        dt: sampling time.
+        order: order of the filter.
+        clip: number of standard deviations that reach from the middle to low and to high.
+        seed: seed of the noise.
+
+    Raises:
+        StructureError: an argument out of its range.
+    """
+    from scipy.signal import butter, sosfilt
+
+    _check(n, low, high)
+    edges = np.atleast_1d(np.asarray(cutoff, dtype=float))
+    if edges.size > 2 or not (np.diff([0.0, *edges]) > 0).all():
+        raise StructureError(f"cutoff = {cutoff}: one positive frequency, or two in rising order.")
+    if edges[-1] >= 0.5 / dt:
+        raise StructureError(f"cutoff = {cutoff}: it must lie below half the sampling rate, {0.5 / dt:g}.")
+    if not clip > 0 or order < 1:
+        raise StructureError(f"clip = {clip} and order = {order}: both must be positive.")
+    kind = "lowpass" if edges.size == 1 else "bandpass"
+    sections = butter(order, edges if edges.size == 2 else edges[0], kind, fs=1.0 / dt, output="sos")
+    # About fifty time constants of the slowest pole.
+    run_in = int(np.ceil(5 * order / (dt * float(np.min(np.diff([0.0, *edges]))))))
+    noise = sosfilt(sections, np.random.default_rng(seed).standard_normal(run_in + n))[run_in:]
+    # The deviation of the process, not of this record: records of one design then share one scale.
+    deviation = float(np.linalg.norm(sosfilt(sections, np.eye(1, run_in)[0])))
+    return (low + high) / 2 + (high - low) / 2 * np.clip(noise / (clip * deviation), -1.0, 1.0)
+
+
+def uniform_levels(
+    n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, levels: int | None = None, seed: int = 0
+) -> np.ndarray:
+    """Return independent uniform values, each held for some samples; with hold 1 uniform white noise.
+
+    Args:
+        n: samples.
+        low: smallest value.
+        high: largest value.
+        hold: samples for which each value is held.
+        levels: number of equally spaced values to draw from; any value when not given.
+        seed: seed of the draws.
+
+    Raises:
+        StructureError: an argument out of its range.
+    """
+    _check(n, low, high)
+    rng = np.random.default_rng(seed)
+    draws = _held_draws(n, hold)
+    if levels is None:
+        values = rng.uniform(low, high, draws)
+    else:
+        values = rng.choice(_spaced(low, high, levels), draws)
+    return np.repeat(values, hold)[:n]
+
+
+def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold: int | None = None) -> np.ndarray:
+    """Return a staircase from low to high and back, again and again.
+
+    Args:
+        n: samples.
+        low: lowest level.
+        high: highest level.
+        levels: number of equally spaced levels, at least 2.
+        hold: samples per step; one staircase up and down fills the record when not given.
+
+    Raises:
+        StructureError: an argument out of its range, or n too small for the staircase.
+    """
+    _check(n, low, high)
+    up = _spaced(low, high, levels)
+    stairs = np.concatenate([up, up[-2:0:-1]]) if hold is not None else np.concatenate([up, up[-2::-1]])
+    if hold is None:
+        if n < stairs.size:
+            raise StructureError(f"n = {n} samples cannot hold {stairs.size} steps; use fewer levels.")
+        return stairs[np.arange(n) * stairs.size // n]
+    draws = _held_draws(n, hold)
+    return np.repeat(np.resize(stairs, draws), hold)[:n]
+
+
+def _check(n: int, low: float, high: float) -> None:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+        raise StructureError(f"n = {n!r}: a positive number of samples is needed.")
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise StructureError(f"low = {low}, high = {high}: low must be below high.")
+
+
+def _check_rate(frequency: float, dt: float, what: str) -> None:
+    if not dt > 0 or not 0 < frequency <= 0.5 / dt:
+        raise StructureError(f"{what}: {frequency:g} is not between 0 and half the sampling rate, {0.5 / dt:g}.")
+
+
+def _held_draws(n: int, hold: int) -> int:
+    if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
+        raise StructureError(f"hold = {hold!r}: a positive number of samples is needed.")
+    return -(-n // hold)
+
+
+def _spaced(low: float, high: float, levels: int) -> np.ndarray:
+    if levels < 2:
+        raise StructureError(f"levels = {levels}: at least 2 are needed.")
+    return np.linspace(low, high, levels)
+
+
+def _stretched(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    return low + (high - low) * (x - x.min()) / (x.max() - x.min())
+
+
+def _lines(
+    size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None
+) -> np.ndarray:
+    most = (size - 1) // 2  # the line at half the sampling rate has no free phase
+    if lines is not None and band is not None:
+        raise StructureError("give lines or band, not both.")
+    if lines is not None:
+        k = np.unique(np.asarray(lines))
+        if k.dtype.kind not in "iu" or not k.size or k[0] < 1 or k[-1] > most:
+            raise StructureError(f"lines: whole numbers from 1 to {most} are needed for {size} samples a period.")
+        return k
+    everywhere = np.arange(1, most + 1)
+    if band is not None:
+        frequencies = everywhere / (size * dt)
+        everywhere = everywhere[(frequencies >= band[0] - 1e-12) & (frequencies <= band[1] + 1e-12)]
+    if not everywhere.size:
+        raise StructureError(
+            f"band = {band}: no line of a period of {size} samples lies in it; lines are multiples of "
+            f"{1 / (size * dt):g} up to {most / (size * dt):g}."
+        )
+    return everywhere
+
+
+def _amplitudes(spectrum: Spectrum, frequencies: np.ndarray) -> np.ndarray:
+    if spectrum is None:
+        return np.ones(frequencies.size)
+    a = np.asarray(spectrum(frequencies) if callable(spectrum) else spectrum, dtype=float)
+    if a.shape != frequencies.shape or not (np.isfinite(a) & (a >= 0)).all() or not a.any():
+        raise StructureError(f"spectrum: {frequencies.size} amplitudes are needed, not negative and not all zero.")
+    return a
+
+
+def _phases(kind: str, amplitudes: np.ndarray, seed: int) -> np.ndarray:
+    if kind == "random":
+        return np.random.default_rng(seed).uniform(0.0, 2 * np.pi, amplitudes.size)
+    if kind != "schroeder":
+        raise StructureError(f"phases = {kind!r}: 'schroeder' and 'random' exist.")
+    power = amplitudes**2 / np.sum(amplitudes**2)
+    # phi_k = -2 pi sum_{i<k} (k - i) p_i, by two cumulative sums.
+    return -2 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power)[:-1])])

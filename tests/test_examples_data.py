@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from optid.data import Data
+from optid.errors import LookupFailed
+from optid.examples import EXAMPLES, dead_zone, example, thruster
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_truth_leaves_white_residuals_of_the_stated_size(name):
+    ex = EXAMPLES[name](seed=3, n=4000)
+    data, truth = ex.data, ex.truth
+    assert isinstance(data, Data) and data.name == name and data.n_samples == 4000
+    assert len(truth["b"]) == len(truth["f"]) == data.m
+    # The difference equation A y = B f(u) + e, written out sample by sample.
+    e = np.empty(3990)
+    w = [f(data.u[:, c]) for c, f in enumerate(truth["f"])]
+    for k in range(10, 4000):
+        past = sum(a * data.y[k - 1 - i, 0] for i, a in enumerate(truth["a"]))
+        drive = sum(bj * wc[k - j] for wc, b in zip(w, truth["b"]) for j, bj in enumerate(b))
+        e[k - 10] = data.y[k, 0] + past - drive
+    assert e.std() == pytest.approx(truth["sigma"], rel=0.05)
+    r = np.array([e[lag:] @ e[: e.size - lag] for lag in range(1, 11)]) / (e @ e)
+    assert np.abs(r).max() < 4 / np.sqrt(e.size)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_records_depend_on_the_seed_alone(name):
+    np.testing.assert_array_equal(EXAMPLES[name](seed=1).data.y, EXAMPLES[name](seed=1).data.y)
+    assert not np.array_equal(EXAMPLES[name](seed=1).data.y, EXAMPLES[name](seed=2).data.y)
+    ex = EXAMPLES[name]()
+    assert set(ex.suggestion) == {"na", "nb", "nk", "basis", "constraints"}
+    assert (ex.suggestion["na"], ex.suggestion["nb"]) == (ex.truth["a"].size, ex.truth["b"][0].size)
+
+
+def test_dead_zone_has_the_noise_of_the_source():
+    energies = []
+    for seed in range(40):
+        ex = dead_zone(seed=seed, n=2000)
+        clean = ex.truth["noise_free"]
+        energies.append([np.sum(clean**2), np.sum((ex.data.y - clean) ** 2)])
+    signal, noise = np.mean(energies, axis=0)
+    assert signal / noise == pytest.approx(22, rel=0.03)
+    f = ex.truth["f"][0]
+    np.testing.assert_array_equal(f(np.array([-1.0, -0.25, 0.1, 0.25, 0.5])), [-0.75, 0.0, 0.0, 0.0, 0.25])
+    assert np.abs(ex.data.u).max() <= 1 and ex.data.n_samples == 2000 and ex.data.dt == 0.1
+
+
+def test_thruster_is_the_rig_described():
+    ex = thruster()
+    data = ex.data
+    assert (data.inputs, data.input_units) == (("current",), ("A",))
+    assert (data.outputs, data.output_units) == (("thrust",), ("N",))
+    assert (data.n_samples, data.dt) == (600, 0.1) and data.channels[0].levels > 100
+    assert data.u.min() < -1.3 and data.u.max() > 1.3 and np.abs(data.u).max() <= 1.5
+    # Every cell of the suggested basis is visited.
+    assert np.histogram(data.u, bins=10)[0].min() >= 10
+    f = ex.truth["f"][0]
+    np.testing.assert_allclose(f(np.array([-1.0, -0.05, 0.0, 0.09, 0.5, 1.5])), [-0.7, 0, 0, 0, 0.25, 2.25])
+    assert ex.truth["b"][0][0] / (1 + ex.truth["a"].sum()) == pytest.approx(1.0)
+    ratios = [np.sum(t.truth["noise_free"] ** 2) / np.sum((t.data.y - t.truth["noise_free"]) ** 2)
+              for t in (thruster(seed=s) for s in range(30))]
+    assert np.median(ratios) == pytest.approx(30, rel=0.15)
+
+
+def test_unknown_example_names_the_nearest():
+    assert example("thruster", seed=0, n=50).data.n_samples == 50
+    with pytest.raises(LookupFailed, match="Did you mean 'thruster'"):
+        example("truster")
