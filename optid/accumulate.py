@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.basis import Array
+from optid.errors import StructureError
 from optid.layout import Layout
 
 FORMED = 2048
@@ -28,22 +29,27 @@ class Signals:
     """Signals that enter the rows at the same lags: the outputs, or the functions of one input.
 
     Attributes:
-        first: (T,) position of the first function that does not vanish; None for dense signals.
+        first: (T,) position of the first function that does not vanish.
         weights: (T, s) values from there on.
         size: number of signals.
         lags: the lags at which they enter.
         columns: (lags, size) where they stand in a complete row.
     """
 
-    first: NDArray[np.int32] | None
+    first: NDArray[np.int32]
     weights: Array
     size: int
     lags: range
     columns: NDArray[np.int32]
 
+    @property
+    def local(self) -> bool:
+        """Whether some functions vanish at every sample."""
+        return self.weights.shape[1] < self.size
+
     def dense(self) -> Array:
         """Return all values, (T, size)."""
-        if self.first is None:
+        if not self.local:
             return self.weights
         values = np.zeros((self.first.size, self.size))
         np.put_along_axis(values, self.first[:, None] + np.arange(self.weights.shape[1]), self.weights, axis=1)
@@ -51,10 +57,13 @@ class Signals:
 
     def total(self) -> Array:
         """Return the sum over time, (size,)."""
-        if self.first is None:
+        if not self.local:
             return self.weights.sum(axis=0)
-        parts = (np.bincount(self.first + i, w, self.size) for i, w in enumerate(self.weights.T))
-        return np.sum(list(parts), axis=0)
+        from optid import kernels
+
+        sums = np.zeros(self.size)
+        kernels.local_total(self.first, self.weights, sums)
+        return sums
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ def rows_present(u: Array, y: Array, layout: Layout) -> NDArray[np.bool_]:
     """
     reach, count = layout.first_row, len(u) - layout.first_row
     present = np.ones(count, dtype=bool)
-    missing = [np.isnan(y).any(axis=1, keepdims=True)[:, 0], *np.isnan(u).T]
+    missing = [np.logical_or.reduce(np.isnan(y), axis=1), *np.isnan(u).T]
     for lost, lags in zip(missing, layout.group_lags):
         for lag in lags if lost.any() else ():
             present &= ~lost[reach - lag : reach - lag + count]
@@ -126,15 +135,15 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     valid[reach : len(u)] = rows_present(u, y, layout)
     outputs = np.zeros((len(y) + 2 * reach, layout.l))
     np.copyto(outputs[inner], y, where=~np.isnan(y))
-    groups = [Signals(None, outputs, layout.l, range(layout.na + 1), layout.complete_columns[0])]
+    always = np.zeros(len(outputs), dtype=np.int32)
+    groups = [Signals(always, outputs, layout.l, layout.group_lags[0], layout.complete_columns[0])]
     for c, basis in enumerate(layout.bases):
         channel = np.full(len(u) + 2 * reach, np.nan)  # a missing sample evaluates to zeros
         channel[inner] = u[:, c]
         first, values = basis.local(channel)
-        local = values.shape[1] < basis.full_size
-        groups.append(
-            Signals(first if local else None, values, basis.full_size, layout.lags[c], layout.complete_columns[c + 1])
-        )
+        if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
+            raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
+        groups.append(Signals(first, values, basis.full_size, layout.lags[c], layout.complete_columns[c + 1]))
     candidates = len(u) - reach
     if weights is not None:
         candidates = int(np.count_nonzero(weights[reach:]))
@@ -145,24 +154,30 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
 
 def sparse_rows(block: Block, rows: NDArray[np.intp], n: int) -> tuple[NDArray[np.int32], Array]:
     """List what need not vanish in some rows of length n: increasing column numbers (K, z) and values (K, z)."""
+    from optid import kernels
+
     outputs, *inputs = block.groups
-    columns, values = [], []
-
-    def append(group: Signals, lag: int) -> None:
-        at, where = rows + (block.reach - lag), group.columns[lag - group.lags.start]
-        values.append(group.weights[at])
-        if group.first is None:
-            columns.append(np.broadcast_to(where, values[-1].shape))
-        else:
-            columns.append((where[0] + group.first[at])[:, None] + np.arange(group.weights.shape[1], dtype=np.int32))
-
-    for group, lags in [(outputs, outputs.lags[1:]), *((group, group.lags) for group in inputs)]:
-        for lag in lags:
-            append(group, lag)
-    columns.append(np.full((rows.size, 1), n - 1 - outputs.size, dtype=np.int32))
-    values.append(np.ones((rows.size, 1)))
-    append(outputs, 0)
-    return np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
+    entries = 1 + sum(group.weights.shape[1] * len(group.lags) for group in block.groups)
+    columns, values = np.empty((rows.size, entries), dtype=np.int32), np.empty((rows.size, entries))
+    constant, end = entries - 1 - outputs.size, 0
+    columns[:, constant], values[:, constant] = n - 1 - outputs.size, 1.0
+    parts = [(outputs, outputs.lags[1:]), *((group, group.lags) for group in inputs), (outputs, outputs.lags[:1])]
+    for group, lags in parts:
+        if group is outputs and lags.start == 0:
+            end += 1  # the constant
+        begin, end = end, end + group.weights.shape[1] * len(lags)
+        if lags:
+            kernels.list_entries(
+                group.first,
+                group.weights,
+                rows + (block.reach - lags[0]),
+                len(lags),
+                group.columns[lags[0] - group.lags[0], 0],
+                group.size,
+                columns[:, begin:end],
+                values[:, begin:end],
+            )
+    return columns, values
 
 
 def dense_rows(block: Block, rows: NDArray[np.intp], n: int) -> Array:
@@ -186,13 +201,13 @@ def lagged_products(g: Signals, h: Signals, lags: range, reach: int) -> Array:
     from optid import kernels
 
     start, stop = reach, len(g.weights) - reach
-    if g.first is None and h.first is not None:
+    if h.local and not g.local:
         return lagged_products(h, g, range(-lags[-1], 1 - lags[0]), reach)[:, ::-1].transpose(2, 1, 0)
     sums = np.zeros((g.size, len(lags), h.size))
-    if g.first is None:
+    if not g.local:
         for d, lag in enumerate(lags):
             sums[:, d] = g.weights[start:stop].T @ h.weights[start - lag : stop - lag]
-    elif h.first is None:  # the values of h at all these lags are neighbours in memory, the oldest first
+    elif not h.local:  # the values of h at all these lags are neighbours in memory, the oldest first
         windows = h.weights.reshape(-1)[(start - lags[-1]) * h.size :]
         kernels.local_by_dense(g.first[start:stop], g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
         sums = sums[:, ::-1]
@@ -233,9 +248,9 @@ class Sums:
             others = np.flatnonzero(~block.valid)
             self._add_rows(block, others, np.full(others.size, -1.0))
 
-    def cancelled(self) -> bool:
-        """Say whether the subtraction of rows lost digits; the sums should then be taken again with direct=True."""
-        return bool((self._removed > SAFE * np.maximum(np.diag(self.complete()), 0.0)).any())
+    def cancelled(self, complete: Array) -> bool:
+        """Say whether the subtraction of rows cost digits; the sums should then be taken again with direct=True."""
+        return bool((self._removed > SAFE * np.maximum(np.diag(complete), 0.0)).any())
 
     def complete(self) -> Array:
         """Return the complete Gram matrix, symmetric, (n_complete, n_complete)."""

@@ -26,8 +26,8 @@ def root_of_gram(gram: Array, n: int) -> Array:
     """Return an upper triangular R, diagonal >= 0, with R^T R = gram.
 
     The first n columns are scaled to norm one before they are factorised (Cholesky). From the first column on that
-    depends on those before it, rows of R are zero. What remains of the last columns may be singular, as for data without
-    noise.
+    depends on those before it, rows of R are zero. What remains of the last columns may be singular, as for data
+    without noise.
 
     Args:
         gram: (n + l, n + l) symmetric, positive semidefinite up to rounding.

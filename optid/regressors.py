@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from optid.data import Data
     from optid.streams import Stream
 
-CHUNK = 16384
+CHUNK = 32768
 """Samples evaluated at a time: their basis functions stay in the processor's cache."""
 
 CONDITION_LIMIT = 1e7
@@ -68,23 +68,26 @@ class Statistics:
         return "gram" if self.factor is None else "qr"
 
     @cached_property
+    def _triangle(self) -> Array:
+        return root_of_gram(self.gram, self.layout.n_columns) if self.factor is None else self.factor
+
+    @cached_property
     def root(self) -> Array:
         """Upper triangular R (n + l, n + l), diagonal >= 0, with R^T R = gram.
 
         Raises:
             RankError: a column of Phi depends on the columns before it; named.
         """
-        root = root_of_gram(self.gram, self.layout.n_columns) if self.factor is None else self.factor
-        column = dependent_column(root, self.layout.n_columns, self.method)
+        column = dependent_column(self._triangle, self.layout.n_columns, self.method)
         if column is not None:
-            raise RankError(_explain_dependence(self, root, column))
-        return root
+            raise RankError(_explain_dependence(self.layout, self._triangle, column))
+        return self._triangle
 
     @cached_property
     def condition(self) -> float:
         """Estimate of the condition number of Phi with its columns scaled to norm one; inf when it is singular."""
-        root = root_of_gram(self.gram, self.layout.n_columns) if self.factor is None else self.factor
-        return conditioning(root[: self.layout.n_columns, : self.layout.n_columns])
+        n = self.layout.n_columns
+        return conditioning(self._triangle[:n, :n])
 
     def check(self) -> None:
         """Refuse a record that does not determine the parameters.
@@ -168,9 +171,11 @@ def accumulate(
     This is for parts of a record that are to be added; arguments and errors as `collect`.
     """
     sums = _sum(data, layout, weights, chunk, direct=False)
-    if sums.cancelled():
+    complete = sums.complete()
+    if sums.cancelled(complete):
         sums = _sum(data, layout, weights, chunk, direct=True)
-    gram = layout.contrasted(layout.contrasted(sums.complete()).T)
+        complete = sums.complete()
+    gram = layout.contrasted(layout.contrasted(complete).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 
@@ -319,17 +324,18 @@ def _explain_silence(basis: Basis, channel: str, function: int, lag: int) -> str
     whole = "[{:.4g}, {:.4g}]".format(*basis.interval) if basis.interval else "the real line"
     return (
         f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} is "
-        f"never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower interval, or data "
-        "that cover it."
+        f"never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower interval, "
+        "or data that cover it."
     )
 
 
-def _explain_dependence(statistics: Statistics, root: Array, column: int) -> str:
-    names = statistics.layout.names()
+def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
+    names = layout.names()
     scale = np.linalg.norm(root[:, : column + 1], axis=0)
     combination = np.linalg.lstsq(root[:column, :column] / scale[:column], root[:column, column] / scale[column])[0]
     partners = [names[j] for j in np.argsort(-np.abs(combination))[:3] if abs(combination[j]) > 1e-3]
     return (
-        f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: the "
-        "record does not tell them apart. Use fewer lags or basis functions, or an input with more levels and frequencies."
+        f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
+        "the record does not tell them apart. Use fewer lags or basis functions, or an input with more levels and "
+        "frequencies."
     )
