@@ -191,9 +191,9 @@ def band_limited_noise(
     sections = butter(order, edges if edges.size == 2 else edges[0], kind, fs=1.0 / dt, output="sos")
     # About fifty time constants of the slowest pole.
     run_in = int(np.ceil(5 * order / (dt * float(np.min(np.diff([0.0, *edges]))))))
-    noise = sosfilt(sections, np.random.default_rng(seed).standard_normal(run_in + n))[run_in:]
+    noise = np.asarray(sosfilt(sections, np.random.default_rng(seed).standard_normal(run_in + n)))[run_in:]
     # The deviation of the process, not of this record: records of one design then share one scale.
-    deviation = float(np.linalg.norm(sosfilt(sections, np.eye(1, run_in)[0])))
+    deviation = float(np.linalg.norm(np.asarray(sosfilt(sections, np.eye(1, run_in)[0]))))
     return (low + high) / 2 + (high - low) / 2 * np.clip(noise / (clip * deviation), -1.0, 1.0)
 
 
