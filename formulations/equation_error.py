@@ -17,7 +17,7 @@ from optid.data import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinARX, Nonlinearity
 from optid.program import Program, View
-from optid.rank_one import Block, RankOne
+from optid.rank_one import RankOne
 from optid.streams import Stream
 from optid.regressors import Layout, Statistics, collect
 
@@ -76,8 +76,10 @@ class EquationError:
 
     def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
         """Return what constraints may speak about."""
+        full = np.linalg.lstsq(self.problem.root, self.problem.target, rcond=None)[0]
         return View(expressions, kind=kind, channels=self.channels,
-                    bases=dict(zip(self.channels, self.layout.bases)), gauge=gauge)
+                    bases=dict(zip(self.channels, self.layout.bases)), gauge=gauge,
+                    reference=self.linear_part(full[: self.problem.linear]))
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""
@@ -90,11 +92,11 @@ class EquationError:
     def matrices(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Return Theta_c (P_c, nb_c l) of every input, whatever variables the formulation uses."""
         found = []
-        for c, block in enumerate(self.problem.blocks):
+        for c, shape in enumerate(self.problem.blocks):
             theta, mu, b = (values.get(self.key(name, c)) for name in ("Theta", "mu", "b"))
             if theta is None:
                 theta = np.outer(np.ones(1) if mu is None else mu, np.ravel(np.asarray(b), order="F"))
-            found.append(np.reshape(theta, (block.rows, block.cols)))
+            found.append(np.reshape(theta, shape))
         return found
 
     def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -238,7 +240,7 @@ def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> Ra
     layout, l = statistics.layout, len(statistics.layout.outputs)
     n, na = layout.n_columns, layout.na
     sizes = [b.size for b in layout.bases]
-    blocks = tuple(Block(p, q * l) for p, q in zip(sizes, layout.nb))
+    blocks = tuple((p, q * l) for p, q in zip(sizes, layout.nb))
     linear = na * l * l + l
     total = linear + sum(p * q for p, q in zip(sizes, layout.nb)) * l
     where = np.zeros((l, n), dtype=int)
@@ -262,14 +264,13 @@ def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> Ra
     if curvature:
         extra = np.zeros((total - linear, total + 1))
         position = linear
-        for block, basis in zip(blocks, layout.bases):
+        for (p, q), basis in zip(blocks, layout.bases):
             factor = _square_root(np.asarray(basis.penalty(2)))
-            for _ in range(block.cols):
-                span = slice(position, position + block.rows)
-                extra[position - linear : position - linear + block.rows, span] = np.sqrt(curvature) * factor
-                position += block.rows
+            for _ in range(q):
+                extra[position - linear : position - linear + p, position : position + p] = np.sqrt(curvature) * factor
+                position += p
         system = np.vstack([system, extra])
-    triangle = np.linalg.qr(system, mode="r")
+    triangle = np.triu(np.linalg.qr(system, mode="r"))
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
     scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(l)))
     return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,

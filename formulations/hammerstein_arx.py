@@ -20,15 +20,17 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import EquationError, compress, leading_sign, residual_programme
+from formulations.equation_error import EquationError, compress, residual_programme
 from formulations.losses import with_loss
 from optid.basis import Basis
 from optid.data import Data
+from optid.bilinear import starts
 from optid.errors import StructureError
 from optid.lifting import certify_nuclear, certify_rank_one
 from optid.models import HammersteinARX
 from optid.program import Program, RankOneForm, Values
-from optid.rank_one import split, starts
+from optid.gauges import gauge_factor
+from optid.rank_one import Core, reduce
 from optid.streams import Stream
 from optid.solving import Procedure
 
@@ -74,7 +76,8 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
     linear = problem.linear_variables()
     variables, expressions = dict(linear), dict(linear)
     thetas, gauges, blocks, start = [], [], [], {}
-    point = starts(problem.problem, count=1)[0]
+    core = reduce(problem.problem)
+    point = core.point(*starts(core, count=1)[0])
     start.update(problem.linear_part(point.w))
     for c in range(len(problem.channels)):
         names = problem.key("mu", c), problem.key("b", c)
@@ -86,7 +89,8 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         thetas.append(theta)
         variables.update({names[0]: mu, names[1]: b})
         expressions.update({names[0]: mu, names[1]: b, problem.key("Theta", c): theta})
-        values = to_gauge(gauge, point.mus[c], point.bs[c].reshape(b.shape, order="F"), start.get("a"))
+        values = _in_gauge(gauge, point.mus[c], point.bs[c].reshape(b.shape, order="F"), start.get("a"),
+                           problem.channels[c])
         start.update(dict(zip(names, values)))
     program = residual_programme(
         problem, "hammerstein_arx.exact", variables, problem.residual(linear, thetas),
@@ -115,21 +119,12 @@ def _gauge(gauge: str, b: cp.Variable, a: cp.Variable | None, problem: EquationE
     return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
 
 
-def to_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Move the scale between mu and b so that b satisfies the gauge; ``mu bᵀ`` does not change.
-
-    Raises:
-        StructureError: the gauge cannot be reached (zero first coefficient or zero gain).
-    """
-    if gauge == "norm":
-        size = leading_sign(b) * float(np.linalg.norm(b))
-        if size == 0:
-            return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
-    else:
-        size = float(b.flat[0]) if gauge == "b0" else float(np.sum(b)) / (1 + float(np.sum(a if a is not None else 0)))
-        if abs(size) < 1e-9 * np.linalg.norm(b):
-            raise StructureError(f"gauge {gauge!r} cannot be reached: the quantity it sets to one is zero; use 'norm'")
-    return mu * size, b / size
+def _in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, channel: str
+              ) -> tuple[np.ndarray, np.ndarray]:
+    if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
+        return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
+    factor = gauge_factor(gauge, np.zeros(0) if a is None else a, b, channel)
+    return mu * factor, b / factor
 
 
 def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -208,8 +203,7 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
                       svd: str) -> Program:
     linear = problem.linear_variables()
     keys = [problem.key("Theta", c) for c in range(len(problem.channels))]
-    thetas = {key: cp.Variable((block.rows, block.cols), name=key)
-              for key, block in zip(keys, problem.problem.blocks)}
+    thetas = {key: cp.Variable(shape, name=key) for key, shape in zip(keys, problem.problem.blocks)}
     tau = cp.Parameter(nonneg=True, name="weight", value=float(weight))
     penalty = 2 * tau * sum(cp.normNuc(t) for t in thetas.values()) if name.endswith("nuclear") else 0.0
     program = residual_programme(
@@ -222,10 +216,22 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
 
 
 def _split_model(problem: EquationError, keys: Sequence[str], gauge: str, svd: str, values: Values) -> HammersteinARX:
+    core = reduce(problem.problem)
     mus, bs = [], []
     for c, key in enumerate(keys):
-        mu, b = split(problem.problem, c, np.asarray(values[key]), whitened=svd == "whitened")
-        mu, b = to_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"))
+        mu, b = _leading_pair(core, c, np.reshape(values[key], problem.problem.blocks[c]), svd == "whitened")
+        mu, b = _in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.channels[c])
         mus.append(mu)
         bs.append(b)
     return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")
+
+
+def _leading_pair(core: Core, c: int, theta: np.ndarray, whitened: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Leading singular pair of Theta, in the Kronecker metric of the Gram matrix where that is asked for."""
+    if whitened and c in core.kept:
+        position = core.kept.index(c)
+        left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
+    else:
+        left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
+    u, d, vt = np.linalg.svd(left.T @ theta @ right, full_matrices=False)
+    return np.linalg.solve(left.T, u[:, 0] * d[0]), np.linalg.solve(right.T, vt[0])

@@ -12,6 +12,8 @@ _HOME = {
     "Data": "data",
     "read": "readers",
     "open_stream": "readers",
+    "Stream": "streams",
+    "Transform": "channels",
     "Triangular": "bases",
     "Trigonometric": "bases",
     "Polynomial": "bases",
@@ -32,7 +34,7 @@ _HOME = {
     "load": "io",
     "RecursiveARX": "recursion",
 }
-_MODULES = {"signals", "bases", "plots", "report", "errors"}
+_MODULES = {"signals", "bases", "plots", "report", "errors", "examples"}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,15 +6,17 @@ programme's own convex constraints; constraints that are bilinear are linearised
 and right-hand side are parameters.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, find
-from optid.program import Program, RankOneForm
-from optid.rank_one import Point, RankOne, local_solution, starts
+from optid.bilinear import minimise, starts
+from optid.errors import StructureError
+from optid.gauges import gauge_factor
+from optid.program import Program, RankOneForm, Values
+from optid.rank_one import Point, reduce
 from optid.solution import Status
 
 STEPS = 100
@@ -38,17 +40,12 @@ def run(program: Program, settings: Settings) -> Answer:
 
 
 def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
-    found = local_solution(form.problem, count=count, seed=seed)
+    found = minimise(form.problem, count=count, seed=seed)
     values = to_values(program, form, found.point)
-    r = form.problem.root @ lifted(form.problem, found.point) - form.problem.target
+    r = form.problem.root @ found.point.lift() - form.problem.target
     duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
     return Answer(Status.LOCAL if found.converged else Status.LIMIT,
                   "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
-
-
-def lifted(problem: RankOne, point: Point) -> np.ndarray:
-    """Return z = [w; vec(mu_i b_iᵀ)]."""
-    return np.concatenate([point.w, *(np.kron(b, mu) for mu, b in zip(point.mus, point.bs))])
 
 
 def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
@@ -60,23 +57,12 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
         values[name] = np.reshape(point.w[position : position + variable.size], variable.shape, order="F")
         position += variable.size
     for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
-        size = _gauge_size(form.gauge, b, program.variables[b_name].shape, values.get("a"))
+        size = float(np.linalg.norm(b)) or 1.0  # the sign stays: constraints may depend on it
+        if form.gauge != "norm":
+            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), b, mu_name)
         values[mu_name] = mu * size
         values[b_name] = np.reshape(b / size, program.variables[b_name].shape, order="F")
     return values
-
-
-def _gauge_size(gauge: str, b: np.ndarray, shape: tuple[int, ...], a: np.ndarray | None) -> float:
-    norm = float(np.linalg.norm(b))
-    if gauge == "norm":
-        size = norm
-    elif gauge == "b0":
-        size = float(b[0])
-    else:
-        size = float(np.sum(b)) / (1.0 + float(np.sum(a if a is not None else 0.0)))
-    if abs(size) <= 1e-12 * norm or norm == 0:
-        raise ValueError(f"gauge {gauge!r} cannot be reached at this point: the quantity it fixes is zero")
-    return size
 
 
 @dataclass(frozen=True)
@@ -162,8 +148,9 @@ class _Constrained:
     # points
 
     def _candidates(self, count: int, seed: int) -> list[Point]:
-        best = local_solution(self.problem, count=count, seed=seed).point
-        points = [best, *starts(self.problem, count=CANDIDATES, seed=seed)]
+        core = reduce(self.problem)
+        points = [minimise(self.problem, count=count, seed=seed).point,
+                  *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed) if core.shapes)]
         distinct: list[Point] = []
         for point in points:
             directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
@@ -181,7 +168,7 @@ class _Constrained:
         """Solve for everything but b, which is held in its gauge; None where the constraints forbid this b."""
         try:
             values = to_values(self.program, self.form, point)
-        except ValueError:
+        except StructureError:  # this direction cannot be scaled into the gauge
             return None
         for (_, name), pin in zip(self.form.blocks, half.pinned):
             pin.value = values[name]
@@ -194,16 +181,14 @@ class _Constrained:
         x = self._pack(answer.values)
         return self._merit(x, 0.0), x
 
-    def _pack(self, values) -> np.ndarray:
+    def _pack(self, values: Values) -> np.ndarray:
         return np.concatenate([np.ravel(values[name], order="F") for name in self.names]).astype(float)
 
     def _parts(self, x: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
         position, pairs = self.linear, []
-        for block in self.problem.blocks:
-            mu = x[position : position + block.rows]
-            b = x[position + block.rows : position + block.rows + block.cols]
-            pairs.append((mu, b))
-            position += block.rows + block.cols
+        for p, q in self.problem.blocks:
+            pairs.append((x[position : position + p], x[position + p : position + p + q]))
+            position += p + q
         return x[: self.linear], pairs
 
     def _lift(self, x: np.ndarray) -> np.ndarray:
@@ -317,7 +302,7 @@ class _Constrained:
     def _duals(self, step: _Step, found: Answer) -> dict[str, np.ndarray]:
         return {name: self.unit**2 * dual for name, dual in found.duals.items() if name in self.program.constraints}
 
-    def _all_duals(self, values, duals) -> dict[str, np.ndarray]:
+    def _all_duals(self, values: Values, duals: Values) -> dict[str, np.ndarray]:
         r = self.problem.root @ self._lift(self._pack(values)) - self.problem.target
         return {**duals, "residual": -2.0 * r}
 
@@ -325,5 +310,3 @@ class _Constrained:
 back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
                    about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints")
 
-
-__all__: Sequence[str] = ["back_end", "lifted", "run", "to_values"]

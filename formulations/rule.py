@@ -1,0 +1,24 @@
+"""A named constraint that is built when the variables of a formulation exist."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from optid.program import View
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What the functions of `formulations.shape` return, and what ``constraints=[...]`` takes.
+
+    Attributes:
+        name: name under which it is reported.
+        build: view -> CVXPY constraint or list of them.
+    """
+
+    name: str
+    build: Callable[[View], Any]
+
+    def __call__(self, view: View) -> dict[str, Any]:
+        """Build the constraint in the variables of a formulation."""
+        return {self.name: self.build(view)}

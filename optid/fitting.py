@@ -1,0 +1,173 @@
+"""Fit a model: examine the record, pose the problem, solve it, judge and prove the answer, report it."""
+
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from optid.data import Data
+from optid.doctor import examine, examine_rows
+from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError
+from optid.prices import Price, price_constraints
+from optid.program import Program
+from optid.registry import check_arguments, formulation, named_constraint
+from optid.solution import Solution, Status
+from optid.solving import Outcome, run
+from optid.streams import Stream
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model with the evidence for it.
+
+    Attributes:
+        model: the identified model, in raw units; None only with ``raises=False``.
+        solution: status, proof, residuals and times.
+        formulation: its name.
+        arguments: what it was called with.
+        program: the last programme solved.
+        data: the record.
+        prices: activity and price of every user constraint.
+        findings: what the examination of the record found, one sentence each.
+        figures: rows used, rows there are, condition number, method of the statistics.
+        steps: (name, solution) of every programme on the way.
+        seconds: wall time of the whole call.
+    """
+
+    model: Any
+    solution: Solution
+    formulation: str
+    arguments: Mapping[str, Any] = field(repr=False)
+    program: Program = field(repr=False)
+    data: Data | Stream = field(repr=False)
+    prices: tuple[Price, ...] = ()
+    findings: tuple[str, ...] = ()
+    figures: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    steps: tuple[tuple[str, Solution], ...] = field(default=(), repr=False)
+    seconds: float = 0.0
+
+    @cached_property
+    def one_step_fit(self) -> np.ndarray:
+        """One-step fit in % of every output on the rows used for the estimate."""
+        return self.program.compressed.one_step_fit(self.solution.values)
+
+    @cached_property
+    def simulation_fit(self) -> np.ndarray:
+        """Simulation fit in % of every output on the estimation record, initial conditions fitted."""
+        from optid.validation import fit_percent
+
+        if isinstance(self.data, Stream):
+            return np.full(len(self.data.outputs), np.nan)
+        raw = self.data.raw()
+        simulated = self.model.simulate(raw, x0="fit")
+        several = simulated if isinstance(simulated, list | tuple) else [simulated]
+        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(several))
+
+    @cached_property
+    def uncertainty(self) -> Any:
+        """Standard errors, intervals and bands (`optid.uncertainty.Uncertainty`)."""
+        from optid.uncertainty import uncertainty
+
+        return uncertainty(self)
+
+    def __str__(self) -> str:
+        from optid.printing import describe
+
+        return describe(self)
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        printer.text("Fit(...)" if cycle else str(self))
+
+
+def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hammerstein_arx.exact", *,
+        solver: Any = "auto", accuracy: float = 1e-8, time_limit: float | None = None, isolate: bool | None = None,
+        prove: bool = True, constraints: Sequence[Any] = (), solver_options: Mapping[str, Any] | None = None,
+        raises: bool = True, **structure: Any) -> Fit:
+    """Fit a model to a record.
+
+    Args:
+        data: the record; a `Stream` for files larger than memory.
+        formulation_name: name of a registered formulation, or the callable itself.
+        solver: the back end's word, or "auto".
+        accuracy: requested relative accuracy.
+        time_limit: seconds for each programme; the solver then runs in a process of its own.
+        isolate: run the solver in a process of its own, so that a crash is an outcome.
+        prove: ask for a proof of global optimality.
+        constraints: builders (``formulations.shape``), callables of the named variables, or words such as
+            "monotone:increasing". They are stated in the units of ``data``.
+        solver_options: native options of the solver.
+        raises: False returns failures as values (``fit.solution.status``) instead of raising.
+        structure: arguments of the formulation (na, nb, nk, basis, loss, gauge, ...).
+
+    Returns:
+        The model in raw units with status, proof, constraint prices and times.
+
+    Raises:
+        DataError, RankError: the record cannot determine the model.
+        StructureError, LookupFailed, SolverMissing: the request cannot be met; the message says what to change.
+        InfeasibleError: with the smallest conflicting subset of constraints found.
+        UnboundedError, SolverFailed: no usable point, with the reason.
+    """
+    started = time.perf_counter()
+    if not isinstance(data, Data | Stream):
+        raise DataError(f"fit takes optid.Data (or a stream), not {type(data).__name__}; use optid.Data(u=, y=, dt=)")
+    name, pose = formulation(formulation_name)
+    arguments = dict(structure)
+    built = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
+    if built:
+        arguments["constraints"] = built
+    check_arguments(name, pose, arguments)
+    findings = _examined(data, arguments)
+    problem = pose(data, **arguments)
+    built_at = time.perf_counter()
+    outcome = run(problem, solver, accuracy=accuracy, time_limit=time_limit, isolate=isolate, prove=prove,
+                  **(solver_options or {}))
+    outcome = replace(outcome, solution=replace(
+        outcome.solution, times=replace(outcome.solution.times, build=built_at - started)))
+    if raises:
+        _raise_failure(outcome, accuracy)
+    model = outcome.model
+    transform = getattr(data, "transform", None)
+    if model is not None and transform is not None and not transform.is_identity:
+        model = model.with_transform(transform)
+    statistics = getattr(outcome.program.compressed, "statistics", None)
+    figures = {} if statistics is None else {"rows": statistics.rows, "candidates": statistics.candidates,
+                                             "condition": statistics.condition, "method": statistics.method}
+    if statistics is not None:
+        findings += examine_rows(statistics.rows, statistics.candidates, statistics.condition)
+    return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
+               program=outcome.program, data=data, prices=price_constraints(outcome.program, outcome.solution),
+               findings=tuple(findings), figures=figures, steps=outcome.steps, seconds=time.perf_counter() - started)
+
+
+def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
+    if isinstance(data, Stream):
+        return []
+    from optid.bases import Linear, parse
+
+    basis = arguments.get("basis", Linear())
+    several = list(basis) if isinstance(basis, list | tuple) else [basis] * data.m
+    if len(several) != data.m:
+        raise StructureError(f"{len(several)} bases for {data.m} inputs ({', '.join(data.inputs)})")
+    return examine(data, [parse(b) if isinstance(b, str) else b for b in several])
+
+
+def _raise_failure(outcome: Outcome, accuracy: float) -> None:
+    solution, program = outcome.solution, outcome.program
+    if solution.status is Status.INFEASIBLE:
+        from optid.infeasibility import explain
+
+        raise InfeasibleError(explain(program))
+    if solution.status is Status.UNBOUNDED:
+        raise UnboundedError(f"{program.name!r} has no minimum (according to {solution.solver}): the constraints or the "
+                             "penalty leave a direction in which the objective falls for ever")
+    if solution.status is Status.FAILED or not solution.has_point:
+        raise SolverFailed(f"{solution.solver} gave no usable answer for {program.name!r}: "
+                           f"{solution.reason or solution.claimed}. Try another solver (optid solvers)")
+    if solution.status in (Status.INACCURATE, Status.LIMIT):
+        warnings.warn(f"{solution.solver} stopped with status '{solution.status}': {solution.reason}", DataWarning,
+                      stacklevel=3)

@@ -1,0 +1,79 @@
+"""What every constraint costs: activity, slack, multiplier, and the multiplier in points of fit."""
+
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+
+from optid.program import Program
+from optid.solution import Solution
+
+ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below which it counts as active
+
+
+@dataclass(frozen=True)
+class Price:
+    """One user constraint at the solution.
+
+    Attributes:
+        name: the user's name.
+        active: how many of its rows hold with equality.
+        rows: how many rows it has.
+        slack: smallest slack over the rows (0 for equalities).
+        multiplier: largest multiplier over the rows, in units of the objective per unit of the constraint; ``nan``
+            where the solver gives none.
+        fit_points: points of one-step fit (%, all outputs together) gained per unit by which the most expensive row
+            is relaxed.
+    """
+
+    name: str
+    active: int
+    rows: int
+    slack: float
+    multiplier: float
+    fit_points: float
+
+    @property
+    def binding(self) -> bool:
+        """Whether at least one row is active."""
+        return self.active > 0
+
+
+def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]:
+    """Return the price of every user constraint; empty without a point.
+
+    ``fit = 100 (1 - sqrt(F / S))`` with S the objective of the zero model, so that a multiplier lambda = -dF/d(bound)
+    is worth ``50 lambda / sqrt(F S)`` points.
+    """
+    if not solution.has_point:
+        return ()
+    program.assign(solution.values)
+    floor = 1e-9 * solution.scale
+    worth = 50.0 / np.sqrt(max(solution.objective, floor) * solution.scale) if solution.scale > 0 else np.nan
+    found = []
+    for name, group in program.user_constraints.items():
+        active = rows = 0
+        slack = np.inf
+        for member in group:
+            size = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
+            gaps = _slacks(member)
+            rows += gaps.size
+            active += int(np.count_nonzero(gaps <= ACTIVE * size))
+            slack = min(slack, float(np.min(gaps, initial=np.inf)))
+        dual = solution.duals.get(name)
+        multiplier = float(np.max(np.abs(dual), initial=0.0)) if dual is not None else np.nan
+        found.append(Price(name, active, rows, max(slack, 0.0), multiplier, multiplier * worth))
+    return tuple(found)
+
+
+def _slacks(member: cp.Constraint) -> np.ndarray:
+    """Distance of every row from its bound; zero for equalities."""
+    if isinstance(member, cp.constraints.Equality | cp.constraints.Zero):
+        return np.zeros(member.size)
+    if isinstance(member, cp.constraints.Inequality | cp.constraints.NonPos):
+        return -np.ravel(member.expr.value)
+    if isinstance(member, cp.constraints.PSD):
+        return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
+    if isinstance(member, cp.SOC):
+        return np.atleast_1d(member.args[0].value) - np.linalg.norm(np.atleast_1d(member.args[1].value))
+    return np.ravel(member.args[0].value)
