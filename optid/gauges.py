@@ -39,7 +39,8 @@ def in_raw_units(model: "HammersteinARX", transform: Transform) -> "HammersteinA
     gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
     if len(transform.u_scale) != model.m or gain.size != model.l:
         raise StructureError(
-            f"The transform has {len(transform.u_scale)} inputs and {gain.size} outputs, the model {model.m} and {model.l}."
+            f"The transform has {len(transform.u_scale)} inputs and {gain.size} outputs, "
+            f"the model {model.m} and {model.l}."
         )
     a = model.a if model.l == 1 else model.a * (gain[:, None] / gain)
     b = tuple(row * gain for row in model.b)
