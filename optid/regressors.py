@@ -55,9 +55,9 @@ class Statistics:
     def __add__(self, other: "Statistics") -> "Statistics":
         if self.layout != other.layout:
             raise StructureError("Statistics to be added must have the same layout: na, nb, nk, bases and names.")
-        factor = None
-        if self.factor is not None or other.factor is not None:
-            factor = add_to_root(self.root, other.root)
+        factor = None  # digits that one Gram matrix has lost do not come back
+        if self.factor is not None and other.factor is not None:
+            factor = add_to_root(self.factor, other.factor)
         return Statistics(
             self.layout, self.gram + other.gram, self.rows + other.rows, self.candidates + other.candidates, factor
         )
@@ -107,6 +107,9 @@ class Statistics:
                 "Use a longer record, fewer lags or fewer basis functions."
             )
         energy = np.diag(self.gram)[:n]
+        silent = np.flatnonzero(energy[: self.layout.na * self.layout.l] == 0)
+        if silent.size:
+            raise RankError(f"Output {self.layout.outputs[silent[0] % self.layout.l]!r} is zero in every used row.")
         for c, (channel, basis) in enumerate(zip(self.layout.inputs, self.layout.bases)):
             block = energy[self.layout.block(c)].reshape(-1, basis.size)
             lags, functions = np.nonzero(block <= 1e-14 * block.mean())
@@ -274,12 +277,12 @@ def _records(
     if weights is not None and len(weights) != len(data.experiments):
         raise DataError(f"{len(weights)} arrays of weights for {len(data.experiments)} experiments: give one each.")
     for i, experiment in enumerate(data.experiments):
-        name = f"experiment {i + 1}, " if len(data.experiments) > 1 else ""
+        name = f"experiment {i + 1}: " if len(data.experiments) > 1 else ""
         count = len(experiment.y)
         if count <= layout.first_row:
             raise RankError(
-                f"{name or 'the record, '}{count} samples: the lags reach back {layout.first_row} samples, so no row "
-                "is complete. Leave it out, or use fewer lags."
+                f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. Leave it out, "
+                "or use fewer lags."
             )
         if weights is None:
             yield name, [(experiment.u, experiment.y)]
