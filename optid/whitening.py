@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
+_trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 
 
 def kronecker_factors(gram: Array, shape: tuple[int, int], passes: int = 5) -> tuple[Array, Array]:
@@ -46,7 +47,7 @@ def _factor(matrix: Array) -> tuple[Array, Array]:
 
 def invert_triangular(factor: Array, lower: bool = True) -> Array:
     """Inverse of a triangular matrix whose diagonal has no zero."""
-    inverse, info = lapack.dtrtri(factor, lower=int(lower))
+    inverse, info = _trtri(factor, lower=int(lower))
     if info:
         raise np.linalg.LinAlgError(f"the triangular factor is singular at row {info - 1}")
     return inverse
@@ -85,6 +86,10 @@ class Whitening:
             start = stop
         return new
 
+    def cone(self, block: int, rows: Array) -> Array:
+        """Rows (r, P) that act on mu of a block, written for the new coordinates."""
+        return rows @ invert_triangular(self.factors_mu[block]).T
+
     def matrix(self) -> Array:
         """The (n, n) matrix K of the change of coordinates ``z' = K z``."""
         size = self.linear + sum(p * nb for p, nb in self.shapes)
@@ -104,8 +109,8 @@ class Whitening:
 
     def back(self, mus: list[Array], bs: list[Array]) -> tuple[list[Array], list[Array]]:
         """Factors (mu_i, b_i) in the original coordinates."""
-        return ([lapack.dtrtrs(factor, mu, lower=1, trans=1)[0] for factor, mu in zip(self.factors_mu, mus)],
-                [lapack.dtrtrs(factor, b, lower=1, trans=1)[0] for factor, b in zip(self.factors_b, bs)])
+        return ([_trtrs(factor, mu, lower=1, trans=1)[0] for factor, mu in zip(self.factors_mu, mus)],
+                [_trtrs(factor, b, lower=1, trans=1)[0] for factor, b in zip(self.factors_b, bs)])
 
 
 def whiten(root: Array, shapes: tuple[tuple[int, int], ...], linear: int = 0) -> Whitening:

@@ -1,0 +1,109 @@
+"""Algebra of the 2 x 2 minors: quadratic forms that vanish on rank-one matrices, and the dual bound they give.
+
+Adding such a form ``z^T M z`` to a least-squares objective changes nothing on the rank-one blocks, and if H + M > 0 the
+unrestricted minimum of the sum bounds the objective from below (Lagrangian dual of rank(Theta_i) <= 1; Shor's
+relaxation is its dual). The forms of one block are the symmetric matrices that change sign when the row indices of
+``X[(j, i), (l, k)]``, the lags j and l, are exchanged; this makes projection onto them one transposition.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from optid.rank_one import Array
+
+_potrf, _trtrs = get_lapack_funcs(("potrf", "trtrs"), dtype=float)
+MARGIN = 1e-12  # a Cholesky factor of S - MARGIN max(diag S) I proves S > 0 in spite of roundoff
+
+
+def project_minors(matrix: Array, shape: tuple[int, int]) -> Array:
+    """Nearest combination of the minors of one block to a symmetric matrix (P nb, P nb); exactly antisymmetric."""
+    p, nb = shape
+    tensor = matrix.reshape(nb, p, nb, p)
+    return ((tensor - tensor.transpose(2, 1, 0, 3)) / 2).reshape(p * nb, p * nb)
+
+
+def tangent_minors(gradient: Array, mu: Array, b: Array) -> Array:
+    """The combination M of minors with ``M kron(b, mu) = vec(gradient)``, which needs nothing beyond the tangent data.
+
+    Args:
+        gradient: (P, nb) with gradient b = 0 and gradient^T mu = 0.
+        mu: (P,), not zero.
+        b: (nb,) of unit length.
+    """
+    size = float(mu @ mu)
+    outer = np.outer(gradient.T.ravel(), np.kron(b, mu)) / size
+    return 2 * project_minors(outer + outer.T, gradient.shape)  # pyright: ignore[reportArgumentType]
+
+
+def basis_from(direction: Array) -> Array:
+    """Orthogonal matrix (n, n) whose first column is the unit vector ``direction`` (Householder)."""
+    reflector = direction.copy()
+    sign = 1.0 if direction[0] >= 0 else -1.0
+    reflector[0] += sign
+    return -sign * (np.eye(len(direction)) - np.outer(reflector, reflector) / (1 + abs(direction[0])))
+
+
+def free_mask(shape: tuple[int, int]) -> np.ndarray:
+    """Entries, as (P nb, P nb), of the minors that do not contain Theta[0, 0]."""
+    p, nb = shape
+    mask = np.ones((nb, p, nb, p), dtype=bool)
+    mask[0, 0] = False
+    mask[:, :, 0, 0] = False
+    mask[0, :, :, 0] = False
+    mask[:, 0, 0, :] = False
+    return mask.reshape(p * nb, p * nb)
+
+
+def cholesky(matrix: Array) -> Any | None:
+    """Upper factor of a matrix proved positive definite with a margin for roundoff, or None."""
+    shifted = matrix.copy()
+    shifted.flat[::len(matrix) + 1] -= MARGIN * max(float(matrix.diagonal().max(initial=0.0)), 0.0)
+    factor, info = _potrf(shifted, clean=0)
+    return None if info else factor
+
+
+@dataclass(frozen=True, eq=False)
+class Lagrangian:
+    """The objective around a feasible point, with the terms of constraints linear in z already added.
+
+    Attributes:
+        gram: (k, k) H.
+        z: (k,) the point.
+        slope: (k,) half the gradient of objective and linear terms at z.
+        value: objective at the point.
+        linear_terms: value at the point of the linear terms, <= 0 at a feasible point.
+    """
+
+    gram: Array
+    z: Array
+    slope: Array
+    value: float
+    linear_terms: float = 0.0
+
+    def with_linear(self, rows: Array, slack: Array, multipliers: Array) -> "Lagrangian":
+        """Add ``multipliers @ (rows z - right)``; slack is right - rows z at the point."""
+        slope = self.slope + multipliers @ rows / 2
+        return Lagrangian(self.gram, self.z, slope, self.value, self.linear_terms - float(multipliers @ slack))
+
+    def bound(self, minors: Array, cuts: Array | None = None) -> float:
+        """Closed-form minimum over all z of objective + linear terms + z^T (minors - cuts) z; -inf unless H + M > 0.
+
+        Written around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far
+        below the roundoff of the objective itself is resolved.
+
+        Args:
+            minors: (k, k) combination of minors, zero at every rank-one point.
+            cuts: (k, k) form that is nonnegative at every feasible point.
+        """
+        extra = minors if cuts is None else minors - cuts
+        if not len(self.z):
+            return self.value
+        factor = cholesky(self.gram + extra)
+        if factor is None:
+            return -np.inf
+        half, _ = _trtrs(factor, self.slope + extra @ self.z, trans=1)
+        at_point = self.linear_terms - (0.0 if cuts is None else float(self.z @ cuts @ self.z))
+        return self.value + at_point - float(half @ half)
