@@ -10,6 +10,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from optid.bases import parse
 from optid.basis import Basis
@@ -76,7 +77,7 @@ class EquationError:
 
     def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
         """Return what constraints may speak about."""
-        full = np.linalg.lstsq(self.problem.root, self.problem.target, rcond=None)[0]
+        full = solve_triangular(self.problem.root, self.problem.target)
         return View(expressions, kind=kind, channels=self.channels,
                     bases=dict(zip(self.channels, self.layout.bases)), gauge=gauge,
                     reference=self.linear_part(full[: self.problem.linear]))

@@ -315,7 +315,10 @@ def _mirror(basis: Any, parity: float) -> np.ndarray:
     if reach <= 0:
         raise StructureError(f"the interval [{lo:g}, {hi:g}] of the input does not contain zero: "
                              "a symmetry about zero says nothing there")
-    points = np.linspace(0.0, reach, max(64, 8 * basis.size))
+    # as many points as the family has functions of the other parity: more would overdetermine a family whose nodes are
+    # not mirror images of each other, and leave only straight lines
+    count = max(basis.size // 2 if parity > 0 else (basis.size + 1) // 2, 1)
+    points = reach * np.arange(1, count + 1) / count
     both = basis.values(points) + parity * basis.values(-points)
     return both - 2 * basis.values(np.zeros(1)) if parity > 0 else both
 

@@ -21,10 +21,35 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
         objective has a kink at the point.
     """
     program.assign(values)
-    objective = float(np.asarray(program.objective.expr.value))
     violation, worst = measure_violation(program)
+    if program.rank_one is not None and not program.user_constraints:
+        objective, stationarity = _rank_one_residuals(program)
+        return objective, Residuals(violation, worst, stationarity, 0.0)
+    objective = float(np.asarray(program.objective.expr.value))
     stationarity, complementarity = _first_order(program, duals, objective)
     return objective, Residuals(violation, worst, stationarity, complementarity)
+
+
+def _rank_one_residuals(program: Program) -> tuple[float, float]:
+    """Objective and stationarity of an unconstrained rank-one programme from its compressed numbers.
+
+    The gauge has multiplier zero, because moving the scale between mu and b does not change the objective.
+    """
+    form = program.rank_one
+    assert form is not None
+    problem = form.problem
+    w = np.concatenate([np.ravel(program.variables[name].value, order="F") for name in form.linear] or [np.zeros(0)])
+    pairs = [(program.variables[mu].value, np.ravel(program.variables[b].value, order="F")) for mu, b in form.blocks]
+    z = np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
+    r = problem.root @ z - problem.target
+    pull = 2.0 * problem.root.T @ r
+    parts, position = [pull[: w.size]], w.size
+    for mu, b in pairs:
+        block = pull[position : position + mu.size * b.size].reshape(b.size, mu.size)
+        parts += [block.T @ b, block @ mu]
+        position += mu.size * b.size
+    size = 2.0 * float(np.max(np.abs(problem.root.T @ problem.target), initial=0.0))
+    return float(r @ r) + problem.remainder, float(np.max(np.abs(np.concatenate(parts)))) / (1.0 + size)
 
 
 def measure_violation(program: Program) -> tuple[float, str]:

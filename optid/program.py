@@ -20,20 +20,22 @@ class View(Mapping[str, cp.Expression]):
     """The named expressions that a constraint may speak about, and the structure it may need.
 
     Attributes:
-        kind: "exact" (variables a, b, mu, offset) or "relaxed" (a, Theta, offset).
+        kind: "exact" (variables a, b, mu, offset), "relaxed" (a, Theta, offset) or "linear" (a, b, offset).
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
         bases: the fitted basis of every channel.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
+        reference: values of the unconstrained least-squares estimate, for constraints that need a centre.
     """
 
     def __init__(self, expressions: Mapping[str, cp.Expression], *, kind: str, channels: tuple[str, ...] = (),
-                 bases: Mapping[str, Any] | None = None, gauge: str = "") -> None:
+                 bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None) -> None:
         self._expressions = dict(expressions)
         self.kind = kind
         self.channels = channels
         self.bases = dict(bases or {})
         self.gauge = gauge
+        self.reference = dict(reference or {})
 
     def __getitem__(self, name: str) -> cp.Expression:
         try:
@@ -122,7 +124,7 @@ class Program:
         derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
             variables; they are recomputed at every point before it is judged.
         rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
-        certify: (program, values, duals) -> (Bound, better values or None), or None where no certificate exists.
+        certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
         compressed: the compressed data the programme was built from, for uncertainty and figures; its class belongs
@@ -245,7 +247,8 @@ class Program:
                 continue
             constraints[name] = kept
         view = View({name: self.view[name].tree_copy(swap) for name in self.view}, kind=self.view.kind,
-                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge)
+                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
+                    reference=self.view.reference)
         left = {name: v for name, v in self.variables.items() if name not in values}
         held = {name: parameters[name] for name in values}
 

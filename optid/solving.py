@@ -81,19 +81,34 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned non-finite numbers")
 
     clock = time.perf_counter()
-    objective, residuals = judge(program, values, answer.duals)
+    point = _judged(program, answer)
     judged = time.perf_counter()
-    values, duals = program.values(), dict(answer.duals)
-    status, reason = _status(answer, residuals, settings.accuracy, back_end.name)
+    status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
-        values, objective, residuals, bound = _proof(program, values, duals, objective, residuals)
+        point, bound = _proof(program, back_end, settings, point)
         if bound is not None and bound.proved and status is Status.LOCAL:
             status = Status.OPTIMAL
     done = time.perf_counter()
     return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   values=values, duals=duals, objective=objective, bound=bound, residuals=residuals,
+                   values=point.values, duals=point.duals, objective=point.objective, bound=bound,
+                   residuals=point.residuals,
                    times=Times(solve=seconds, judge=judged - clock, prove=done - judged))
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A point with what we measured there."""
+
+    values: Values
+    duals: Values
+    objective: float
+    residuals: Residuals
+
+
+def _judged(program: Program, answer: Answer) -> _Judged:
+    objective, residuals = judge(program, answer.values, answer.duals)
+    return _Judged(program.values(), dict(answer.duals), objective, residuals)
 
 
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
@@ -116,22 +131,30 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     return Status.LOCAL, ""
 
 
-def _proof(program: Program, values: Values, duals: Values, objective: float, residuals: Residuals
-           ) -> tuple[Values, float, Residuals, Bound | None]:
-    if program.certify is not None:
-        bound, better = program.certify(program, values, duals)
-        if better is not None:  # the proof attempt found a better point: judge that one instead
-            program.assign(better)
-            objective, residuals = judge(program, better, {})
-            values = program.values()
-        return values, objective, residuals, bound
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged) -> tuple[_Judged, Bound | None]:
+    """Ask for a proof; when the attempt proposes a better start, solve again from there and keep the better point."""
+    if program.certify is None:
+        return point, _convex_proof(program, point)
+    bound, start = program.certify(program, point.values, point.duals)
+    if start is not None and not bound.proved:
+        answer = back_end.run(replace(program, start=start), settings)
+        if answer.values:
+            again = _judged(program, answer)
+            lower = point.objective - 1e-10 * abs(point.objective)
+            if again.objective < lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
+                bound, _ = program.certify(program, again.values, again.duals)
+                return again, bound
+        program.assign(point.values)
+    return point, bound
+
+
+def _convex_proof(program: Program, point: _Judged) -> Bound | None:
+    residuals = point.residuals
     if not program.problem.is_dcp() or not np.isfinite(residuals.stationarity):
-        return values, objective, residuals, None
+        return None
     error = max(residuals.violation, residuals.stationarity, residuals.complementarity)
-    proved = error < 1e-6
-    reason = f"convex programme; optimality conditions hold to {error:.0e}"
-    return values, objective, residuals, Bound(objective - residuals.complementarity * (1.0 + abs(objective)), proved,
-                                               "convex optimality conditions", reason)
+    return Bound(point.objective - residuals.complementarity * (1.0 + abs(point.objective)), error < 1e-6,
+                 "convex optimality conditions", f"convex programme; optimality conditions hold to {error:.0e}")
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,21 @@ def run(program: Program, settings: Settings) -> Answer:
 
 def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
     found = minimise(form.problem, count=count, seed=seed)
+    if program.start:
+        again = minimise(form.problem, start_point(form, program.start))
+        found = again if again.value < found.value else found
     values = to_values(program, form, found.point)
     r = form.problem.root @ found.point.lift() - form.problem.target
     duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
     return Answer(Status.LOCAL if found.converged else Status.LIMIT,
                   "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
+
+
+def start_point(form: RankOneForm, start: Values) -> Point:
+    """Read a point from named values."""
+    w = np.concatenate([np.ravel(start[name], order="F") for name in form.linear] or [np.zeros(0)])
+    return Point(w, tuple(np.asarray(start[mu], dtype=float) for mu, _ in form.blocks),
+                 tuple(np.ravel(start[b], order="F") for _, b in form.blocks))
 
 
 def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
@@ -81,7 +91,7 @@ class _Constrained:
 
     def __init__(self, program: Program, form: RankOneForm, settings: Settings, inner: str) -> None:
         self.program, self.form, self.problem = program, form, form.problem
-        self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-9), warm=False)
+        self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-11), warm=False)
         names = [*form.linear, *(name for pair in form.blocks for name in pair)]
         self.variables = [program.variables[name] for name in names]
         self.names, self.size = names, sum(v.size for v in self.variables)
@@ -149,7 +159,8 @@ class _Constrained:
 
     def _candidates(self, count: int, seed: int) -> list[Point]:
         core = reduce(self.problem)
-        points = [minimise(self.problem, count=count, seed=seed).point,
+        points = [start_point(self.form, self.program.start)] if self.program.start else []
+        points += [minimise(self.problem, count=count, seed=seed).point,
                   *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed) if core.shapes)]
         distinct: list[Point] = []
         for point in points:
