@@ -159,13 +159,13 @@ class HammersteinARX:
         return np.outer(self.nonlinearities[c].mu, self.b[c].ravel(order="F"))
 
     @cached_property
-    def poles(self) -> Array:
+    def poles(self) -> Any:
         """Roots of det A(z), complex (na l,), largest first."""
         n = self.na * self.l
         companion = np.eye(n, k=-self.l)
         if n:
             companion[: self.l] = -np.hstack(list(simulation.matrices_of(self)))
-        poles = np.linalg.eigvals(companion).astype(complex)
+        poles: Any = np.linalg.eigvals(companion).astype(complex)
         return poles[np.lexsort((poles.imag, -np.abs(poles)))]
 
     @property
@@ -210,7 +210,7 @@ class HammersteinARX:
 
     def __str__(self) -> str:
         """Return the equations and the poles."""
-        poles = ", ".join(f"{p.real:.4g}" if abs(p.imag) < 1e-12 else f"{p:.4g}" for p in self.poles.tolist())
+        poles = ", ".join(f"{p.real:.4g}" if abs(p.imag) < 1e-12 else f"{p:.4g}" for p in list(self.poles))
         return self.equation() + (f"\npoles: {poles}" if poles else "")
 
     # -- prediction and simulation -------------------------------------------------------------------------------

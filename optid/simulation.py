@@ -1,6 +1,6 @@
 """One-step prediction and simulation of A(q) y = sum_c B_c(q) f_c(u_c) + d, without a Python loop over samples.
 
-The state is what the past adds to the right-hand side of the next n equations, x (n, l): the observer form of the model.
+The state x (n, l) is what the past adds to the right-hand side of the next n equations: the observer form of the model.
 It shifts by one every sample and receives B_i f(u) - A_i y, so a free response is 1/A driven by the rows of x.
 """
 
@@ -63,6 +63,7 @@ def simulate_record(model: "HammersteinARX", u: Array, state: Array, label: str 
 def fitted_state(model: "HammersteinARX", u: Array, y: Array, label: str = "") -> Array:
     """Estimate the initial state (n, l) by least squares of the simulated on the measured outputs, where present.
 
+    The errors of each output count in units of its standard deviation, so that the estimate does not depend on units.
     Directions that the record does not determine are set to zero.
     """
     n, outputs = model.memory, model.l
@@ -70,13 +71,15 @@ def fitted_state(model: "HammersteinARX", u: Array, y: Array, label: str = "") -
         return np.zeros((0, outputs))
     rest = (y - simulate_record(model, u, np.zeros((n, outputs)), label))[: _horizon(model, len(y))]
     free = impulse_of_inverse(model, len(rest))  # (T, l, l)
-    columns = np.zeros((len(rest), outputs, n, outputs))
-    for i in range(min(n, len(rest))):
-        columns[i:, :, i] = free[: len(rest) - i]
     present = ~np.isnan(rest)
-    design = columns[present].reshape(-1, n * outputs)
     if not present.any():
         return np.zeros((n, outputs))
+    unit = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
+    unit[unit == 0] = 1.0
+    columns = np.zeros((len(rest), outputs, n, outputs))
+    for i in range(min(n, len(rest))):
+        columns[i:, :, i] = free[: len(rest) - i] / unit[:, None]
+    design, rest = columns[present].reshape(-1, n * outputs), rest / unit
     sizes = np.linalg.norm(design, axis=0)
     sizes[sizes == 0] = 1.0
     return (np.linalg.lstsq(design / sizes, rest[present])[0] / sizes).reshape(n, outputs)

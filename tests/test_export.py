@@ -1,0 +1,101 @@
+"""Exports against the model's own responses and simulation."""
+
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy import signal
+from systems import BASES, inputs, mimo, nonlinearity, siso
+
+from optid.bases import UserFunctions
+from optid.errors import OptidError, StructureError
+from optid.models import Nonlinearity
+
+
+@pytest.mark.parametrize("model", [siso(), siso(nk=3), siso(a=[]), mimo()])
+def test_dlti_has_the_impulse_responses(model):
+    expected = model.impulse_response(30)
+    for o in range(model.l):
+        for c in range(model.m):
+            system = model.to_dlti(model.outputs[o], c)
+            assert system.dt == model.dt
+            assert system.impulse(n=30)[1][0][:, 0] == pytest.approx(expected[:, o, c], abs=1e-12)
+
+
+def test_dlti_channels():
+    with pytest.raises(StructureError, match="Known: u|Did you mean 'u'"):
+        siso().to_dlti(input="x")
+    with pytest.raises(StructureError, match="counted from 0"):
+        siso().to_dlti(output=1)
+    assert isinstance(siso().to_dlti(), signal.dlti)
+
+
+@pytest.mark.parametrize("model", [siso(nk=2), mimo()])
+def test_control_has_the_frequency_response(model):
+    pytest.importorskip("control")
+    system = model.to_control()
+    assert system.dt == model.dt
+    w = np.array([0.01, 0.7, 3.0])
+    response = model.frequency_response(w)
+    for k, frequency in enumerate(w):
+        value = np.reshape(system(np.exp(1j * frequency * model.dt)), (model.l, model.m))
+        assert value == pytest.approx(response[k], abs=1e-10)
+
+
+def test_control_missing_names_the_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(OptidError, match=r"optid\[control\]"):
+        siso().to_control()
+
+
+def iterate(function, u, state):
+    x, outputs = state.ravel(), []
+    for row in u:
+        x, y = function(x, row)
+        x = np.array(x).ravel()
+        outputs.append(np.array(y).ravel())
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_casadi_equals_simulation_inside_and_outside(basis):
+    model = siso(basis, nk=1)
+    u = np.random.default_rng(0).uniform(-1.0, 1.6, (120, 1))
+    state = np.array([[0.4], [-0.3]])
+    simulated = model.simulate(u, x0=state)
+    assert iterate(model.to_casadi(), u, state) == pytest.approx(simulated, abs=1e-9 * np.max(np.abs(simulated)))
+
+
+def test_casadi_mimo_and_static():
+    for model in (mimo(), siso(a=[], b=([2.0],))):
+        u = inputs(model, 80)
+        state = np.random.default_rng(2).normal(size=(model.memory, model.l))
+        function = model.to_casadi()
+        assert function.size1_in(0) == model.memory * model.l and function.size1_in(1) == model.m
+        assert iterate(function, u, state) == pytest.approx(model.simulate(u, x0=state), abs=1e-10)
+
+
+def test_casadi_differentiates():
+    model = siso(BASES[3])
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    slope = ca.Function("slope", [x, u], [ca.jacobian(model.to_casadi()(x, u)[1], u)])
+    assert float(slope([0, 0], 0.4)) == pytest.approx(16 / 15 * model.nonlinearities[0].slope(0.4), abs=1e-9)
+
+
+def test_casadi_in_a_predictive_controller():
+    """One-step tracking through IPOPT finds an input whose simulated output is the target."""
+    model = siso(BASES[2], nonlinearities=(Nonlinearity(nonlinearity(BASES[2]).basis, [1.0, 0.2, 0.1, 0.0]),))
+    u = ca.MX.sym("u")
+    y = model.to_casadi()(ca.DM([0.1, 0.0]), u)[1]
+    solver = ca.nlpsol(
+        "s", "ipopt", {"x": u, "f": (y - 0.8) ** 2}, {"print_time": 0, "ipopt": {"print_level": 0, "sb": "yes"}}
+    )
+    best = float(solver(x0=0.0, lbx=-0.7, ubx=1.3)["x"])
+    assert model.simulate(np.array([[best]]), x0=[0.1, 0.0])[0, 0] == pytest.approx(0.8, abs=1e-4)
+
+
+def test_user_functions_have_no_symbolic_form():
+    functions = UserFunctions((np.tanh,), ("tanh",)).fitted(-1, 1)
+    with pytest.raises(StructureError, match="BSpline"):
+        siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi()
