@@ -61,9 +61,9 @@ def to_casadi(model: "HammersteinARX") -> Any:
     """Return the model as a `casadi.Function` (x, u) -> (x_next, y) without noise.
 
     x has n l entries, n = `model.memory`: the rows of the state (n, l) one after the other, row i being what the past
-    adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The constant
-    is part of y. Outside the interval of its basis f is clamped or extrapolated as chosen (outside="error" clamps, since a
-    symbolic function cannot raise). Iterating equals `model.simulate`.
+    adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The
+    constant is part of y. Outside the interval of its basis f is clamped or extrapolated as chosen (outside="error"
+    clamps, since a symbolic function cannot raise). Iterating equals `model.simulate`.
 
     Raises:
         StructureError: a basis of UserFunctions, which has no symbolic form.
