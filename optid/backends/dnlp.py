@@ -1,7 +1,29 @@
-"""All private names of CVXPY that optid needs, in one place, for the versions pinned in the project file."""
+"""All private names of CVXPY that optid needs, in one place, for the versions pinned in the project file.
+
+A nonconvex programme passes through CVXPY's own smooth chain (variable attributes lowered, kinks replaced by epigraph
+variables); what comes out, `Smooth`, is what every NLP back end works on. The way back, values and multipliers, goes
+through the inverse data of the same chain, never by position.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import cvxpy as cp
+import numpy as np
+from cvxpy.atoms.affine.binary_operators import DivExpression
+from cvxpy.atoms.quad_over_lin import quad_over_lin
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
+from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
+from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
+from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
+
+from optid.errors import StructureError
+
+CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
 
 def conic_capabilities() -> dict[str, tuple[set[str], bool]]:
@@ -21,4 +43,212 @@ def conic_capabilities() -> dict[str, tuple[set[str], bool]]:
     for name in SOLVER_MAP_QP:
         classes, present = found.get(name.lower(), (set(), name in installed))
         found[name.lower()] = (classes | {"LP", "QP"}, present)
+    return found
+
+
+@dataclass(frozen=True)
+class Row:
+    """A block of rows of the smooth programme: ``expression == 0`` or ``expression <= 0``.
+
+    The multiplier of either, in the convention ``L = f + dual * expression``, is CVXPY's own dual value.
+    """
+
+    expression: cp.Expression
+    equality: bool
+    id: int
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A programme after CVXPY's smooth chain, with the way back.
+
+    Attributes:
+        original: the problem it was made from.
+        problem: the smooth problem; its constraints are read through ``rows``.
+        attributes, kinks: the two reductions, with their inverse data in ``inverse``.
+    """
+
+    original: cp.Problem
+    problem: cp.Problem
+    attributes: CvxAttr2Constr
+    kinks: Dnlp2Smooth
+    inverse: tuple[Any, Any]
+
+    @cached_property
+    def variables(self) -> tuple[cp.Variable, ...]:
+        """Variables of the smooth problem, in the order of its flat vector of unknowns."""
+        return tuple(self.problem.variables())
+
+    @cached_property
+    def parameters(self) -> tuple[cp.Parameter, ...]:
+        """Parameters of the smooth problem, in the order of its flat vector of parameters."""
+        return tuple(self.problem.parameters())
+
+    @cached_property
+    def rows(self) -> tuple[Row, ...]:
+        """The constraints as rows.
+
+        Raises:
+            StructureError: a cone that is not a smooth equality or inequality.
+        """
+        return tuple(_row(constraint) for constraint in self.problem.constraints)
+
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the flat vector of unknowns."""
+        pairs = [variable.get_bounds() for variable in self.variables]
+        return _flat([lower for lower, _ in pairs]), _flat([upper for _, upper in pairs])
+
+    @cached_property
+    def row_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the stacked rows."""
+        lower = [np.full(row.expression.size, 0.0 if row.equality else -np.inf) for row in self.rows]
+        return _flat(lower), _flat([np.zeros(row.expression.size) for row in self.rows])
+
+    def start(self) -> np.ndarray:
+        """Return the flat start: the values the original variables hold now, auxiliary ones consistent with them."""
+        known = {variable.id for variable in self.original.variables()}
+        plain = all(variable.id in known for variable in self.variables) and not self.inverse[0]
+        current = self if plain else _apply(self.original)
+        _set_nlp_initial_point(current.problem)
+        return _flat([variable.value for variable in current.variables])
+
+    def parameter_values(self) -> np.ndarray:
+        """Return the flat vector of the values the parameters hold now."""
+        self.attributes.update_parameters(self.original)
+        return _flat([parameter.value for parameter in self.parameters])
+
+    def restore(self, x: np.ndarray, multipliers: np.ndarray) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+        """Map a flat point and the flat multipliers of the rows back to the original problem.
+
+        Args:
+            x: (unknowns,) point of the smooth problem.
+            multipliers: (rows,) in the convention ``L = f + multipliers * row``; empty where there are none.
+
+        Returns:
+            ``({variable id: value}, {constraint id: dual})``, arrays flattened column by column for the duals.
+        """
+        primal, at = {}, 0
+        for variable in self.variables:
+            primal[variable.id] = np.reshape(x[at : at + variable.size], variable.shape, order="F")
+            at += variable.size
+        dual, at = {}, 0
+        for row in self.rows if multipliers.size else ():
+            dual[row.id] = multipliers[at : at + row.expression.size]
+            at += row.expression.size
+        solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
+        solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
+        return solution.primal_vars, solution.dual_vars
+
+
+def smooth(problem: cp.Problem) -> Smooth:
+    """Return the smooth form of a problem; it is made once and kept with the problem.
+
+    Raises:
+        StructureError: a part that the smooth chain does not carry over faithfully.
+    """
+    kept = cache(problem)
+    if "smooth" not in kept:
+        kept["smooth"] = _apply(problem)
+    return kept["smooth"]
+
+
+def cache(problem: cp.Problem) -> dict[str, Any]:
+    """Return our part of the problem's cache of compiled solvers, which lives and dies with the problem."""
+    return problem._solver_cache.setdefault(CACHE, {})
+
+
+def _apply(problem: cp.Problem) -> Smooth:
+    _set_nlp_initial_point(problem)
+    attributes, kinks = CvxAttr2Constr(reduce_bounds=False), _SmoothChain()
+    lowered, inverse = attributes.apply(problem)
+    for variable in problem.variables():  # the reduced symmetric variable does not inherit its start
+        if inverse and variable in attributes._symmetric_vars:
+            reduced = inverse[0][variable.id]
+            reduced.value = np.reshape(lower_value(variable), reduced.shape, order="F")
+    result, inverse_kinks = kinks.apply(lowered)
+    return Smooth(problem, result, attributes, kinks, (inverse, inverse_kinks))
+
+
+class _SmoothChain(Dnlp2Smooth):
+    """CVXPY's smooth chain, with three of its canonicalisations replaced because they change the problem.
+
+    * Division by a constant or parameter: CVXPY forces the divisor to be nonnegative, so that ``x / -2`` becomes
+      infeasible. It is smooth as it stands.
+    * ``quad_over_lin`` along an axis: CVXPY sums over everything.
+    * ``quad_over_lin``, ``rel_entr`` and ``kl_div`` with a parameter: CVXPY freezes its value of the first solve.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        originals = self.smooth_canon_methods
+        self.smooth_canon_methods = {
+            **originals,
+            DivExpression: _divide(originals[DivExpression]),
+            quad_over_lin: _quad_over_lin(originals[quad_over_lin]),
+            cp.rel_entr: _refuse_parameters(originals[cp.rel_entr]),
+            cp.kl_div: _refuse_parameters(originals[cp.kl_div]),
+        }
+
+
+def _divide(original: Any) -> Any:
+    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
+        return original(expr, args) if args[1].variables() else (expr.copy(args), [])
+
+    return canonicalise
+
+
+def _quad_over_lin(original: Any) -> Any:
+    def canonicalise(expr: Any, args: list) -> tuple[Any, list]:
+        if args[1].variables():
+            if expr.axis is not None:
+                raise StructureError(f"{expr} along an axis with a variable denominator: write the columns one by one")
+            return original(expr, args)
+        total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
+        unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
+        return (total if unit else total / args[1]), []
+
+    return canonicalise
+
+
+def _refuse_parameters(original: Any) -> Any:
+    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
+        if expr.parameters():
+            raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
+        return original(expr, args)
+
+    return canonicalise
+
+
+def _row(constraint: Constraint) -> Row:
+    kinds = cp.constraints
+    if isinstance(constraint, kinds.Equality | kinds.Zero):
+        return Row(constraint.expr, True, constraint.id)
+    if isinstance(constraint, kinds.Inequality | kinds.NonPos):
+        return Row(constraint.expr, False, constraint.id)
+    if isinstance(constraint, kinds.NonNeg):
+        return Row(-constraint.args[0], False, constraint.id)
+    raise StructureError(
+        f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
+        "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")
+
+
+def _flat(arrays: list) -> np.ndarray:
+    parts = [np.ravel(np.asarray(array.toarray() if hasattr(array, "toarray") else array, dtype=float), order="F")
+             for array in arrays]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def by_name(program_constraints: Mapping[str, tuple[Constraint, ...]], duals: Mapping[int, np.ndarray]
+            ) -> dict[str, np.ndarray]:
+    """Collect the multipliers of every named group of constraints; groups without multipliers are absent.
+
+    Args:
+        program_constraints: {name: constraints}.
+        duals: {constraint id: dual}.
+    """
+    found = {}
+    for name, group in program_constraints.items():
+        if all(member.id in duals for member in group):
+            found[name] = np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
     return found

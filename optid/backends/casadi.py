@@ -1,0 +1,351 @@
+"""IPOPT and fatrop through CasADi: the smooth CVXPY expression tree is translated into one CasADi graph.
+
+Every CVXPY expression becomes a CasADi column: its entries in column-major order, whatever its shape. Atoms that only
+move entries about (index, reshape, stack, diag, ...) are one rule: the atom itself is evaluated on the numbers of the
+entries. Derivatives are CasADi's, Hessians exact; a limited-memory Hessian does not converge on bilinear fits.
+
+CasADi's other solvers are not offered because they do not pass `optid.conformance`: SLEQP runs for ever on an
+infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay at the start.
+"""
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import scipy.sparse as sp
+
+from optid.backends import Answer, BackEnd, Settings
+from optid.backends.dnlp import Smooth, by_name, cache, smooth
+from optid.errors import StructureError
+from optid.program import Program
+from optid.solution import Status
+
+CLASSES = frozenset({"LP", "QP", "NLP"})
+
+LIMIT = 3000  # iterations
+
+STATUS = {
+    "Solve_Succeeded": Status.LOCAL, "Feasible_Point_Found": Status.LOCAL,
+    "Solved_To_Acceptable_Level": Status.INACCURATE, "Search_Direction_Becomes_Too_Small": Status.INACCURATE,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE, "Diverging_Iterates": Status.UNBOUNDED,
+    "Maximum_Iterations_Exceeded": Status.LIMIT, "Maximum_CpuTime_Exceeded": Status.LIMIT,
+    "Maximum_WallTime_Exceeded": Status.LIMIT,
+}
+
+
+def translate(form: Smooth) -> dict[str, Any]:
+    """Translate a smooth programme into CasADi's dictionary ``{"x", "p", "f", "g"}``.
+
+    Args:
+        form: the programme after CVXPY's smooth chain.
+
+    Raises:
+        StructureError: an atom without a translation, by name.
+    """
+    import casadi as ca
+
+    x = ca.MX.sym("x", sum(v.size for v in form.variables))
+    p = ca.MX.sym("p", sum(v.size for v in form.parameters))
+    known: dict[int, Any] = {}
+    for vector, leaves in ((x, form.variables), (p, form.parameters)):
+        edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
+        known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
+    graph = _Graph(known)
+    rows = [ca.densify(graph.column(row.expression)) for row in form.rows]
+    return {"x": x, "p": p, "f": ca.densify(graph.column(form.problem.objective.expr)),
+            "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
+
+
+class _Graph:
+    """Translated expressions, each translated once."""
+
+    def __init__(self, leaves: dict[int, Any]) -> None:
+        self.leaves = leaves
+        self.done: dict[int, tuple[Any, Any]] = {}
+
+    def column(self, expr: Any) -> Any:
+        """Return the CasADi column of an expression."""
+        if id(expr) not in self.done:
+            self.done[id(expr)] = (expr, self._column(expr))  # the expression is kept, so that its id stays its own
+        return self.done[id(expr)][1]
+
+    def _column(self, expr: Any) -> Any:
+        if isinstance(expr, cp.Variable | cp.Parameter):
+            return self.leaves[expr.id]
+        if expr.is_constant() and not expr.parameters():
+            return constant(expr.value, (expr.size, 1))
+        name = type(expr).__name__
+        columns = [self.column(arg) for arg in expr.args]
+        if name in MOVES:
+            return _move(expr, columns)
+        if name not in ATOMS:
+            raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
+        return ATOMS[name](expr, columns)
+
+
+def constant(value: Any, shape: tuple[int, int]) -> Any:
+    """Return a CasADi matrix of a number, array or sparse matrix, column by column, without its zeros."""
+    import casadi as ca
+
+    if sp.issparse(value):
+        value = sp.csc_array(value).reshape(shape, order="F").tocsc()
+        value.sum_duplicates()
+        value.sort_indices()
+        pattern = ca.Sparsity(*shape, value.indptr.tolist(), value.indices.tolist())
+        return ca.DM(pattern, value.data)
+    return ca.sparsify(ca.DM(np.reshape(np.asarray(value, dtype=float), shape, order="F")))
+
+
+MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "Concatenate", "Promote", "broadcast_to",
+         "diag_vec", "diag_mat", "upper_tri", "squeeze", "Stack", "nonneg_wrap", "nonpos_wrap", "symmetric_wrap",
+         "psd_wrap", "nsd_wrap", "real"}
+
+
+def _move(expr: Any, columns: list) -> Any:
+    """Apply an atom that only moves entries, by evaluating it on the numbers 1, 2, ... of the entries."""
+    import casadi as ca
+
+    numbers, count = [], 0
+    for arg in expr.args:
+        numbers.append(np.reshape(np.arange(count + 1, count + arg.size + 1, dtype=float), arg.shape, order="F"))
+        count += arg.size
+    moved = expr.numeric(numbers)
+    moved = np.ravel(moved.toarray() if sp.issparse(moved) else np.asarray(moved), order="F").astype(int)
+    source = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
+    if moved.all():
+        return source if np.array_equal(moved, np.arange(1, count + 1)) else source[(moved - 1).tolist()]
+    kept = np.flatnonzero(moved)
+    place = ca.Sparsity(moved.size, 1, [0, kept.size], kept.tolist())
+    return ca.MX(place, ca.densify(source)[(moved[kept] - 1).tolist()])
+
+
+def _matrix(column: Any, shape: tuple[int, ...], *, row: bool = False) -> Any:
+    """Give a column the shape of a matrix; a vector is a column, or a row where it stands on the left."""
+    import casadi as ca
+
+    if len(shape) > 2:
+        raise StructureError(f"an array of {len(shape)} dimensions has no translation for CasADi's solvers")
+    if len(shape) == 2:
+        return ca.reshape(column, *shape)
+    return column.T if row else column
+
+
+def _matmul(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    left, right = expr.args
+    if left.ndim == 0 or right.ndim == 0:
+        return columns[0] * columns[1]
+    return ca.vec(ca.mtimes(_matrix(columns[0], left.shape, row=True), _matrix(columns[1], right.shape)))
+
+
+def _sum(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    if expr.axis is None:
+        return ca.sum1(columns[0])
+    shape = expr.args[0].shape
+    axes = {axis % len(shape) for axis in (expr.axis if isinstance(expr.axis, tuple) else (expr.axis,))}
+    kept = tuple(1 if i in axes else n for i, n in enumerate(shape))
+    group = np.broadcast_to(np.reshape(np.arange(int(np.prod(kept))), kept, order="F"), shape)
+    group = np.ravel(group, order="F")
+    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(int(np.prod(kept)), group.size))
+    return ca.mtimes(constant(adding, adding.shape), columns[0])
+
+
+def _cumsum(expr: Any, columns: list) -> Any:
+    shape = expr.args[0].shape
+    axis = expr.axis if expr.axis is not None else 0
+    if len(shape) > 2 or (expr.axis is None and len(shape) == 2):
+        raise StructureError(f"{expr}: a cumulative sum needs an axis and at most two dimensions")
+    import casadi as ca
+
+    return ca.vec(ca.cumsum(ca.densify(_matrix(columns[0], shape)), axis % max(len(shape), 1)))
+
+
+def _trace(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return ca.trace(_matrix(columns[0], expr.args[0].shape))
+
+
+def _kron(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    left, right = (_matrix(column, arg.shape) for column, arg in zip(columns, expr.args))
+    return ca.vec(ca.kron(ca.densify(left), ca.densify(right)))
+
+
+def _convolve(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    short, long = (columns[0], columns[1]) if expr.args[0].size <= expr.args[1].size else (columns[1], columns[0])
+    terms = [ca.vertcat(ca.MX(i, 1), short[i] * long, ca.MX(short.numel() - 1 - i, 1)) for i in range(short.numel())]
+    return sum(terms[1:], terms[0])
+
+
+def _power(expr: Any, columns: list) -> Any:
+    exponent = float(expr.p.value)
+    if exponent == 2.0:
+        return columns[0] * columns[0]
+    return 1 / columns[0] if exponent == -1.0 else columns[0] ** exponent
+
+
+def _quad_over_lin(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return ca.sumsqr(columns[0]) / columns[1]
+
+
+def _quad_form(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return ca.dot(columns[0], ca.mtimes(_matrix(columns[1], expr.args[1].shape), columns[0]))
+
+
+def _prod(expr: Any, columns: list) -> Any:
+    if expr.axis is not None:
+        raise StructureError(f"{expr}: a product along an axis has no translation for CasADi's solvers")
+    result = columns[0][0]
+    for i in range(1, expr.args[0].size):
+        result = result * columns[0][i]
+    return result
+
+
+def _of_one(function: str) -> Callable[[Any, list], Any]:
+    def apply(expr: Any, columns: list) -> Any:
+        import casadi as ca
+
+        return getattr(ca, function)(ca.densify(columns[0]))
+
+    return apply
+
+
+def _entr(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return -columns[0] * ca.log(columns[0])
+
+
+def _rel_entr(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return columns[0] * ca.log(columns[0] / columns[1])
+
+
+def _logistic(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return ca.log1p(ca.exp(ca.densify(columns[0])))
+
+
+def _normcdf(expr: Any, columns: list) -> Any:
+    import casadi as ca
+
+    return 0.5 * (1.0 + ca.erf(ca.densify(columns[0]) / np.sqrt(2.0)))
+
+
+ATOMS: dict[str, Callable[[Any, list], Any]] = {
+    "AddExpression": lambda _, columns: sum(columns[1:], columns[0]),
+    "NegExpression": lambda _, columns: -columns[0],
+    "multiply": lambda _, columns: columns[0] * columns[1],
+    "DivExpression": lambda _, columns: columns[0] / columns[1],
+    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "Trace": _trace, "kron": _kron, "convolve": _convolve,
+    "conv": _convolve, "Power": _power, "PowerApprox": _power, "quad_over_lin": _quad_over_lin, "QuadForm": _quad_form,
+    "Prod": _prod, "entr": _entr, "rel_entr": _rel_entr, "logistic": _logistic, "normcdf": _normcdf,
+    **{name: _of_one(name) for name in ("exp", "log", "log1p", "sin", "cos", "tan", "sinh", "tanh", "asinh", "atanh")},
+}
+
+
+def options(name: str, settings: Settings) -> dict[str, Any]:
+    """Translate what is asked into a solver's own options; native options of the user come last.
+
+    Args:
+        name: "ipopt" or "fatrop".
+        settings: what is asked.
+
+    Raises:
+        StructureError: a Hessian that is not exact.
+    """
+    eps, limit = settings.accuracy, settings.time_limit
+    chosen: dict[str, Any] = {"print_time": settings.verbose, "error_on_fail": False}
+    if name == "ipopt":
+        chosen |= {"ipopt.tol": eps, "ipopt.constr_viol_tol": eps, "ipopt.compl_inf_tol": eps,
+                   "ipopt.acceptable_iter": 0, "ipopt.bound_relax_factor": 0.1 * eps, "ipopt.max_iter": LIMIT,
+                   "ipopt.print_level": 5 if settings.verbose else 0, "ipopt.sb": "yes"}
+        if limit is not None:
+            chosen["ipopt.max_wall_time"] = float(limit)
+    if name == "fatrop":
+        chosen |= {"fatrop.tol": eps, "fatrop.max_iter": LIMIT, "fatrop.print_level": 5 if settings.verbose else 0}
+    chosen.update({key if "." in key else f"{name}.{key}": value for key, value in settings.options.items()})
+    if chosen.get("ipopt.hessian_approximation", "exact") != "exact":
+        raise StructureError("ipopt with a limited-memory Hessian does not converge on these programmes; "
+                             "leave hessian_approximation at 'exact'")
+    return chosen
+
+
+def solve_with(name: str, program: Program, settings: Settings) -> Answer:
+    """Solve a smooth programme with one of CasADi's solvers.
+
+    The translated programme and the compiled solver are kept with the CVXPY problem: only parameter values and the
+    start are new in the next solve.
+
+    Args:
+        name: "ipopt" or "fatrop".
+        program: an LP, QP or smooth nonconvex programme.
+        settings: what is asked.
+
+    Returns:
+        The solver's claim with values and multipliers in CVXPY's convention ``L = f + dual (lhs - rhs)``.
+    """
+    form = smooth(program.problem)
+    solver = _compiled(name, form, options(name, settings))
+    lower, upper = form.bounds
+    row_lower, row_upper = form.row_bounds
+    found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
+    statistics = solver.stats()
+    word, status = _status(statistics)
+    iterations = int(statistics.get("iter_count", -1))
+    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
+        return Answer(status, word, iterations=iterations)
+    values, duals = form.restore(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
+    named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
+    return Answer(status, word, named, by_name(program.constraints, duals), iterations)
+
+
+def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
+    """Read IPOPT's words; fatrop only says whether it succeeded."""
+    word = str(statistics.get("return_status", ""))
+    if word in STATUS:
+        return word, STATUS[word]
+    if statistics.get("success"):
+        return "success", Status.LOCAL
+    stopped = int(statistics.get("iter_count", 0)) >= LIMIT
+    return ("iteration limit", Status.LIMIT) if stopped else (f"no success ({word})", Status.FAILED)
+
+
+def _compiled(name: str, form: Smooth, chosen: dict[str, Any]) -> Any:
+    import casadi as ca
+
+    kept = cache(form.original)
+    if "casadi" not in kept:
+        kept["casadi"] = translate(form)
+    key = ("casadi", name, repr(sorted(chosen.items())))
+    if key not in kept:
+        kept[key] = ca.nlpsol("solver", name, kept["casadi"], chosen)
+    return kept[key]
+
+
+def family() -> list[BackEnd]:
+    """Return the CasADi solvers that pass the conformance suite."""
+    found = []
+    for name, about in (("ipopt", "interior point with exact Hessians, through CasADi; large sparse programmes"),
+                        ("fatrop", "interior point with exact Hessians, through CasADi; does not detect infeasibility")):
+
+        def run(program: Program, settings: Settings, name: str = name) -> Answer:
+            return solve_with(name, program, settings)
+
+        found.append(BackEnd(name, CLASSES, run, find_spec("casadi") is not None, "casadi", warm=True, about=about))
+    return found
