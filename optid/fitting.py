@@ -11,12 +11,20 @@ import numpy as np
 
 from optid.data import Data
 from optid.doctor import examine, examine_rows
-from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError
+from optid.errors import (
+    DataError,
+    DataWarning,
+    InfeasibleError,
+    SolverFailed,
+    StructureError,
+    UnboundedError,
+    nearest,
+)
 from optid.prices import Price, price_constraints
 from optid.program import Program
 from optid.registry import check_arguments, formulation, named_constraint
 from optid.solution import Solution, Status
-from optid.solving import Outcome, run
+from optid.solving import Outcome, Procedure, run
 from optid.streams import Stream
 
 
@@ -123,13 +131,47 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     check_arguments(name, pose, arguments)
     findings = _examined(data, arguments)
     problem = pose(data, **arguments)
+    settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate, "prove": prove,
+                **(solver_options or {})}
+    return _finished(data, name, arguments, findings, problem, solver, settings, raises, started)
+
+
+def resolve(fit: Fit, *, solver: Any = "auto", raises: bool = True, accuracy: float = 1e-8, **parameters: float) -> Fit:
+    """Solve the programme of a fit again with other parameter values, starting from its solution.
+
+    Nothing is compressed or compiled again.
+
+    Args:
+        fit: an earlier fit.
+        solver: as in `fit`.
+        raises: as in `fit`.
+        accuracy: as in `fit`.
+        parameters: new values of the programme's parameters, such as ``weight`` of the nuclear norm.
+
+    Raises:
+        StructureError: the programme has no such parameter; names the nearest.
+    """
+    started = time.perf_counter()
+    program = fit.program
+    for name, value in parameters.items():
+        if name not in program.parameters:
+            raise StructureError(f"programme {program.name!r} has no parameter {name!r}. "
+                                 f"{nearest(name, program.parameters)}")
+        program.parameters[name].value = np.asarray(value, dtype=float)
+    program.assign(fit.solution.values)
+    return _finished(fit.data, fit.formulation, {**fit.arguments, **parameters}, [], program, solver,
+                     {"accuracy": accuracy}, raises, started)
+
+
+def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], findings: list[str],
+              problem: Program | Procedure, solver: Any, settings: Mapping[str, Any], raises: bool,
+              started: float) -> Fit:
     built_at = time.perf_counter()
-    outcome = run(problem, solver, accuracy=accuracy, time_limit=time_limit, isolate=isolate, prove=prove,
-                  **(solver_options or {}))
+    outcome = run(problem, solver, **settings)
     outcome = replace(outcome, solution=replace(
         outcome.solution, times=replace(outcome.solution.times, build=built_at - started)))
     if raises:
-        _raise_failure(outcome, accuracy)
+        _raise_failure(outcome)
     model = outcome.model
     transform = getattr(data, "transform", None)
     if model is not None and transform is not None and not transform.is_identity:
@@ -138,7 +180,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     figures = {} if statistics is None else {"rows": statistics.rows, "candidates": statistics.candidates,
                                              "condition": statistics.condition, "method": statistics.method}
     if statistics is not None:
-        findings += examine_rows(statistics.rows, statistics.candidates, statistics.condition)
+        findings = findings + examine_rows(statistics.rows, statistics.candidates, statistics.condition)
     return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data, prices=price_constraints(outcome.program, outcome.solution),
                findings=tuple(findings), figures=figures, steps=outcome.steps, seconds=time.perf_counter() - started)
@@ -156,7 +198,7 @@ def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
     return examine(data, [parse(b) if isinstance(b, str) else b for b in several])
 
 
-def _raise_failure(outcome: Outcome, accuracy: float) -> None:
+def _raise_failure(outcome: Outcome) -> None:
     solution, program = outcome.solution, outcome.program
     if solution.status is Status.INFEASIBLE:
         from optid.infeasibility import explain
