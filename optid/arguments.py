@@ -1,0 +1,108 @@
+"""From words of the command line to records and arguments."""
+
+import inspect
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.streams import Stream
+
+
+def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, stream: bool = False) -> Data | Stream:
+    """Read the files of a record, one experiment each.
+
+    Args:
+        files: paths.
+        how: the options of the command line: inputs, outputs, columns (words), dt, time, experiment, delimiter, decimal.
+        stream: read chunk by chunk.
+
+    Raises:
+        DataError: no file given, or what `optid.read` refuses.
+    """
+    from optid.readers import open_stream, read
+
+    if not files:
+        raise DataError("give a data file, or --example NAME (optid examples lists them)")
+    time = how["time"]
+    options: dict[str, Any] = {
+        **how, "inputs": listed(how["inputs"]), "outputs": listed(how["outputs"]), "columns": listed(how["columns"]),
+        "time": False if time == "none" else time, "delimiter": how["delimiter"].replace("\\t", "\t")}
+    if not stream:
+        return read([Path(name) for name in files], **options)
+    if len(files) > 1 or options.pop("experiment") is not None:
+        raise DataError("--stream reads one file with one experiment; leave --stream out for several")
+    return open_stream(Path(files[0]), **options)
+
+
+def example_record(name: str, seed: int, formulation: str) -> tuple[Data, dict[str, Any]]:
+    """Return a built-in record and those of its suggested arguments that the formulation takes.
+
+    Raises:
+        LookupFailed: no such example or formulation.
+    """
+    from optid.examples import example
+    from optid.registry import formulation as look_up
+
+    chosen = example(name, seed=seed)
+    takes = inspect.signature(look_up(formulation)[1]).parameters
+    arguments = {key: value for key, value in chosen.suggestion.items() if key in takes}
+    if "basis" not in takes:  # the suggested constraints are about the nonlinearity
+        arguments.pop("constraints", None)
+    return chosen.data, arguments
+
+
+def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
+    """Cut a record in an estimation and a validation part.
+
+    Raises:
+        DataError: an impossible share, or a stream.
+    """
+    if isinstance(record, Stream):
+        raise DataError("--split needs the record in memory; leave --stream out, or give --test another file")
+    return record.split(share)
+
+
+def listed(words: Sequence[str] | None) -> list[str] | None:
+    """Return the names in words that may be joined by commas; None stays None."""
+    return None if words is None else [part.strip() for word in words for part in word.split(",") if part.strip()]
+
+
+def one_or_all(values: list[Any] | None) -> Any:
+    """Return the single value of a list, the list itself when it has several, None for None."""
+    return values[0] if values is not None and len(values) == 1 else values
+
+
+def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
+    """Read one whole number or several.
+
+    Raises:
+        StructureError: naming the option and the word.
+    """
+    numbers = []
+    for word in listed(words) or []:
+        try:
+            numbers.append(int(word))
+        except ValueError:
+            raise StructureError(f"{option} {word}: a whole number is needed, or one per input") from None
+    return one_or_all(numbers) if words is not None else None
+
+
+def pairs(words: Sequence[str] | None, option: str) -> dict[str, Any]:
+    """Read key=value words; a value that is JSON (number, list, true) counts as such, any other is text.
+
+    Raises:
+        StructureError: a word without an equals sign.
+    """
+    found = {}
+    for word in words or []:
+        key, equals, value = word.partition("=")
+        if not equals or not key:
+            raise StructureError(f"{option} {word}: write key=value")
+        try:
+            found[key] = json.loads(value)
+        except json.JSONDecodeError:
+            found[key] = value
+    return found

@@ -1,0 +1,185 @@
+"""How the command line reads its words and speaks: greedy options, one clean message for an error, notes, progress."""
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from threading import Timer
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+from typer.core import TyperCommand, TyperGroup
+
+from optid.errors import (
+    DataWarning,
+    InfeasibleError,
+    OptidError,
+    SolverFailed,
+    SolverMissing,
+    UnboundedError,
+)
+
+PATIENCE = 2.0
+"""Seconds of silence before progress is shown."""
+
+FILES = "FILE..."
+"""Metavar of options whose values are files."""
+
+_FILE = re.compile(r".+\.(csv|tsv|txt|parquet|mat|npz|npy|json)", re.IGNORECASE)
+_NUMBER = re.compile(r"-[0-9.].*")
+
+
+class Command(TyperCommand):
+    """A command whose repeatable options take several values, and whose errors are one message and an exit code."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse, after `--inputs u1 u2` has become `--inputs u1 --inputs u2`."""
+        several = {word: p.metavar == FILES for p in self.params if getattr(p, "multiple", False) for word in p.opts}
+        return super().parse_args(ctx, spread(args, several))
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run; what is raised on purpose is told in one message, unless `--debug` asks for the traceback."""
+        try:
+            return super().invoke(ctx)
+        except (typer.Exit, typer.Abort):
+            raise
+        except Exception as error:
+            if ctx.find_root().params.get("debug"):
+                raise
+            complain(error)
+            raise typer.Exit(exit_code(error)) from None
+
+
+class Group(TyperGroup):
+    """The commands; `--debug` may stand anywhere."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse, after `--debug` has been moved in front of the command."""
+        rest = [word for word in args if word != "--debug"]
+        return super().parse_args(ctx, ["--debug"] * (len(rest) < len(args)) + rest)
+
+
+def spread(args: Sequence[str], several: dict[str, bool]) -> list[str]:
+    """Repeat an option in front of each of its values.
+
+    The values end at the next option, at ``--``, and at a data file, unless files are what the option takes.
+
+    Args:
+        args: words of the command line.
+        several: options that take several values, and whether the values are files.
+    """
+    result: list[str] = []
+    option, count = "", 0
+    for position, word in enumerate(args):
+        if word == "--":
+            return result + [option] * (bool(option) and not count) + list(args[position:])
+        if word.startswith("-") and len(word) > 1 and not _NUMBER.fullmatch(word):
+            if option and not count:
+                result.append(option)
+            name, equals, _ = word.partition("=")
+            option, count = (name if name in several else ""), int(bool(equals))
+            if equals or not option:
+                result.append(word)
+        elif option and (several[option] or not _FILE.fullmatch(word)):
+            result += [option, word]
+            count += 1
+        else:
+            result.append(word)
+            option = ""
+    return result + [option] * (bool(option) and not count)
+
+
+def exit_code(error: BaseException) -> int:
+    """Return 2 for data, structure and names, 3 for no solution, 4 for the solver, 1 for a defect of optid."""
+    if isinstance(error, InfeasibleError | UnboundedError):
+        return 3
+    if isinstance(error, SolverMissing | SolverFailed):
+        return 4
+    return 2 if isinstance(error, OptidError | OSError) else 1
+
+
+def output() -> Console:
+    """Return the console of results."""
+    return Console(highlight=False)
+
+
+def say(text: str | Text) -> None:
+    """Print a result as it is: no wrapping, no markup."""
+    output().print(Text(text) if isinstance(text, str) else text, soft_wrap=True)
+
+
+def coloured(text: str) -> Text:
+    """Return a printed result with its headings and its verdict in colour."""
+    result = Text(text)
+    result.highlight_regex(r"(?m)^\S.*(?=\n[-=─═]{3})", "bold")
+    result.highlight_regex(r"(?m)^[-=─═]{3,}$", "dim")
+    result.highlight_regex(r"\boptimal \(proved\)", "bold green")
+    result.highlight_regex(r"\b(locally optimal|inaccurate|limit) \(not proved\)", "bold yellow")
+    return result
+
+
+def complain(error: BaseException) -> None:
+    """Print one message for an error, on the error stream."""
+    text = str(error) or type(error).__name__
+    if exit_code(error) == 1:
+        text = f"{type(error).__name__}: {text}. This is a defect of optid; --debug shows where it happened"
+    _tell("error", "bold red", text)
+
+
+def note(text: str) -> None:
+    """Print a warning, on the error stream."""
+    _tell("note", "bold yellow", text)
+
+
+def _tell(word: str, style: str, text: str) -> None:
+    console = Console(stderr=True, highlight=False)
+    console.print(Text.assemble((f"{word}: ", style), text), soft_wrap=not console.is_terminal)
+
+
+@contextmanager
+def hearing() -> Iterator[list[str]]:
+    """Collect the data warnings raised inside, each sentence once; print them if an error ends the block."""
+    heard: list[str] = []
+
+    def keep(message: Any, category: type[Warning], *_: Any, **__: Any) -> None:
+        if issubclass(category, DataWarning) and str(message) not in heard:
+            heard.append(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = keep
+        try:
+            yield heard
+        except Exception:
+            for sentence in heard:
+                note(sentence)
+            raise
+
+
+class Waiting:
+    """Progress on the error stream once something takes longer than `PATIENCE`; nothing where nobody looks."""
+
+    def __init__(self) -> None:
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        console = Console(stderr=True)
+        self._progress = Progress(SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
+                                  console=console, transient=True, disable=not console.is_terminal)
+        self._task = self._progress.add_task("")
+        self._timer = Timer(PATIENCE, self._progress.start)
+        self._timer.daemon = True
+
+    def step(self, text: str) -> None:
+        """Say what is being done now."""
+        self._progress.update(self._task, description=text)
+
+    def __enter__(self) -> "Waiting":
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._timer.cancel()
+        self._progress.stop()
