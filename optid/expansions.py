@@ -156,11 +156,16 @@ class Trigonometric(Basis):
 
     def _derivative(self, u: Array, order: int) -> Array:
         lo, hi = span(self)
-        rate = np.pi * np.arange(1, self.p + 1) / (self.half_range * (hi - lo) / 2)
-        # each derivative advances the phase by a quarter turn
-        angle = rate * (u[:, None] - (lo + hi) / 2) + order * np.pi / 2
-        columns = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * (rate**order)[:, None]
-        return np.asarray(columns.reshape(u.size, self.full_size), dtype=float)
+        rate = np.pi / (self.half_range * (hi - lo) / 2)
+        # powers of exp(i v) hold cosine and sine side by side, as the columns want them
+        turn = np.exp(1j * rate * (u - (lo + hi) / 2))
+        powers = np.empty((u.size, self.p), dtype=complex)
+        powers[:, 0] = turn
+        for j in range(1, self.p):
+            np.multiply(powers[:, j - 1], turn, out=powers[:, j])
+        if order:
+            powers *= (1j * rate * np.arange(1, self.p + 1)) ** order
+        return powers.view(float)
 
 
 @dataclass(frozen=True)

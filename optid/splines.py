@@ -256,16 +256,12 @@ class BSpline(Basis):
 
     def local(self, u: ArrayLike) -> tuple[NDArray[np.int32], Array]:
         """Evaluate the degree + 1 splines that do not vanish in the cell of each sample."""
-        from scipy.interpolate import BSpline as Spline
-
+        cell, _, missing = _split_cells(u, span(self), self.p, self.outside)
         x = brought_inside(samples(u), span(self), self.outside)
-        missing = np.isnan(x)
-        x = np.where(missing, span(self)[0], x)
-        design = Spline.design_matrix(x, self.knots, self.degree, extrapolate=True)
-        shape = (x.size, self.degree + 1)
-        weights = np.array(design.data, dtype=float).reshape(shape)
-        weights[missing] = 0.0
-        return np.ascontiguousarray(design.indices.reshape(shape)[:, 0], dtype=np.int32), weights
+        weights = _not_vanishing(np.where(np.isnan(x), span(self)[0], x), cell, self.knots, self.degree)
+        if missing is not None:
+            weights[missing] = 0.0
+        return cell, weights
 
     def slopes(self, u: ArrayLike) -> Array:
         """Slopes of the splines, (N, P)."""
@@ -315,8 +311,24 @@ class BSpline(Basis):
         return rows
 
     def _derivative(self, points: Array, order: int) -> Array:
-        from scipy.interpolate import BSpline as Spline
+        lower, degree = self.knots[order : len(self.knots) - order], self.degree - order
+        cell, _, _ = _split_cells(points, span(self), self.p, "extrapolate")
+        weights = _not_vanishing(points, cell, lower, degree)
+        control = self._control_points(order)
+        return sum((weights[:, [i]] * control[cell + i] for i in range(degree + 1)), np.zeros((points.size, self.size)))
 
-        lower = self.knots[order : len(self.knots) - order]
-        design = Spline.design_matrix(points, lower, self.degree - order, extrapolate=True)
-        return design @ self._control_points(order)
+
+def _not_vanishing(x: Array, cell: NDArray[np.int32], knots: Array, degree: int) -> Array:
+    """Evaluate the degree + 1 B-splines of the cell of each sample by the Cox-de Boor recursion, (N, degree + 1)."""
+    values = np.ones((degree + 1, x.size))
+    at = cell + degree
+    left = [x - knots[at - i] for i in range(degree)]
+    right = [knots[at + 1 + i] - x for i in range(degree)]
+    for d in range(1, degree + 1):
+        saved = np.zeros(x.size)
+        for r in range(d):
+            part = values[r] / (right[r] + left[d - 1 - r])
+            values[r] = saved + right[r] * part
+            saved = left[d - 1 - r] * part
+        values[d] = saved
+    return np.ascontiguousarray(values.T)
