@@ -71,6 +71,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
     weights: list[np.ndarray] | None = None
     width, value = 0.0, np.inf
     program, problem = pose(None)
+    scale = program.scale  # of the unweighted record: the weights of a pass are no unit of the data
     for step in range(PASSES):
         used = weights
         solution: Solution = yield program
@@ -90,7 +91,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
         program, problem = pose(weights)
         if step:  # the answer of the pass before is the best start, and no proof belongs to a weighted pass
             program = replace(program, start=dict(solution.values))
-        program = replace(program, certify=None)
+        program = replace(program, certify=None, scale=scale)
     return _evidence(program, problem, solution, sizes, used, kind, width, convex)
 
 
