@@ -29,7 +29,7 @@ def record(samples: int):
 
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, samples)
-    m = np.sign(u) * np.maximum(np.abs(u) - 0.25, 0)
+    m = np.sign(u) * np.maximum(np.abs(u) - 0.2, 0)
     y = lfilter([16 / 15, 0.8], [1, -1.5, 0.7], m) + lfilter([1], [1, -1.5, 0.7], 0.1 * rng.standard_normal(samples))
     return optid.Data(u=u, y=y)
 

@@ -1,4 +1,4 @@
-"""Compiled inner loops: hats at a sample, lagged products of local families, outer products of sparse rows.
+"""Compiled inner loops: lagged products of families of functions of which few differ from zero, and sparse rows.
 
 Compiled at the first call and cached on disk. Every function is single threaded, so that the answer does not depend on
 the machine. Indices are unsigned: signed ones are tested for counting from the end, which takes half of the time.
@@ -12,36 +12,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
 unsigned = np.uintp
 ONE = unsigned(1)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def hat_local(u: Array, lo: float, width: float, p: int, extrapolate: bool) -> tuple[Indices, Array]:
-    """Evaluate the two hats that do not vanish at each sample.
-
-    Args:
-        u: (N,) input; NaN gets weights 0 at position 0.
-        lo: first node.
-        width: distance of the nodes.
-        p: number of cells; there are p + 1 hats.
-        extrapolate: continue the outer cells; otherwise clamp to the end nodes.
-
-    Returns:
-        first (N,) left node of the cell, weights (N, 2) of that node and the next.
-    """
-    first = np.empty(u.size, np.int32)
-    weights = np.empty((u.size, 2))
-    for k in range(u.size):
-        x = (u[k] - lo) / width
-        present = x == x  # false for NaN
-        x = x if present else 0.0
-        cell = np.int32(min(max(x, 0.0), p - 1.0))
-        right = x - cell
-        if not extrapolate:
-            right = min(max(right, 0.0), 1.0)
-        first[k] = cell
-        weights[k, 0] = 1.0 - right if present else 0.0
-        weights[k, 1] = right if present else 0.0
-    return first, weights
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
