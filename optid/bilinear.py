@@ -43,6 +43,8 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
         count: how many.
         seed: of the random directions b.
     """
+    if not core.shapes:  # linear least squares: nothing to start
+        return [([], [])]
     estimates = matrices(core.least_squares, core.shapes)
     factors = list(zip(estimates, core.whitening.factors_mu, core.whitening.factors_b))
     white = [np.linalg.svd(left.T @ theta @ right, full_matrices=False) for theta, left, right in factors]
