@@ -1,11 +1,13 @@
-"""Run a back end in a process of its own, so that a crash or an endless loop is an outcome and not the end of the program."""
+"""Run a back end in a process of its own: a crash or an endless loop is an outcome, not the end of the program."""
 
 import multiprocessing
 import signal
 import time
+import warnings
 from multiprocessing.connection import Connection
 
 from optid.backends import Answer, BackEnd, Settings
+from optid.errors import StructureError
 from optid.program import Program
 from optid.solution import Status
 
@@ -22,6 +24,9 @@ def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Ans
 
     Returns:
         The child's answer; ``Status.LIMIT`` when it was killed, ``Status.FAILED`` when it died.
+
+    Raises:
+        StructureError: the back end refuses the programme.
     """
     if "fork" not in multiprocessing.get_all_start_methods():
         return back_end.run(program, settings)
@@ -29,12 +34,17 @@ def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Ans
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_work, args=(sender, back_end, program, settings), daemon=True)
     started = time.monotonic()
-    child.start()
+    with warnings.catch_warnings():  # forking a process with threads is deprecated; the child runs one solver and ends
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child.start()
     sender.close()
     limit = None if settings.time_limit is None else settings.time_limit + GRACE
     try:
         if receiver.poll(limit):
-            return receiver.recv()
+            answer = receiver.recv()
+            if isinstance(answer, StructureError):
+                raise answer
+            return answer
         return Answer(Status.LIMIT, f"stopped after {time.monotonic() - started:.1f} s: it did not keep its time limit")
     except EOFError:
         child.join()
@@ -50,7 +60,9 @@ def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Ans
 
 def _work(sender: Connection, back_end: BackEnd, program: Program, settings: Settings) -> None:
     try:
-        answer = back_end.run(program, settings)
+        answer: Answer | StructureError = back_end.run(program, settings)
+    except StructureError as refusal:
+        answer = refusal
     except Exception as error:
         answer = Answer(Status.FAILED, f"{type(error).__name__}: {error}")
     sender.send(answer)

@@ -2,6 +2,7 @@
 
 import cvxpy as cp
 import numpy as np
+from cvxpy.constraints import PSD, SOC, Equality, Inequality, NonNeg, NonPos, Zero
 from cvxpy.constraints.constraint import Constraint
 
 from optid.program import Program, Values
@@ -53,7 +54,10 @@ def _rank_one_residuals(program: Program) -> tuple[float, float]:
 
 
 def measure_violation(program: Program) -> tuple[float, str]:
-    """Return the largest relative violation over all constraints at the assigned point, and its name."""
+    """Return the largest relative violation over all constraints at the assigned point, and its name.
+
+    Bounds that variables carry as attributes count as well, under the name of the variable.
+    """
     worst, name = 0.0, ""
     for key, group in program.constraints.items():
         for member in group:
@@ -61,7 +65,23 @@ def measure_violation(program: Program) -> tuple[float, str]:
             amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / size
             if not amount <= worst:  # also true for nan
                 worst, name = amount, key
+    for key, variable in program.variables.items():
+        value, amount = np.asarray(variable.value, dtype=float), 0.0
+        if has_bounds(variable):
+            lower, upper = variable.get_bounds()
+            amount = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
+        elif variable.attributes["PSD"] or variable.attributes["NSD"]:
+            sign = 1.0 if variable.attributes["PSD"] else -1.0
+            amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
+        amount /= 1.0 + float(np.max(np.abs(value), initial=0.0))
+        if not amount <= worst:
+            worst, name = amount, key
     return (worst if np.isfinite(worst) else float("inf")), name
+
+
+def has_bounds(variable: cp.Variable) -> bool:
+    """Whether the variable carries bounds as attributes (nonneg, bounds, ...)."""
+    return any(variable.attributes[key] not in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds"))
 
 
 def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
@@ -72,63 +92,103 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
         dual: its multipliers, flat, in the order of its dual variables.
 
     Returns:
-        The pairs, or None for a cone whose multipliers are not used here.
+        The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
+        or None for a cone whose multipliers are not used here.
     """
-    if isinstance(member, cp.constraints.Equality | cp.constraints.Inequality | cp.constraints.Zero
-                  | cp.constraints.NonPos):
+    if isinstance(member, Equality | Zero):
         return [(member.expr, dual)]
-    if isinstance(member, cp.constraints.NonNeg | cp.constraints.PSD):
-        return [(member.args[0], -dual)]
-    if isinstance(member, cp.SOC):
-        split = member.args[0].size
-        return [(member.args[0], -dual[:split]), (member.args[1], -dual[split:])]
+    if isinstance(member, Inequality | NonPos):
+        return [(member.expr, np.maximum(dual, 0.0))]
+    if isinstance(member, NonNeg):
+        return [(member.args[0], -np.maximum(dual, 0.0))]
+    if isinstance(member, PSD):
+        square = np.reshape(dual, member.args[0].shape, order="F")
+        values, vectors = np.linalg.eigh((square + square.T) / 2)
+        return [(member.args[0], -np.ravel((vectors * np.maximum(values, 0.0)) @ vectors.T, order="F"))]
+    if isinstance(member, SOC) and member.args[0].size == 1:
+        level, rest = float(dual[0]), dual[1:]
+        length = float(np.linalg.norm(rest))
+        if length > level:  # projection on the second-order cone
+            factor = max(0.0, (level + length) / 2)
+            level, rest = factor, factor * rest / length
+        return [(member.args[0], -np.array([level])), (member.args[1], -rest)]
     return None
 
 
+class _Gradient:
+    """Gradient of the Lagrangian, block by block, with the size of the terms it is a sum of."""
+
+    def __init__(self, program: Program) -> None:
+        self.variables = list(program.variables.values())
+        self.total = {v.id: np.zeros(v.size) for v in self.variables}
+        self.largest = {v.id: 0.0 for v in self.variables}
+
+    def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
+        """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
+        if not _smooth(expression):
+            return False
+        for variable, jacobian in expression.grad.items():
+            if jacobian is None:
+                return False
+            if variable.id in self.total:
+                part = np.asarray(jacobian @ weights).ravel()
+                self.total[variable.id] += part
+                self.largest[variable.id] = max(self.largest[variable.id], float(np.max(np.abs(part), initial=0.0)))
+        return True
+
+    def residual(self, yardstick: float) -> float:
+        """Return the largest component relative to its terms plus the objective's size per size of the variable."""
+        worst = 0.0
+        for variable in self.variables:
+            part = _free_part(variable, self.total[variable.id])
+            if part is None:
+                return float("nan")
+            size = float(np.max(np.abs(variable.value), initial=0.0)) or 1.0
+            worst = max(worst, part / (yardstick / size + self.largest[variable.id]))
+        return worst
+
+
+def _free_part(variable: cp.Variable, gradient: np.ndarray) -> float | None:
+    """Largest gradient component that the variable's own attributes leave free; None where that is not known."""
+    flags = variable.attributes
+    if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
+        return None
+    gradient = np.reshape(gradient, variable.shape, order="F")
+    if flags["symmetric"]:
+        gradient = (gradient + gradient.T) / 2
+    if has_bounds(variable):
+        lower, upper = variable.get_bounds()
+        value = np.asarray(variable.value)
+        margin = 1e-6 * (1.0 + np.abs(value))
+        held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
+        gradient = np.where(held, 0.0, gradient)
+    return float(np.max(np.abs(gradient), initial=0.0))
+
+
 def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
-    gradient = {v.id: np.zeros(v.size) for v in program.variables.values()}
+    unknown = float("nan"), float("nan")
+    gradient, complementarity = _Gradient(program), 0.0
+    yardstick = max(abs(objective), program.scale)
     try:
-        if not _accumulate(gradient, program.objective.expr, np.ones(1)):
-            return float("nan"), float("nan")
-        size = max((float(np.max(np.abs(g), initial=0.0)) for g in gradient.values()), default=0.0)
-        complementarity, reference = 0.0, size
+        if not gradient.add(program.objective.expr, np.ones(1)):
+            return unknown
         for name, group in program.constraints.items():
             if name not in duals:
-                return float("nan"), float("nan")
-            dual, position = duals[name], 0
+                return unknown
+            position = 0
             for member in group:
                 length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, dual[position : position + length])
+                terms = multiplier_terms(member, duals[name][position : position + length])
                 position += length
-                if terms is None:
-                    return float("nan"), float("nan")
-                inner = 0.0
-                for expression, weights in terms:
-                    part = {v.id: np.zeros(v.size) for v in program.variables.values()}
-                    if not _accumulate(part, expression, weights):
-                        return float("nan"), float("nan")
-                    for key, value in part.items():
-                        gradient[key] += value
-                        reference = max(reference, float(np.max(np.abs(value), initial=0.0)))
-                    inner += float(np.dot(np.ravel(expression.value, order="F"), weights))
-                if not isinstance(member, cp.constraints.Equality | cp.constraints.Zero):
-                    complementarity = max(complementarity, abs(inner))
-    except (ValueError, NotImplementedError, TypeError):
-        return float("nan"), float("nan")
-    residual = max((float(np.max(np.abs(g), initial=0.0)) for g in gradient.values()), default=0.0)
-    return residual / (1.0 + reference), complementarity / (1.0 + abs(objective))
-
-
-def _accumulate(gradient: dict[int, np.ndarray], expression: cp.Expression, weights: np.ndarray) -> bool:
-    """Add d<weights, expression>/dx to the gradient; False where the expression has a kink."""
-    if not _smooth(expression):
-        return False
-    for variable, jacobian in expression.grad.items():
-        if jacobian is None:
-            return False
-        if variable.id in gradient:
-            gradient[variable.id] += np.asarray(jacobian @ weights).ravel()
-    return True
+                if terms is None or not all(gradient.add(expression, weights) for expression, weights in terms):
+                    return unknown
+                if not isinstance(member, Equality | Zero):
+                    products = [np.ravel(expression.value, order="F") * weights for expression, weights in terms]
+                    whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
+                    complementarity += abs(sum(map(np.sum, products))) if whole else float(np.sum(np.abs(products[0])))
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return unknown
+    return gradient.residual(yardstick), float(complementarity / yardstick)
 
 
 _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",

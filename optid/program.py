@@ -162,10 +162,10 @@ class Program:
         if self.problem.is_dcp():
             return _convex_class(self.problem)
         for name, part in self._parts():
-            if not part.is_dnlp():
+            if not getattr(part, "is_dnlp", bool)():  # cones have no such method
                 raise StructureError(
-                    f"{name} of {self.name!r} is neither convex nor a smooth expression that an NLP solver accepts: {part}"
-                )
+                    f"{name} of {self.name!r} is neither convex nor a smooth expression that an NLP solver accepts: "
+                    f"{part}")
         return "NLP"
 
     @property
@@ -292,7 +292,12 @@ class Program:
     def assign(self, values: Values) -> None:
         """Write values into the CVXPY variables and recompute the derived ones."""
         for name, value in values.items():
-            self.variables[name].value = np.asarray(value, dtype=float).reshape(self.variables[name].shape, order="F")
+            variable = self.variables[name]
+            array = np.asarray(value, dtype=float).reshape(variable.shape, order="F")
+            if variable.attributes["sparsity"] or variable.attributes["diag"]:
+                variable.value = array
+            else:  # a point just outside the variable's own bounds is to be judged, not refused
+                variable.save_value(array)
         for name, expression in self.derived.items():
             self.variables[name].value = np.asarray(expression.value)
 

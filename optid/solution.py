@@ -51,9 +51,11 @@ class Residuals:
     Attributes:
         violation: largest constraint violation, relative to the size of the constraint's terms.
         worst: name of the constraint that is violated most.
-        stationarity: norm of the gradient of the Lagrangian relative to that of the objective;
-            ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound judges there).
-        complementarity: largest product of multiplier and slack, relative to the objective.
+        stationarity: largest component of the gradient of the Lagrangian, relative to the terms it is a sum of plus
+            the objective per size of the variable (so that units do not matter); multipliers of the wrong sign count
+            as missing. ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound
+            judges there).
+        complementarity: sum of the products of multiplier and slack, relative to the objective (or to its scale).
     """
 
     violation: float

@@ -10,9 +10,9 @@ import numpy as np
 from optid.backends import Answer, BackEnd, Settings, choose, find
 from optid.errors import StructureError
 from optid.isolated import run_isolated
-from optid.judging import judge
+from optid.judging import judge, measure_violation
 from optid.program import Program, Values
-from optid.solution import Bound, Residuals, Solution, Status, Times
+from optid.solution import Bound, Residuals, Solution, Status, Times, relative_gap
 
 Procedure = Generator[Program, Solution, Any]
 
@@ -56,29 +56,39 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
         raise StructureError(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
 
-    program.clear_duals()
-    if warm and program.start:
-        program.assign(program.start)
-    clock = time.perf_counter()
     separate = (time_limit is not None) if isolate is None else isolate
-    try:
-        answer = run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
-    except Exception as error:  # a solver that crashes is an outcome, not a traceback
-        answer = Answer(Status.FAILED, f"{type(error).__name__}: {error}")
+    clock = time.perf_counter()
+    answer = _attempt(program, back_end, settings, separate)
     solved = time.perf_counter()
-    return _verdict(program, back_end, answer, chosen, settings, solved - clock, prove)
+    return _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
+
+
+def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
+    """Run a back end from the programme's start; whatever happens to it is an answer."""
+    program.clear_duals()
+    if settings.warm and program.start:
+        program.assign(program.start)
+    try:
+        return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
+    except StructureError:  # a refusal says what to change, so it must reach the user
+        raise
+    except Exception as error:  # a solver that crashes is an outcome, not a traceback
+        return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
 
 
 def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, settings: Settings, seconds: float,
-             prove: bool) -> Solution:
+             prove: bool, separate: bool) -> Solution:
     base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
                     iterations=answer.iterations, times=Times(solve=seconds))
     values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
     if not values:
-        status = answer.status if answer.status not in (Status.OPTIMAL, Status.LOCAL) else Status.FAILED
-        return replace(base, status=status, reason=answer.word)
+        status, reason = _without_point(program, answer, back_end.name)
+        return replace(base, status=status, reason=reason)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned non-finite numbers")
+    if missing := set(program.variables) - set(values) - set(program.derived):
+        return replace(base, status=Status.FAILED,
+                       reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
 
     clock = time.perf_counter()
     point = _judged(program, answer)
@@ -86,9 +96,11 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
-        point, bound = _proof(program, back_end, settings, point)
+        point, bound = _proof(program, back_end, settings, point, separate)
         if bound is not None and bound.proved and status is Status.LOCAL:
             status = Status.OPTIMAL
+        elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
+            status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
     done = time.perf_counter()
     return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
                    values=point.values, duals=point.duals, objective=point.objective, bound=bound,
@@ -111,33 +123,62 @@ def _judged(program: Program, answer: Answer) -> _Judged:
     return _Judged(program.values(), dict(answer.duals), objective, residuals)
 
 
+def _tolerance(accuracy: float) -> float:
+    """Residual up to which a claim of success at the requested accuracy stands."""
+    return max(100.0 * accuracy, 1e-7)
+
+
+def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status, str]:
+    """Judge a claim that comes without a point."""
+    if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
+        return Status.FAILED, f"{name} claims success, but returned no point"
+    if answer.status is Status.INFEASIBLE and program.start:
+        program.assign(program.start)
+        if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
+            return Status.FAILED, f"{name} says infeasible, but the start satisfies every constraint"
+    return answer.status, answer.word
+
+
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
     """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
-    tolerance = max(100.0 * accuracy, 1e-7)
-    claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
-    if residuals.violation > tolerance:
-        amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)"
+    tolerance = _tolerance(accuracy)
+    outside = residuals.violation > tolerance
+    amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
+    if answer.status is Status.INFEASIBLE and not outside:
+        return Status.FAILED, f"{name} says infeasible at a point that satisfies every constraint"
+    if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
+        return answer.status, f"{answer.word}; {amount}" if amount else answer.word
+    if outside:
         if residuals.violation > LIE:
-            return Status.FAILED, (f"{name} claims success, but {amount}" if claims else amount)
+            return Status.FAILED, f"{name} claims success, but {amount}"
         return Status.INACCURATE, amount
-    if answer.status is Status.INFEASIBLE and np.isfinite(residuals.stationarity):
-        return Status.INACCURATE, f"{name} says infeasible at a point that satisfies every constraint"
-    if not claims:
-        return answer.status, answer.word
-    if residuals.stationarity > 100.0 * tolerance or residuals.complementarity > 100.0 * tolerance:
+    if residuals.stationarity > tolerance or residuals.complementarity > tolerance:
         return Status.INACCURATE, (
             f"{name} claims success, but the point is not stationary: residual {residuals.stationarity:.1e}, "
             f"complementarity {residuals.complementarity:.1e}")
+    if answer.status is Status.INACCURATE and not np.isfinite(residuals.stationarity):
+        return Status.INACCURATE, answer.word
     return Status.LOCAL, ""
 
 
-def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged) -> tuple[_Judged, Bound | None]:
+def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) -> bool:
+    """Whether the certificate of a convex programme shows that the point is not optimal after all.
+
+    It decides alone where the objective has kinks, so that stationarity cannot be measured.
+    """
+    if bound.proved or np.isfinite(point.residuals.stationarity) or program.kind == "NLP":
+        return False
+    return relative_gap(point.objective, bound.value, program.scale) > _tolerance(accuracy)
+
+
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool
+           ) -> tuple[_Judged, Bound | None]:
     """Ask for a proof; when the attempt proposes a better start, solve again from there and keep the better point."""
     if program.certify is None:
         return point, _convex_proof(program, point)
     bound, start = program.certify(program, point.values, point.duals)
     if start is not None and not bound.proved:
-        answer = back_end.run(replace(program, start=start), settings)
+        answer = _attempt(replace(program, start=start), back_end, settings, separate)
         if answer.values:
             again = _judged(program, answer)
             lower = point.objective - 1e-10 * abs(point.objective)
@@ -153,7 +194,7 @@ def _convex_proof(program: Program, point: _Judged) -> Bound | None:
     if not program.problem.is_dcp() or not np.isfinite(residuals.stationarity):
         return None
     error = max(residuals.violation, residuals.stationarity, residuals.complementarity)
-    return Bound(point.objective - residuals.complementarity * (1.0 + abs(point.objective)), error < 1e-6,
+    return Bound(point.objective - residuals.complementarity * max(abs(point.objective), program.scale), error < 1e-6,
                  "convex optimality conditions", f"convex programme; optimality conditions hold to {error:.0e}")
 
 

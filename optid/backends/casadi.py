@@ -90,7 +90,7 @@ def constant(value: Any, shape: tuple[int, int]) -> Any:
     import casadi as ca
 
     if sp.issparse(value):
-        value = sp.csc_array(value).reshape(shape, order="F").tocsc()
+        value = sp.csc_array(sp.csc_array(value).reshape(shape, order="F"))
         value.sum_duplicates()
         value.sort_indices()
         pattern = ca.Sparsity(*shape, value.indptr.tolist(), value.indices.tolist())
@@ -342,7 +342,7 @@ def family() -> list[BackEnd]:
     """Return the CasADi solvers that pass the conformance suite."""
     found = []
     for name, about in (("ipopt", "interior point with exact Hessians, through CasADi; large sparse programmes"),
-                        ("fatrop", "interior point with exact Hessians, through CasADi; does not detect infeasibility")):
+                        ("fatrop", "interior point with exact Hessians, through CasADi; blind to infeasibility")):
 
         def run(program: Program, settings: Settings, name: str = name) -> Answer:
             return solve_with(name, program, settings)

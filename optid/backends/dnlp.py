@@ -14,6 +14,7 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
+from cvxpy.constraints import Equality, Inequality, NonNeg, NonPos, Zero
 from cvxpy.constraints.constraint import Constraint
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
@@ -153,9 +154,73 @@ def smooth(problem: cp.Problem) -> Smooth:
     return kept["smooth"]
 
 
-def cache(problem: cp.Problem) -> dict[str, Any]:
+def cache(problem: cp.Problem) -> dict[Any, Any]:
     """Return our part of the problem's cache of compiled solvers, which lives and dies with the problem."""
     return problem._solver_cache.setdefault(CACHE, {})
+
+
+class Derivatives:
+    """Values and exact derivatives of a smooth problem, from CVXPY's compiled derivative engine.
+
+    The engine differentiates at the point of its last evaluation, whatever point it is asked for; every call here
+    evaluates first when the point is a new one. Attributes: ``jacobian_pattern`` and ``hessian_pattern`` (lower
+    triangle) as (rows, columns).
+    """
+
+    def __init__(self, form: Smooth) -> None:
+        from cvxpy.reductions.solvers.nlp_solvers.nlp_solver import Oracles
+
+        self._problem = cp.Problem(form.problem.objective, [Zero(row.expression) for row in form.rows])
+        self._oracles = Oracles(self._problem, verbose=False)
+        self._rows = sum(row.expression.size for row in form.rows)
+        self._x: np.ndarray | None = None
+        self.jacobian_pattern = self._oracles.jacobianstructure()
+        self.hessian_pattern = self._oracles.hessianstructure()
+
+    def update(self) -> None:
+        """Take over the values the parameters hold now."""
+        if self._problem.parameters():
+            self._oracles.update_params(self._problem)
+        self._x = None
+
+    def objective(self, x: np.ndarray) -> float:
+        """Return the objective at x."""
+        self._move(x)
+        return self._value
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """Return the gradient of the objective at x."""
+        self._move(x)
+        return self._oracles.gradient(x)
+
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        """Return the rows at x."""
+        self._move(x)
+        return self._levels
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Return the non-zeros of the Jacobian of the rows at x."""
+        self._move(x)
+        return self._oracles.jacobian(x)
+
+    def hessian(self, x: np.ndarray, factor: float, multipliers: np.ndarray) -> np.ndarray:
+        """Return the non-zeros of the lower triangle of the Hessian of ``factor f + multipliers * rows``."""
+        self._move(x)
+        return self._oracles.hessian(x, multipliers, factor)
+
+    def _move(self, x: np.ndarray) -> None:
+        if self._x is None or not np.array_equal(x, self._x):
+            self._x = np.array(x, dtype=float)
+            self._value = float(self._oracles.objective(self._x))
+            self._levels = np.array(self._oracles.constraints(self._x)) if self._rows else np.zeros(0)
+
+
+def derivatives(form: Smooth) -> Derivatives:
+    """Return the compiled derivatives of a smooth problem; made once and kept with the problem."""
+    kept = cache(form.original)
+    if "derivatives" not in kept:
+        kept["derivatives"] = Derivatives(form)
+    return kept["derivatives"]
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -221,12 +286,11 @@ def _refuse_parameters(original: Any) -> Any:
 
 
 def _row(constraint: Constraint) -> Row:
-    kinds = cp.constraints
-    if isinstance(constraint, kinds.Equality | kinds.Zero):
+    if isinstance(constraint, Equality | Zero):
         return Row(constraint.expr, True, constraint.id)
-    if isinstance(constraint, kinds.Inequality | kinds.NonPos):
+    if isinstance(constraint, Inequality | NonPos):
         return Row(constraint.expr, False, constraint.id)
-    if isinstance(constraint, kinds.NonNeg):
+    if isinstance(constraint, NonNeg):
         return Row(-constraint.args[0], False, constraint.id)
     raise StructureError(
         f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
