@@ -1,0 +1,109 @@
+"""Uno through CVXPY's derivative engine, driven here so that multipliers come back and nothing is printed.
+
+CVXPY's own interface to Uno reports "optimal" for any terminated run, infeasible stationary points included, and
+returns no multipliers. Here the status of the *point* decides the claim.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from optid.backends import Answer, BackEnd, Settings
+from optid.backends.dnlp import Derivatives, Smooth, by_name, derivatives, smooth
+from optid.program import Program
+from optid.solution import Status
+
+ENDED = {
+    "ITERATION_LIMIT": Status.LIMIT, "TIME_LIMIT": Status.LIMIT, "EVALUATION_ERROR": Status.FAILED,
+    "ALGORITHMIC_ERROR": Status.FAILED, "USER_TERMINATION": Status.LIMIT,
+}
+POINT = {
+    "FEASIBLE_KKT_POINT": Status.LOCAL, "FEASIBLE_FJ_POINT": Status.INACCURATE,
+    "FEASIBLE_SMALL_STEP": Status.INACCURATE, "INFEASIBLE_STATIONARY_POINT": Status.INFEASIBLE,
+    "INFEASIBLE_SMALL_STEP": Status.INFEASIBLE, "UNBOUNDED_OBJECTIVE": Status.UNBOUNDED,
+    "DIVERGING_ITERATE": Status.UNBOUNDED,
+}
+
+
+def run(program: Program, settings: Settings) -> Answer:
+    """Solve a smooth programme with Uno (options: ``preset``, default "filtersqp", and Uno's own).
+
+    Args:
+        program: an LP, QP or smooth nonconvex programme.
+        settings: what is asked.
+    """
+    unopy: Any = import_module("unopy")
+    form = smooth(program.problem)
+    start, _ = form.start(), form.parameter_values()
+    engine = derivatives(form)
+    engine.update()
+    solver = unopy.UnoSolver()
+    chosen = options(settings)
+    solver.set_preset(chosen.pop("preset"))
+    for name, value in chosen.items():
+        solver.set_option(name, value)
+    result = solver.optimize(_model(unopy, form, engine, start))
+    word, status = _status(str(result.optimization_status), str(result.solution_status))
+    iterations = int(result.number_iterations)
+    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
+        return Answer(status, word, iterations=iterations)
+    x = np.array(list(result.primal_solution))
+    multipliers = np.array(list(result.constraint_dual_solution))
+    values, duals = form.restore(x, multipliers)
+    named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
+    return Answer(status, word, named, by_name(program.constraints, duals), iterations)
+
+
+def options(settings: Settings) -> dict[str, Any]:
+    """Translate what is asked into Uno's options; native options of the user come last."""
+    chosen: dict[str, Any] = {
+        "preset": "filtersqp", "primal_tolerance": settings.accuracy, "dual_tolerance": settings.accuracy,
+        "logger": "INFO" if settings.verbose else "SILENT", "print_solution": settings.verbose, "max_iterations": 3000,
+    }
+    if settings.time_limit is not None:
+        chosen["time_limit"] = float(settings.time_limit)
+    return {**chosen, **settings.options}
+
+
+def _model(unopy: Any, form: Smooth, engine: Derivatives, start: np.ndarray) -> Any:
+    lower, upper = form.bounds
+    model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, lower, upper, unopy.ZERO_BASED_INDEXING)
+
+    def gradient(x: Any, out: np.ndarray) -> None:
+        out[:] = engine.gradient(np.asarray(x))
+
+    def rows(x: Any, out: np.ndarray) -> None:
+        out[:] = engine.rows(np.asarray(x))
+
+    def jacobian(x: Any, out: np.ndarray) -> None:
+        out[:] = engine.jacobian(np.asarray(x))
+
+    def hessian(x: Any, factor: float, multipliers: Any, out: np.ndarray) -> None:
+        out[:] = engine.hessian(np.asarray(x), factor, np.asarray(multipliers))
+
+    model.set_objective(unopy.MINIMIZE, lambda x: engine.objective(np.asarray(x)), gradient)
+    row_lower, row_upper = form.row_bounds
+    if row_lower.size:
+        row, column = engine.jacobian_pattern
+        model.set_constraints(row_lower.size, rows, row_lower, row_upper, len(row), row, column, jacobian)
+    row, column = engine.hessian_pattern
+    model.set_lagrangian_hessian(len(row), unopy.LOWER_TRIANGLE, row, column, hessian)
+    model.set_lagrangian_sign_convention(unopy.MULTIPLIER_POSITIVE)
+    model.set_initial_primal_iterate(start)
+    return model
+
+
+def _status(ended: str, point: str) -> tuple[str, Status]:
+    """Read the two words of Uno: how the run ended, and what the point is."""
+    ended, point = ended.split(".")[-1], point.split(".")[-1]
+    if ended == "SUCCESS":
+        return point, POINT.get(point, Status.FAILED)
+    return ended, ENDED.get(ended, Status.FAILED)
+
+
+back_end = BackEnd(
+    "uno", frozenset({"LP", "QP", "NLP"}), run,
+    find_spec("unopy") is not None and find_spec("sparsediffpy") is not None, "unopy sparsediffpy", warm=True,
+    about="SQP through CVXPY's derivative engine; small dense programmes")
