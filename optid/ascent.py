@@ -6,6 +6,7 @@ Entries of different minors never overlap there, so projection onto their span i
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -14,7 +15,7 @@ from optid.minors import basis_from, cholesky, free_mask, project_minors
 from optid.rank_one import Array
 
 
-def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Array:
+def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
     """Orthogonal matrix whose columns turn every block so that mu_i and b_i become first unit vectors."""
     parts = [np.kron(basis_from(b), basis_from(mu / np.linalg.norm(mu))) for mu, b in zip(mus, bs)]
     return block_diag(np.eye(linear), *parts) if parts else np.eye(linear)

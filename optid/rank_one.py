@@ -169,13 +169,15 @@ class Core:
         pairs = [_gauge(mu, b) for mu, b in zip(mus, bs)]
         return w, [mu for mu, _ in pairs], [b for _, b in pairs]
 
-    def point(self, mus: list[Array], bs: list[Array]) -> Point:
-        """Back substitution: the best point of the problem for these whitened factors (w not kept)."""
+    def point(self, mus: list[Array], bs: list[Array], w: Array | None = None) -> Point:
+        """Back substitution: the best point of the problem for these whitened factors (and w, where it is kept)."""
         mus, bs = self.whitening.back(mus, bs)
-        theta = np.concatenate([np.kron(b, mu) for mu, b in zip(mus, bs)]) if mus else np.empty(0)
+        kept_w = _solve_upper(self.whitening.factor_w, w) if w is not None else np.empty(0)
+        core = np.concatenate([kept_w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
         k = self.eliminated
         z = np.empty(len(self.order))
-        z[self.order[:k]] = _solve_upper(self.triangle[:k, :k], self.rotated[:k] - self.triangle[:k, k:] @ theta)
+        z[self.order[k:]] = core
+        z[self.order[:k]] = _solve_upper(self.triangle[:k, :k], self.rotated[:k] - self.triangle[:k, k:] @ core)
         all_mus, all_bs = [], []
         for i, (columns, (_, nb)) in enumerate(zip(block_slices(self.problem), self.problem.blocks)):
             if i in self.kept:

@@ -147,3 +147,25 @@ def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:
         return np.zeros((len(nu), len(nu)))
     outer = np.outer(nu, kappa) / (2 * reach)
     return outer + outer.T
+
+
+def align_cuts(weights: Array, cone: Array, mu: Array, b: Array, nu: Array) -> Array:
+    """Make the cut weights of a relaxation exact at a point: no value there, and the gradient of the multipliers nu.
+
+    Args:
+        weights: (r, r, nb, nb), positive semidefinite for every pair of rows.
+        cone: (r, P).
+        mu: (P,).
+        b: (nb,) of unit length.
+        nu: (r,) KKT multipliers.
+    """
+    values = cone @ mu
+    active = np.abs(values) <= ACTIVE * (np.abs(cone) @ np.abs(mu))
+    weights = weights + weights.transpose(1, 0, 2, 3)
+    loose = ~active[:, None] & ~active
+    away = np.eye(len(b)) - np.outer(b, b)
+    weights[loose] = away @ weights[loose] @ away
+    pulls = np.einsum("jkab,a,b,k->j", weights, b, b, np.where(active, 0.0, values))
+    factors = np.where(active & (pulls > 0), nu / np.where(pulls > 0, pulls, 1.0), 1.0)
+    scale = np.where(active[:, None] & active, 1.0, np.where(active[:, None], factors[:, None], factors[None, :]))
+    return weights * scale[..., None, None] / 2
