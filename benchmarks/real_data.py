@@ -12,8 +12,6 @@ import time
 import warnings
 from pathlib import Path
 
-import numpy as np
-
 import optid
 from optid.errors import DataWarning
 
@@ -41,8 +39,8 @@ def study(name, data, count, structure, constraints, reports: Path | None):
             seconds = time.perf_counter() - started
             check = optid.validate(fit.model, test)
         findings += [str(w.message) for w in caught if issubclass(w.category, DataWarning)]
-        rows.append((label, fit, float(fit.one_step_fit[0]), float(np.squeeze(check.one_step_fit)),
-                     float(np.squeeze(check.simulation_fit)), seconds))
+        rows.append((label, fit, float(fit.one_step_fit[0]), next(iter(check.one_step.values())).fit,
+                     next(iter(check.simulation.values())).fit, seconds))
         if reports is not None:
             from optid import report
 
