@@ -141,6 +141,7 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
         channel = np.full(len(u) + 2 * reach, np.nan)  # a missing sample evaluates to zeros
         channel[inner] = u[:, c]
         first, values = basis.local(channel)
+        first, values = np.ascontiguousarray(first), np.ascontiguousarray(values)
         if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
             raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
         groups.append(Signals(first, values, basis.full_size, layout.lags[c], layout.complete_columns[c + 1]))
