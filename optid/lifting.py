@@ -4,7 +4,7 @@ A certificate needs every constraint in one of two forms: linear in z, or a cone
 carries. Anything else leaves the fit without a proof, and the reason names the constraint.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cvxpy as cp
@@ -129,22 +129,47 @@ def _block_starts(problem: RankOne) -> list[int]:
     return [int(v) for v in problem.linear + np.cumsum([0, *(p * q for p, q in problem.blocks)])]
 
 
-def lift_exact(program: Program, form: RankOneForm) -> Lifted:
-    """Bring the user constraints of a bilinear programme into lifted form."""
+@dataclass(frozen=True)
+class Places:
+    """Where the variables of a bilinear programme stand in the lifted vector z.
+
+    Attributes:
+        size: length of z.
+        columns: {id of a variable: its first column}.
+        stand_in: {id of the expression mu bᵀ: the variable that stands for it}.
+    """
+
+    size: int
+    columns: dict[int, int]
+    stand_in: dict[int, cp.Variable]
+
+    def rows(self, member: Constraint) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return (E, f) of a constraint that reads ``E z <= f`` or ``E z = f``, or None where it does not."""
+        return _rows(member.tree_copy(self.stand_in), self.columns, self.size)
+
+
+def places(program: Program, form: RankOneForm) -> Places:
+    """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
     problem = form.problem
-    lifted = Lifted(len(problem.target))
-    starts = _block_starts(problem)
     columns, position = {}, 0
     for name in form.linear:
         columns[program.variables[name].id] = position
         position += program.variables[name].size
+    stand_in = {}
+    for shape, start, (mu, _) in zip(problem.blocks, _block_starts(problem), form.blocks):
+        theta = cp.Variable(shape)
+        stand_in[id(program.view["Theta" + mu[len("mu"):]])] = theta
+        columns[theta.id] = start
+    return Places(len(problem.target), columns, stand_in)
+
+
+def lift_exact(program: Program, form: RankOneForm) -> Lifted:
+    """Bring the user constraints of a bilinear programme into lifted form."""
+    problem = form.problem
+    lifted, where = Lifted(len(problem.target)), places(program, form)
+    starts = _block_starts(problem)
     mus = {program.variables[mu].id: i for i, (mu, _) in enumerate(form.blocks)}
     bs = {program.variables[b].id: i for i, (_, b) in enumerate(form.blocks)}
-    stand_in = {}
-    for i, (mu, _) in enumerate(form.blocks):
-        theta = cp.Variable(problem.blocks[i])
-        stand_in[id(program.view["Theta" + mu[len("mu") :]])] = theta
-        columns[theta.id] = starts[i]
     for name, group in program.user_constraints.items():
         for member in group:
             if not isinstance(member, EQUALITIES | INEQUALITIES):
@@ -158,7 +183,10 @@ def lift_exact(program: Program, form: RankOneForm) -> Lifted:
             elif only in bs and _affine(member):
                 fits = _lift_b(lifted, member, problem, starts, bs[only], equal)
             else:
-                fits = _lift_linear(lifted, member.tree_copy(stand_in), columns, equal)
+                found = where.rows(member)
+                fits = found is not None
+                if found is not None:
+                    lifted.add(*found, equal)
             if not fits:
                 lifted.refused = lifted.refused or name
     return lifted
@@ -185,16 +213,15 @@ def _jacobian(member: Constraint, variables: Sequence[cp.Variable]) -> tuple[lis
     return found, constant
 
 
-def _lift_linear(lifted: Lifted, member: Constraint, columns: dict[int, int], equal: bool) -> bool:
+def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np.ndarray, np.ndarray] | None:
     variables = member.variables()
     if not _affine(member) or any(v.id not in columns for v in variables):
-        return False
+        return None
     jacobians, constant = _jacobian(member, variables)
-    rows = np.zeros((constant.size, lifted.size))
+    rows = np.zeros((constant.size, size))
     for variable, jacobian in zip(variables, jacobians):
         rows[:, columns[variable.id] : columns[variable.id] + variable.size] = jacobian
-    lifted.add(rows, -constant, equal)
-    return True
+    return rows, -constant
 
 
 def _lift_mu(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[int], i: int, equal: bool,
@@ -246,9 +273,10 @@ def certify_nuclear(problem: RankOne, program: Program, values: Values, duals: V
     multipliers = []
     for name, group in program.user_constraints.items():
         for member in group:
-            if not isinstance(member, EQUALITIES | INEQUALITIES) or not _lift_linear(
-                    lifted, member, columns, isinstance(member, EQUALITIES)):
+            found = _rows(member, columns, lifted.size) if isinstance(member, EQUALITIES | INEQUALITIES) else None
+            if found is None:
                 return Bound(-np.inf, False, "none", f"no proof: constraint {name!r} is not linear"), None
+            lifted.add(*found, isinstance(member, EQUALITIES))
         if name not in duals:
             return Bound(-np.inf, False, "none", f"no proof: the solver gave no multiplier of {name!r}"), None
         multipliers.append(duals[name])

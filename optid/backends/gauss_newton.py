@@ -15,6 +15,7 @@ from optid.backends import Answer, BackEnd, Settings, find
 from optid.bilinear import minimise, starts
 from optid.errors import StructureError
 from optid.gauges import gauge_factor
+from optid.lifting import places
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
 from optid.solution import Status
@@ -76,14 +77,35 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
 
 
 @dataclass(frozen=True)
+class _Tangent:
+    """A constraint that is not convex, linearised at every point: ``slope @ x + level <= 0`` or ``= 0``.
+
+    Attributes:
+        name: of its group.
+        span: its rows in the multipliers of the group.
+        expression: the left-hand side.
+        slope: parameter (r, size).
+        level: parameter (r,).
+        rows: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
+    """
+
+    name: str
+    span: slice
+    expression: cp.Expression
+    slope: cp.Parameter
+    level: cp.Parameter
+    rows: tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclass(frozen=True)
 class _Step:
     """A compiled QP: minimise ``‖U x - t‖²`` over the programme's own variables and constraints."""
 
     program: Program
     matrix: cp.Parameter
     target: cp.Parameter
-    pinned: tuple[cp.Parameter, ...] = ()
-    slopes: tuple[tuple[cp.Parameter, cp.Parameter, cp.Expression], ...] = ()
+    pinned: tuple[cp.Parameter, ...]
+    tangents: tuple[_Tangent, ...]
 
 
 class _Constrained:
@@ -97,6 +119,7 @@ class _Constrained:
         self.names, self.size = names, sum(v.size for v in self.variables)
         self.x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in self.variables])
         self.linear = sum(program.variables[name].size for name in form.linear)
+        self.places = places(program, form)
 
     def solve(self, count: int, seed: int) -> Answer:
         half, step = self._compile(pinned=True), self._compile(pinned=False)
@@ -107,11 +130,13 @@ class _Constrained:
             status = answer.status if answer.status in (Status.INFEASIBLE, Status.UNBOUNDED) else Status.FAILED
             return Answer(status, f"the first step is {answer.word} (by {self.inner.name})")
         tried.sort(key=lambda pair: pair[0])
+        first = tried[0][1]
+        other = [x for _, x in tried[1:] if not np.allclose(self._lift(x), self._lift(first), 1e-3, 1e-6)]
         best: Answer | None = None
         value = np.inf
-        for _, x in tried[:2]:
+        for x in [first, *other[:1]]:
             answer, reached = self._iterate(step, x)
-            if answer is not None and (best is None or reached < value):
+            if best is None or reached < value:
                 best, value = answer, reached
         return best or Answer(Status.FAILED, f"the step QP failed (by {self.inner.name})")
 
@@ -122,7 +147,7 @@ class _Constrained:
         target = cp.Parameter(self.size, value=np.zeros(self.size))
         r = cp.Variable(self.size)
         constraints: dict[str, tuple] = {"model": (r == matrix @ self.x - target,)}
-        slopes = []
+        tangents: list[_Tangent] = []
         pins: list[cp.Parameter] = []
         if pinned:
             for _, name in self.form.blocks:
@@ -133,8 +158,10 @@ class _Constrained:
         for name, group in self.program.constraints.items():
             if name == "residual" or (pinned and name == "gauge"):
                 continue
-            members = []
+            members, row = [], 0
             for member in group:
+                span = slice(row, row + sum(dual.size for dual in member.dual_variables))
+                row = span.stop
                 if member.is_dcp():
                     members.append(member)
                     continue
@@ -143,12 +170,12 @@ class _Constrained:
                 expression = slope @ self.x + level
                 equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
                 members.append(expression == 0 if equal else expression <= 0)
-                slopes.append((slope, level, member.expr))
+                tangents.append(_Tangent(name, span, member.expr, slope, level, self.places.rows(member)))
             constraints[name] = tuple(members)
         inner = Program("step", cp.Minimize(cp.sum_squares(r)), constraints,
                         {**{n: v for n, v in zip(self.names, self.variables)}, "_r": r}, {}, dict,
                         self.program.view)
-        return _Step(inner, matrix, target, tuple(pins), tuple(slopes))
+        return _Step(inner, matrix, target, tuple(pins), tuple(tangents))
 
     def _run(self, step: _Step) -> Answer | None:
         answer = self.inner.run(step.program, self.settings)
@@ -185,7 +212,7 @@ class _Constrained:
             pin.value = values[name]
         x = self._pack(values)
         # with b fixed the residual is affine, so that one linearisation is exact
-        self._set_model(half, x, second_order=False, damping=0.0)
+        self._set_model(half, x, {}, second_order=False, damping=0.0)
         answer = self._run(half)
         if answer is None:
             return None
@@ -206,66 +233,95 @@ class _Constrained:
         w, pairs = self._parts(x)
         return np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
 
-    def _set_model(self, step: _Step, x: np.ndarray, *, second_order: bool, damping: float) -> None:
-        """Write the quadratic model of the residual at x into the QP's parameters."""
-        w, pairs = self._parts(x)
-        root = self.problem.root
-        residual = root @ self._lift(x) - self.problem.target
-        columns, position = [root[:, : self.linear]], self.linear
-        curvature = np.zeros((self.size, self.size))
-        pull = root.T @ residual
-        at = self.linear
+    def _slope_of_lift(self, x: np.ndarray) -> np.ndarray:
+        """Jacobian (n, size) of the lifted vector."""
+        _, pairs = self._parts(x)
+        found = np.zeros((len(self.problem.target), self.size))
+        found[: self.linear, : self.linear] = np.eye(self.linear)
+        row = at = self.linear
         for mu, b in pairs:
             p, q = mu.size, b.size
-            block = root[:, position : position + p * q].reshape(-1, p, q, order="F")
-            columns += [block @ b, np.einsum("npq,p->nq", block, mu)]
-            cross = pull[position : position + p * q].reshape(p, q, order="F")
-            curvature[at : at + p, at + p : at + p + q] = cross
-            curvature[at + p : at + p + q, at : at + p] = cross.T
+            found[row : row + p * q, at : at + p] = np.kron(b[:, None], np.eye(p))
+            found[row : row + p * q, at + p : at + p + q] = np.kron(np.eye(q), mu[:, None])
+            row, at = row + p * q, at + p + q
+        return found
+
+    def _curvature(self, x: np.ndarray, pull: np.ndarray) -> np.ndarray:
+        """Second derivatives of ``pullᵀ z`` at x, made definite along the scale between mu and b."""
+        found = np.zeros((self.size, self.size))
+        row = at = self.linear
+        for mu, b in self._parts(x)[1]:
+            p, q = mu.size, b.size
+            own, other = slice(at, at + p), slice(at + p, at + p + q)
+            found[own, other] = pull[row : row + p * q].reshape(p, q, order="F")
+            found[other, own] = found[own, other].T
             if self.form.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
-                curvature[at + p : at + p + q, at + p : at + p + q] += np.outer(b, b) * float(mu @ mu) / max(q, 1)
-            at, position = at + p + q, position + p * q
-        jacobian = np.hstack(columns)
-        gradient = jacobian.T @ residual
+                found[other, other] += np.outer(b, b) * float(mu @ mu)
+            row, at = row + p * q, at + p + q
+        return found
+
+    def _set_model(self, step: _Step, x: np.ndarray, duals: Values, *, second_order: bool, damping: float) -> None:
+        """Write the quadratic model of the Lagrangian at x into the QP's parameters."""
+        z, lift = self._lift(x), self._slope_of_lift(x)
+        residual = self.problem.root @ z - self.problem.target
+        pull = self.problem.root.T @ residual
+        for tangent in step.tangents:
+            if tangent.rows is not None and tangent.name in duals:
+                pull = pull + tangent.rows[0].T @ duals[tangent.name][tangent.span] / 2
+        jacobian = self.problem.root @ lift
         gram = jacobian.T @ jacobian
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-14 * max(float(np.max(np.diag(gram))), 1e-300)))
-        hessian = gram + curvature if second_order else gram
+        hessian = gram + self._curvature(x, pull) if second_order else gram
+        diagonal = np.diag(gram)
+        scale = np.sqrt(np.maximum(diagonal, 1e-14 * max(float(np.max(diagonal)), 1e-300)))
         shift = max(damping, 1e-12)
-        for _ in range(40):
-            try:
-                factor = np.linalg.cholesky(hessian / np.outer(scale, scale) + shift * np.eye(self.size))
-                break
-            except np.linalg.LinAlgError:
-                if second_order:
-                    hessian, second_order = gram, False
-                else:
-                    shift = max(10.0 * shift, 1e-12)
-        else:
+        factor = _cholesky(hessian / np.outer(scale, scale), shift)
+        while factor is None and shift < 1e12:
+            shift, hessian = (shift, gram) if hessian is not gram else (10.0 * shift, gram)
+            factor = _cholesky(hessian / np.outer(scale, scale), shift)
+        if factor is None:
             raise ValueError("the quadratic model cannot be made definite")
         upper = factor.T * scale
-        unit = max(float(np.max(np.abs(upper))), 1e-300)
-        step.matrix.value = upper / unit
-        step.target.value = (upper @ x - np.linalg.solve(factor, gradient / scale)) / unit
-        self.unit = unit
+        self.unit = max(float(np.max(np.abs(upper))), 1e-300)
+        step.matrix.value = upper / self.unit
+        step.target.value = (upper @ x - np.linalg.solve(factor, jacobian.T @ residual / scale)) / self.unit
         self._assign(x)
-        for slope, level, expression in step.slopes:
-            jac = np.zeros((expression.size, self.size))
-            position = 0
-            gradients = expression.grad
-            for variable in self.variables:
-                part = gradients.get(variable)
-                if part is not None:
-                    jac[:, position : position + variable.size] = np.asarray(
-                        part.toarray() if hasattr(part, "toarray") else part).reshape(variable.size, -1).T
-                position += variable.size
-            slope.value = jac
-            level.value = np.ravel(expression.value, order="F") - jac @ x
+        for tangent in step.tangents:
+            if tangent.rows is not None:
+                slope, level = tangent.rows[0] @ lift, tangent.rows[0] @ z - tangent.rows[1]
+            else:
+                slope, level = self._slope(tangent.expression), np.ravel(tangent.expression.value, order="F")
+            tangent.slope.value = slope
+            tangent.level.value = level - slope @ x
+
+    def _slope(self, expression: cp.Expression) -> np.ndarray:
+        """Jacobian of an expression at the assigned point."""
+        gradients, parts = expression.grad, []
+        for variable in self.variables:
+            part = gradients.get(variable, np.zeros((variable.size, expression.size)))
+            dense = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
+            parts.append(np.reshape(dense, (variable.size, expression.size)).T)
+        return np.hstack(parts)
+
+    def _retract(self, x: np.ndarray) -> np.ndarray:
+        """Return to the gauge ``‖b‖ = 1`` along the scale between mu and b, on which the fit does not depend."""
+        if self.form.gauge != "norm":
+            return x
+        found, at = x.copy(), self.linear
+        for mu, b in self._parts(x)[1]:
+            size = float(np.linalg.norm(b)) or 1.0
+            found[at : at + mu.size] *= size
+            found[at + mu.size : at + mu.size + b.size] /= size
+            at += mu.size + b.size
+        return found
+
+    def _named(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
+        return {name: np.reshape(part, v.shape, order="F")
+                for name, v, part in zip(self.names, self.variables, parts)}
 
     def _assign(self, x: np.ndarray) -> None:
-        position = 0
-        for variable in self.variables:
-            variable.value = np.reshape(x[position : position + variable.size], variable.shape, order="F")
-            position += variable.size
+        for name, value in self._named(x).items():
+            self.program.variables[name].value = value
 
     def _merit(self, x: np.ndarray, weight: float) -> float:
         value = float(np.sum((self.problem.root @ self._lift(x) - self.problem.target) ** 2))
@@ -276,46 +332,42 @@ class _Constrained:
                                   for member in group if not member.is_dcp())
         return value
 
-    def _iterate(self, step: _Step, x: np.ndarray) -> tuple[Answer | None, float]:
+    def _iterate(self, step: _Step, x: np.ndarray) -> tuple[Answer, float]:
         weight, damping = 1e-3 * self.problem.scale + 1e-300, 0.0
-        answer: Answer | None = None
+        multipliers: Values = {}
         status, word, count = Status.LIMIT, "iteration limit", 0
         for count in range(1, STEPS + 1):
-            self._set_model(step, x, second_order=True, damping=damping)
+            self._set_model(step, x, multipliers, second_order=True, damping=damping)
             found = self._run(step)
-            if found is None:
-                if damping > 1e6:
-                    return answer, self._merit(x, weight)
-                damping = max(10.0 * damping, 1e-6)
-                continue
-            new = self._pack(found.values)
-            multipliers = self._duals(step, found)
-            weight = max(weight, 2.0 * max((float(np.max(np.abs(d), initial=0.0)) for d in multipliers.values()),
-                                           default=0.0))
+            new = x if found is None else self._retract(self._pack(found.values))
+            if found is not None:
+                multipliers = self._duals(found)
+                weight = max(weight, 2.0 * max(float(np.max(np.abs(d), initial=0.0)) for d in multipliers.values()))
             before, after = self._merit(x, weight), self._merit(new, weight)
-            size = float(np.linalg.norm(new - x)) / (1e-300 + float(np.linalg.norm(new)))
-            if after > before + 1e-11 * (before + 1e-9 * self.problem.scale) and size > 1e-7:
+            moved, reached = self._lift(new) - self._lift(x), self._lift(new)  # free of what b does where mu is zero
+            size = float(np.linalg.norm(moved)) / (1e-300 + float(np.linalg.norm(reached)))
+            if found is None or (after > before + 1e-11 * (before + 1e-9 * self.problem.scale) and size > 1e-7):
                 damping = max(10.0 * damping, 1e-4)
                 if damping > 1e8:
                     status, word = Status.INACCURATE, "no descent"
                     break
                 continue
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
-            answer = Answer(Status.LIMIT, word, found.values, multipliers, count)
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + 1e-9 * self.problem.scale)):
                 status, word = Status.LOCAL, "stationary"
                 break
-        if answer is None:
-            return None, np.inf
-        values = {name: answer.values[name] for name in self.names}
-        return Answer(status, word, values, self._all_duals(values, answer.duals), count), self._merit(x, weight)
+        duals = {**multipliers, "residual": -2.0 * (self.problem.root @ self._lift(x) - self.problem.target)}
+        return Answer(status, word, self._named(x), duals, count), self._merit(x, weight)
 
-    def _duals(self, step: _Step, found: Answer) -> dict[str, np.ndarray]:
+    def _duals(self, found: Answer) -> dict[str, np.ndarray]:
         return {name: self.unit**2 * dual for name, dual in found.duals.items() if name in self.program.constraints}
 
-    def _all_duals(self, values: Values, duals: Values) -> dict[str, np.ndarray]:
-        r = self.problem.root @ self._lift(self._pack(values)) - self.problem.target
-        return {**duals, "residual": -2.0 * r}
+
+def _cholesky(matrix: np.ndarray, shift: float) -> np.ndarray | None:
+    try:
+        return np.linalg.cholesky(matrix + shift * np.eye(len(matrix)))
+    except np.linalg.LinAlgError:
+        return None
 
 
 back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
