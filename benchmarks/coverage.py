@@ -1,0 +1,65 @@
+"""Do 95 % intervals contain the truth in 95 % of the records, also where constraints are active?
+
+    python benchmarks/coverage.py [--runs 1000] [--samples 200 1000] [--truths ...] [--workers 2]
+
+Every record of the simulation example is fitted without and with the constraint that f increases. Counted are a, b, and f
+(its offset included, gauge norm of b one) at 41 points, nodes and cell interiors. The truths: strictly increasing; with
+a flat piece inside (dead zone); on the boundary of the cone at both ends (saturation). Width is the mean width of the
+band under the constraint relative to the one without, averaged over the points.
+"""
+
+import argparse
+
+import numpy as np
+from montecarlo import A, B, NODES, STRUCTURE, TRUTHS, mapped, record
+
+import optid
+from optid.uncertainty import uncertainty
+
+GRID = np.linspace(-1.0, 1.0, 41)
+CASES = ("strictly monotone", "dead zone", "saturation")
+ROUNDING = 1e-7
+"""A limit that lies on the truth, as where a constraint holds it there, may miss it by the accuracy of the solver."""
+
+
+def run(job: tuple[str, int, int, bool]) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of a (2), b (2) and f (41) are covered, and the widths."""
+    name, n, seed, monotone = job
+    values = TRUTHS[name]
+    constraints = ("monotone:increasing",) if monotone else ()
+    fit = optid.fit(record(values, n, seed), prove=False, constraints=constraints, **STRUCTURE)
+    found = uncertainty(fit, seed=seed)
+    intervals = [found.a, found.b[0], found.band(0, GRID)]
+    lower, upper = (np.concatenate([getattr(i, end) for i in intervals]) for end in ("lower", "upper"))
+    truth = np.concatenate([A, B, np.interp(GRID, NODES, values)])
+    return (lower - ROUNDING <= truth) & (truth <= upper + ROUNDING), upper - lower
+
+
+def main(argv=None) -> dict:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=1000)
+    parser.add_argument("--samples", type=int, nargs="+", default=[200, 1000])
+    parser.add_argument("--truths", nargs="+", default=list(CASES), choices=CASES)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args(argv)
+    figures = {}
+    print(f"{'truth':>18} {'N':>5}  {'constraint':>10}   a1    a2    b0    b1    f mean   f points       width")
+    for name in options.truths:
+        for n in options.samples:
+            free = None
+            for monotone in (False, True):
+                jobs = [(name, n, seed, monotone) for seed in range(options.runs)]
+                hits, widths = map(np.array, zip(*mapped(run, jobs, options.workers)))
+                share, width = 100 * hits.mean(axis=0), widths.mean(axis=0)
+                free = width if free is None else free
+                relative = float(np.mean(width[4:] / free[4:]))
+                figures[name, n, monotone] = {"parameters": share[:4], "points": share[4:], "width": relative}
+                print(f"{name:>18} {n:5d}  {'increasing' if monotone else '-':>10}  "
+                      + " ".join(f"{s:5.1f}" for s in share[:4])
+                      + f"   {share[4:].mean():5.1f}   {share[4:].min():5.1f}-{share[4:].max():5.1f}   {relative:.3f}",
+                      flush=True)
+    return figures
+
+
+if __name__ == "__main__":
+    main()
