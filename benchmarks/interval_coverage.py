@@ -1,6 +1,6 @@
 """Do 95 % intervals contain the truth in 95 % of the records, also where constraints are active?
 
-    python benchmarks/coverage.py [--runs 1000] [--samples 200 1000] [--truths ...] [--workers 2]
+    python benchmarks/interval_coverage.py [--runs 1000] [--samples 200 1000] [--truths ...] [--workers 2]
 
 Every record of the simulation example is fitted without and with the constraint that f increases. Counted are a, b, and f
 (its offset included, gauge norm of b one) at 41 points, nodes and cell interiors. The truths: strictly increasing; with
