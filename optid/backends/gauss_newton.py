@@ -1,21 +1,17 @@
 """Own Gauss-Newton for rank-one least squares; with constraints its steps are QPs of the same layer.
 
 Without constraints the numbers are handled by `optid.rank_one`. With constraints every step minimises the quadratic
-model of the residual (with the exact second-order term of ``mu bᵀ`` where that is positive definite) subject to the
-programme's own convex constraints; constraints that are bilinear are linearised. The QP is compiled once: its matrix
-and right-hand side are parameters.
+model of the Lagrangian over the programme's own convex constraints and the tangents of the others (`step_qp`). A step
+that the tangents misled is corrected by solving for everything but b, which is convex.
 """
 
-from dataclasses import dataclass
-
-import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, find
+from optid.backends.step_qp import Coordinates, StepQP
 from optid.bilinear import minimise, starts
 from optid.errors import StructureError
 from optid.gauges import gauge_factor
-from optid.lifting import places
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
 from optid.solution import Status
@@ -76,119 +72,31 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
     return values
 
 
-@dataclass(frozen=True)
-class _Tangent:
-    """A constraint that is not convex, linearised at every point: ``slope @ x + level <= 0`` or ``= 0``.
-
-    Attributes:
-        name: of its group.
-        span: its rows in the multipliers of the group.
-        expression: the left-hand side.
-        slope: parameter (r, size).
-        level: parameter (r,).
-        rows: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
-    """
-
-    name: str
-    span: slice
-    expression: cp.Expression
-    slope: cp.Parameter
-    level: cp.Parameter
-    rows: tuple[np.ndarray, np.ndarray] | None
-
-
-@dataclass(frozen=True)
-class _Step:
-    """A compiled QP: minimise ``‖U x - t‖²`` over the programme's own variables and constraints."""
-
-    program: Program
-    matrix: cp.Parameter
-    target: cp.Parameter
-    pinned: tuple[cp.Parameter, ...]
-    tangents: tuple[_Tangent, ...]
-
-
 class _Constrained:
     """The constrained iteration on one programme."""
 
     def __init__(self, program: Program, form: RankOneForm, settings: Settings, inner: str) -> None:
         self.program, self.form, self.problem = program, form, form.problem
         self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-11), warm=False)
-        names = [*form.linear, *(name for pair in form.blocks for name in pair)]
-        self.variables = [program.variables[name] for name in names]
-        self.names, self.size = names, sum(v.size for v in self.variables)
-        self.x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in self.variables])
-        self.linear = sum(program.variables[name].size for name in form.linear)
-        self.places = places(program, form)
+        self.at = Coordinates(program, form)
+        self.half, self.full = StepQP(self.at, pinned=True), StepQP(self.at, pinned=False)
 
     def solve(self, count: int, seed: int) -> Answer:
-        half, step = self._compile(pinned=True), self._compile(pinned=False)
-        points = self._candidates(count, seed)
-        tried = [t for t in (self._half_step(half, point) for point in points) if t is not None]
+        tried = [t for t in (self._settle(point) for point in self._candidates(count, seed)) if t is not None]
         if not tried:
-            answer = self.inner.run(step.program, self.settings)
-            status = answer.status if answer.status in (Status.INFEASIBLE, Status.UNBOUNDED) else Status.FAILED
-            return Answer(status, f"the first step is {answer.word} (by {self.inner.name})")
+            return self._no_start()
         tried.sort(key=lambda pair: pair[0])
         first = tried[0][1]
         other = [x for _, x in tried[1:] if not np.allclose(self._lift(x), self._lift(first), 1e-3, 1e-6)]
-        best: Answer | None = None
-        value = np.inf
-        for x in [first, *other[:1]]:
-            answer, reached = self._iterate(step, x)
-            if best is None or reached < value:
-                best, value = answer, reached
-        return best or Answer(Status.FAILED, f"the step QP failed (by {self.inner.name})")
-
-    # the compiled problems
-
-    def _compile(self, *, pinned: bool) -> _Step:
-        matrix = cp.Parameter((self.size, self.size), value=np.eye(self.size))
-        target = cp.Parameter(self.size, value=np.zeros(self.size))
-        r = cp.Variable(self.size)
-        constraints: dict[str, tuple] = {"model": (r == matrix @ self.x - target,)}
-        tangents: list[_Tangent] = []
-        pins: list[cp.Parameter] = []
-        if pinned:
-            for _, name in self.form.blocks:
-                variable = self.program.variables[name]
-                pin = cp.Parameter(variable.shape, value=np.zeros(variable.shape))
-                pins.append(pin)
-                constraints[f"pinned {name}"] = (variable == pin,)
-        for name, group in self.program.constraints.items():
-            if name == "residual" or (pinned and name == "gauge"):
-                continue
-            members, row = [], 0
-            for member in group:
-                span = slice(row, row + sum(dual.size for dual in member.dual_variables))
-                row = span.stop
-                if member.is_dcp():
-                    members.append(member)
-                    continue
-                slope = cp.Parameter((member.size, self.size), value=np.zeros((member.size, self.size)))
-                level = cp.Parameter(member.size, value=np.zeros(member.size))
-                expression = slope @ self.x + level
-                equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
-                members.append(expression == 0 if equal else expression <= 0)
-                tangents.append(_Tangent(name, span, member.expr, slope, level, self.places.rows(member)))
-            constraints[name] = tuple(members)
-        inner = Program("step", cp.Minimize(cp.sum_squares(r)), constraints,
-                        {**{n: v for n, v in zip(self.names, self.variables)}, "_r": r}, {}, dict,
-                        self.program.view)
-        return _Step(inner, matrix, target, tuple(pins), tuple(tangents))
-
-    def _run(self, step: _Step) -> Answer | None:
-        answer = self.inner.run(step.program, self.settings)
-        usable = answer.values and answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
-        return answer if usable else None
-
-    # points
+        ends = [self._iterate(x) for x in [first, *other[:1]]]
+        return min(ends, key=lambda end: end[0])[1]
 
     def _candidates(self, count: int, seed: int) -> list[Point]:
+        """Points with different directions of b, each with every pattern of signs."""
         core = reduce(self.problem)
         points = [start_point(self.form, self.program.start)] if self.program.start else []
         points += [minimise(self.problem, count=count, seed=seed).point,
-                  *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed) if core.shapes)]
+                   *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed))]
         distinct: list[Point] = []
         for point in points:
             directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
@@ -202,172 +110,79 @@ class _Constrained:
                                     tuple(s * b for s, b in zip(signs, point.bs))))
         return signed
 
-    def _half_step(self, half: _Step, point: Point) -> tuple[float, np.ndarray] | None:
-        """Solve for everything but b, which is held in its gauge; None where the constraints forbid this b."""
-        try:
-            values = to_values(self.program, self.form, point)
-        except StructureError:  # this direction cannot be scaled into the gauge
+    def _settle(self, point: Point) -> tuple[float, np.ndarray] | None:
+        """Solve for everything but b, which keeps its direction; None where the constraints forbid it."""
+        x = self._in_gauge(point)
+        if x is None:
             return None
-        for (_, name), pin in zip(self.form.blocks, half.pinned):
+        values = self.at.unpack(x)
+        for name, pin in self.half.pins.items():
             pin.value = values[name]
-        x = self._pack(values)
         # with b fixed the residual is affine, so that one linearisation is exact
-        self._set_model(half, x, {}, second_order=False, damping=0.0)
-        answer = self._run(half)
-        if answer is None:
+        self.half.set_model(x, {}, second_order=False)
+        answer = self.half.run(self.inner, self.settings)
+        found = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+        return None if found is None else (self._merit(found, 0.0), found)
+
+    def _in_gauge(self, point: Point) -> np.ndarray | None:
+        """Return a point as x, moved to the gauge along the scale between mu and b; None where it has none."""
+        try:
+            return self.at.pack(to_values(self.program, self.form, point))
+        except StructureError:
             return None
-        x = self._pack(answer.values)
-        return self._merit(x, 0.0), x
-
-    def _pack(self, values: Values) -> np.ndarray:
-        return np.concatenate([np.ravel(values[name], order="F") for name in self.names]).astype(float)
-
-    def _parts(self, x: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-        position, pairs = self.linear, []
-        for p, q in self.problem.blocks:
-            pairs.append((x[position : position + p], x[position + p : position + p + q]))
-            position += p + q
-        return x[: self.linear], pairs
 
     def _lift(self, x: np.ndarray) -> np.ndarray:
-        w, pairs = self._parts(x)
-        return np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
-
-    def _slope_of_lift(self, x: np.ndarray) -> np.ndarray:
-        """Jacobian (n, size) of the lifted vector."""
-        _, pairs = self._parts(x)
-        found = np.zeros((len(self.problem.target), self.size))
-        found[: self.linear, : self.linear] = np.eye(self.linear)
-        row = at = self.linear
-        for mu, b in pairs:
-            p, q = mu.size, b.size
-            found[row : row + p * q, at : at + p] = np.kron(b[:, None], np.eye(p))
-            found[row : row + p * q, at + p : at + p + q] = np.kron(np.eye(q), mu[:, None])
-            row, at = row + p * q, at + p + q
-        return found
-
-    def _curvature(self, x: np.ndarray, pull: np.ndarray) -> np.ndarray:
-        """Second derivatives of ``pullᵀ z`` at x, made definite along the scale between mu and b."""
-        found = np.zeros((self.size, self.size))
-        row = at = self.linear
-        for mu, b in self._parts(x)[1]:
-            p, q = mu.size, b.size
-            own, other = slice(at, at + p), slice(at + p, at + p + q)
-            found[own, other] = pull[row : row + p * q].reshape(p, q, order="F")
-            found[other, own] = found[own, other].T
-            if self.form.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
-                found[other, other] += np.outer(b, b) * float(mu @ mu)
-            row, at = row + p * q, at + p + q
-        return found
-
-    def _set_model(self, step: _Step, x: np.ndarray, duals: Values, *, second_order: bool, damping: float) -> None:
-        """Write the quadratic model of the Lagrangian at x into the QP's parameters."""
-        z, lift = self._lift(x), self._slope_of_lift(x)
-        residual = self.problem.root @ z - self.problem.target
-        pull = self.problem.root.T @ residual
-        for tangent in step.tangents:
-            if tangent.rows is not None and tangent.name in duals:
-                pull = pull + tangent.rows[0].T @ duals[tangent.name][tangent.span] / 2
-        jacobian = self.problem.root @ lift
-        gram = jacobian.T @ jacobian
-        hessian = gram + self._curvature(x, pull) if second_order else gram
-        diagonal = np.diag(gram)
-        scale = np.sqrt(np.maximum(diagonal, 1e-14 * max(float(np.max(diagonal)), 1e-300)))
-        shift = max(damping, 1e-12)
-        factor = _cholesky(hessian / np.outer(scale, scale), shift)
-        while factor is None and shift < 1e12:
-            shift, hessian = (shift, gram) if hessian is not gram else (10.0 * shift, gram)
-            factor = _cholesky(hessian / np.outer(scale, scale), shift)
-        if factor is None:
-            raise ValueError("the quadratic model cannot be made definite")
-        upper = factor.T * scale
-        self.unit = max(float(np.max(np.abs(upper))), 1e-300)
-        step.matrix.value = upper / self.unit
-        step.target.value = (upper @ x - np.linalg.solve(factor, jacobian.T @ residual / scale)) / self.unit
-        self._assign(x)
-        for tangent in step.tangents:
-            if tangent.rows is not None:
-                slope, level = tangent.rows[0] @ lift, tangent.rows[0] @ z - tangent.rows[1]
-            else:
-                slope, level = self._slope(tangent.expression), np.ravel(tangent.expression.value, order="F")
-            tangent.slope.value = slope
-            tangent.level.value = level - slope @ x
-
-    def _slope(self, expression: cp.Expression) -> np.ndarray:
-        """Jacobian of an expression at the assigned point."""
-        gradients, parts = expression.grad, []
-        for variable in self.variables:
-            part = gradients.get(variable, np.zeros((variable.size, expression.size)))
-            dense = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
-            parts.append(np.reshape(dense, (variable.size, expression.size)).T)
-        return np.hstack(parts)
-
-    def _retract(self, x: np.ndarray) -> np.ndarray:
-        """Return to the gauge ``‖b‖ = 1`` along the scale between mu and b, on which the fit does not depend."""
-        if self.form.gauge != "norm":
-            return x
-        found, at = x.copy(), self.linear
-        for mu, b in self._parts(x)[1]:
-            size = float(np.linalg.norm(b)) or 1.0
-            found[at : at + mu.size] *= size
-            found[at + mu.size : at + mu.size + b.size] /= size
-            at += mu.size + b.size
-        return found
-
-    def _named(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
-        return {name: np.reshape(part, v.shape, order="F")
-                for name, v, part in zip(self.names, self.variables, parts)}
-
-    def _assign(self, x: np.ndarray) -> None:
-        for name, value in self._named(x).items():
-            self.program.variables[name].value = value
+        return self.at.point(x).lift()
 
     def _merit(self, x: np.ndarray, weight: float) -> float:
         value = float(np.sum((self.problem.root @ self._lift(x) - self.problem.target) ** 2))
         if weight:
-            self._assign(x)
+            self.at.assign(x)
             value += weight * sum(float(np.sum(np.abs(np.asarray(member.violation()))))
                                   for name, group in self.program.constraints.items() if name != "residual"
                                   for member in group if not member.is_dcp())
         return value
 
-    def _iterate(self, step: _Step, x: np.ndarray) -> tuple[Answer, float]:
+    def _iterate(self, x: np.ndarray) -> tuple[float, Answer]:
         weight, damping = 1e-3 * self.problem.scale + 1e-300, 0.0
+        floor = 1e-9 * self.problem.scale
         multipliers: Values = {}
         status, word, count = Status.LIMIT, "iteration limit", 0
-        for count in range(1, STEPS + 1):
-            self._set_model(step, x, multipliers, second_order=True, damping=damping)
-            found = self._run(step)
-            new = x if found is None else self._retract(self._pack(found.values))
-            if found is not None:
-                multipliers = self._duals(found)
+        while status is Status.LIMIT and count < STEPS:
+            count += 1
+            self.full.set_model(x, multipliers, damping=damping)
+            answer = self.full.run(self.inner, self.settings)
+            new = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+            size, before, after = np.inf, 0.0, np.inf
+            if new is not None:
+                multipliers = answer.duals
                 weight = max(weight, 2.0 * max(float(np.max(np.abs(d), initial=0.0)) for d in multipliers.values()))
-            before, after = self._merit(x, weight), self._merit(new, weight)
-            moved, reached = self._lift(new) - self._lift(x), self._lift(new)  # free of what b does where mu is zero
-            size = float(np.linalg.norm(moved)) / (1e-300 + float(np.linalg.norm(reached)))
-            if found is None or (after > before + 1e-11 * (before + 1e-9 * self.problem.scale) and size > 1e-7):
+                before, after = self._merit(x, weight), self._merit(new, weight)
+                # measured on the lifted vector: b means nothing where mu is zero
+                size = _distance(self._lift(x), self._lift(new))
+                if after > before + 1e-11 * (before + floor) and size > 1e-7:
+                    # the tangents may mislead along a curved constraint: return to it by solving for all but b
+                    settled = self._settle(self.at.point(new))
+                    after, new = (self._merit(settled[1], weight), settled[1]) if settled else (after, new)
+            if new is None or (after > before + 1e-11 * (before + floor) and size > 1e-7):
                 damping = max(10.0 * damping, 1e-4)
                 if damping > 1e8:
                     status, word = Status.INACCURATE, "no descent"
-                    break
                 continue
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
-            if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + 1e-9 * self.problem.scale)):
+            if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-                break
         duals = {**multipliers, "residual": -2.0 * (self.problem.root @ self._lift(x) - self.problem.target)}
-        return Answer(status, word, self._named(x), duals, count), self._merit(x, weight)
+        return self._merit(x, weight), Answer(status, word, self.at.unpack(x), duals, count)
 
-    def _duals(self, found: Answer) -> dict[str, np.ndarray]:
-        return {name: self.unit**2 * dual for name, dual in found.duals.items() if name in self.program.constraints}
+    def _no_start(self) -> Answer:
+        answer = self.full.run(self.inner, self.settings)
+        status = answer.status if answer.status in (Status.INFEASIBLE, Status.UNBOUNDED) else Status.FAILED
+        return Answer(status, f"the first step is {answer.word} (by {self.inner.name})")
 
 
-def _cholesky(matrix: np.ndarray, shift: float) -> np.ndarray | None:
-    try:
-        return np.linalg.cholesky(matrix + shift * np.eye(len(matrix)))
-    except np.linalg.LinAlgError:
-        return None
+def _distance(z: np.ndarray, reached: np.ndarray) -> float:
+    return float(np.linalg.norm(reached - z) / (1e-300 + np.linalg.norm(reached)))
 
 
 back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
