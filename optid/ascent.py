@@ -11,27 +11,27 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from optid.minors import basis_from, cholesky, free_mask, project_minors
+from optid.minors import Block, basis_from, cholesky, project_minors
 from optid.rank_one import Array
 
 
 def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
     """Orthogonal matrix whose columns turn every block so that mu_i and b_i become first unit vectors."""
-    parts = [np.kron(basis_from(b), basis_from(mu / np.linalg.norm(mu))) for mu, b in zip(mus, bs)]
+    parts = [np.kron(basis_from(b), basis_from(mu / np.linalg.norm(mu)) if mu.any() else np.eye(len(mu)))
+             for mu, b in zip(mus, bs)]
     return block_diag(np.eye(linear), *parts) if parts else np.eye(linear)
 
 
-def ascend(matrix: Array, shapes: Sequence[tuple[int, int]], linear: int, steps: int) -> tuple[Array | None, int]:
+def ascend(matrix: Array, blocks: Sequence[Block], masks: Sequence[np.ndarray],
+           steps: int) -> tuple[Array | None, int]:
     """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken.
 
     Args:
         matrix: (k, k) H + M_tangent (- cuts) in rotated coordinates.
-        shapes: (P_i, nb_i) of the blocks.
-        linear: leading unknowns outside the blocks.
+        blocks: position and shape of every block.
+        masks: entries, as (P nb, P nb), of the minors that are free.
         steps: eigenvalue decompositions at most.
     """
-    edges = np.cumsum([linear, *(p * nb for p, nb in shapes)])
-    spans = [(slice(a, b), shape, free_mask(shape)) for a, b, shape in zip(edges[:-1], edges[1:], shapes)]
     current, memory = matrix, np.zeros_like(matrix)
     aim = 0.1 * float(np.trace(matrix)) / len(matrix)  # inside the cone: its boundary is reached only in the limit
     for step in range(1, steps + 1):
@@ -41,7 +41,7 @@ def ascend(matrix: Array, shapes: Sequence[tuple[int, int]], linear: int, steps:
         aim *= 0.95
         wanted = positive - memory - matrix
         current = matrix.copy()
-        for where, shape, mask in spans:
+        for (where, shape), mask in zip(blocks, masks):
             current[where, where] += project_minors(wanted[where, where], shape) * mask
         if cholesky(current) is not None:
             return current - matrix, step

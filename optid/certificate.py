@@ -16,7 +16,7 @@ from optid.ascent import ascend, rotation
 from optid.bilinear import LocalSolution, best_of, descend, starts
 from optid.certificate_sdp import relax, relaxation_size
 from optid.errors import StructureError
-from optid.minors import Lagrangian, free_mask, project_minors, tangent_minors
+from optid.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
 from optid.rank_one import Array, Core, Point, RankOne, matrices, reduce
 from optid.shape_duals import Linear, Multipliers, align_cuts, as_cones, as_linear, kkt_multipliers, sign_free_cut
 from optid.solution import Bound
@@ -91,10 +91,22 @@ class Case:
     began: float
 
     @property
-    def blocks(self) -> list[tuple[slice, tuple[int, int]]]:
+    def blocks(self) -> list[Block]:
         """Position and shape of every block of the core."""
         edges = np.cumsum([self.core.linear, *(p * nb for p, nb in self.core.shapes)])
         return [(slice(int(a), int(b)), shape) for a, b, shape in zip(edges[:-1], edges[1:], self.core.shapes)]
+
+    @property
+    def vanishing(self) -> list[bool]:
+        """Whether a block is zero: its minors are then all free, and its gradient must vanish by itself."""
+        size = float(np.linalg.norm(self.objective.z))
+        return [bool(np.linalg.norm(mu) <= 1e-10 * size) for mu in self.mus]
+
+    @property
+    def masks(self) -> list[np.ndarray]:
+        """Entries of the minors that do not touch the gradient at the point, in rotated coordinates, by block."""
+        return [np.ones((p * nb, p * nb), bool) if vanishes else free_mask((p, nb))
+                for vanishes, (p, nb) in zip(self.vanishing, self.core.shapes)]
 
     def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
         """The objective with the linear terms, at the KKT multipliers or others."""
@@ -257,13 +269,11 @@ def tangent(case: Case, cuts: dict[int, Array]) -> Array:
     if form is not None:
         slope = slope - form @ case.objective.z
     minors = np.zeros_like(case.objective.gram)
-    negligible = 1e-10 * float(np.linalg.norm(case.objective.z))
     gradients = matrices(slope[case.core.linear:], case.core.shapes)
-    for (where, _), mu, b, gradient in zip(case.blocks, case.mus, case.bs, gradients):
-        size = float(np.linalg.norm(mu))
-        if size > negligible:
+    for (where, _), mu, b, vanishes, gradient in zip(case.blocks, case.mus, case.bs, case.vanishing, gradients):
+        if not vanishes:
             gradient = gradient - np.outer(gradient @ b, b)
-            gradient = gradient - np.outer(mu, mu @ gradient) / size**2
+            gradient = gradient - np.outer(mu, mu @ gradient) / (mu @ mu)
             minors[where, where] = tangent_minors(-gradient, mu, b)
     return minors
 
@@ -273,7 +283,7 @@ def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple
     form = case.cut_form(cuts)
     matrix = case.objective.gram + minors - (0.0 if form is None else form)
     turn = rotation(case.core.linear, case.mus, case.bs)
-    free, taken = ascend(turn.T @ matrix @ turn, case.core.shapes, case.core.linear, steps)
+    free, taken = ascend(turn.T @ matrix @ turn, case.blocks, case.masks, steps)
     return (None if free is None else minors + onto_minors(case, turn @ free @ turn.T)), taken
 
 
@@ -316,8 +326,8 @@ def free_part(case: Case, minors: Array) -> Array:
     """The part of a combination of minors that does not touch the gradient at the point."""
     turn = rotation(case.core.linear, case.mus, case.bs)
     turned = turn.T @ minors @ turn
-    for where, shape in case.blocks:
-        turned[where, where] *= free_mask(shape)
+    for (where, _), mask in zip(case.blocks, case.masks):
+        turned[where, where] *= mask
     return onto_minors(case, turn @ turned @ turn.T)
 
 

@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from optid.minors import Lagrangian
+from optid.minors import Block, Lagrangian
 from optid.rank_one import Array
 from optid.shape_duals import Linear
-
-Block = tuple[slice, tuple[int, int]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from scipy.linalg import get_lapack_funcs
 from optid.rank_one import Array
 
 _potrf, _trtrs = get_lapack_funcs(("potrf", "trtrs"), dtype=float)
+Block = tuple[slice, tuple[int, int]]  # position in the lifted vector and shape (P, nb)
 MARGIN = 1e-12  # a Cholesky factor of S - MARGIN max(diag S) I proves S > 0 in spite of roundoff
 
 
