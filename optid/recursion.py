@@ -129,8 +129,7 @@ class RecursiveARX:
         Raises:
             DataError: detrended or scaled data.
         """
-        if not data.transform.is_identity:
-            raise DataError("The data were detrended or scaled; a recursion works in raw units: use data.raw().")
+        _check_raw(data)
         lo, hi = data.ranges() if isinstance(data, Stream) else _ranges(data)
         bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
         return cls(
@@ -175,7 +174,17 @@ class RecursiveARX:
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
     def read(self, data: Data | Stream) -> list[Array]:
-        """Take in a whole record, every experiment with lags of its own; returns the innovations of each."""
+        """Take in a whole record, every experiment with lags of its own; returns the innovations of each.
+
+        Raises:
+            DataError: other channels than the model's, detrended or scaled data; and as `update`.
+        """
+        _check_raw(data)
+        if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
+            raise DataError(
+                f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
+                f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select."
+            )
         experiments = [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]
         innovations = []
         for chunks in experiments:
@@ -345,6 +354,11 @@ class RecursiveARX:
 def _each(value: Any, m: int) -> tuple[Any, ...]:
     """One entry per input; a list is taken as it is, and `Layout` refuses a wrong length."""
     return tuple(value) if isinstance(value, list | tuple) else (value,) * m
+
+
+def _check_raw(data: Data | Stream) -> None:
+    if not data.transform.is_identity:
+        raise DataError("The data were detrended or scaled; a recursion works in raw units: use data.raw().")
 
 
 def _ranges(data: Data) -> tuple[list[float], list[float]]:

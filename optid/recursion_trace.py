@@ -42,7 +42,7 @@ class Trace:
             beta: the gauge, not zero; the first coefficient of b has its sign.
 
         Returns:
-            mu (K, P), b (K, nb l) and s_2 / s_1 (K,) (0 where there is one singular value).
+            mu (K, P), b (K, nb l) and s_2 / s_1 (K,), 0 where there is no second one.
         """
         if beta == 0:
             raise StructureError("beta=0: the gauge is a number other than zero.")
@@ -55,5 +55,6 @@ class Trace:
             sign = np.where(right[:, 0, 0] < 0, -1.0, 1.0)
             mu[known] = beta * (sign * size[:, 0])[:, None] * left[:, :, 0]
             b[known] = sign[:, None] * right[:, 0] / beta
-            ratio[known] = size[:, 1] / size[:, 0] if size.shape[1] > 1 else 0.0
+            second = size[:, 1] if size.shape[1] > 1 else np.zeros(len(size))
+            ratio[known] = second / np.where(size[:, 0] > 0, size[:, 0], 1.0)
         return mu, b, ratio

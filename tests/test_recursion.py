@@ -227,6 +227,25 @@ def test_a_noise_free_system_is_recovered(split, case):
     assert np.linalg.norm(model.b[0]) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("split", ["whitened", "plain"])
+@pytest.mark.parametrize("case", ["triangular", "trigonometric", "two inputs, two outputs"])
+def test_the_model_is_that_of_algorithm_3_1_on_the_whole_record(split, case):
+    from optid.fitting import fit
+
+    recursion, (u, y) = started(case)
+    layout = recursion.layout
+    recursion.update(u, y)
+    data = Data(u, y, inputs=layout.inputs, outputs=layout.outputs)
+    batch = fit(data, "hammerstein_arx.overparametrised", na=layout.na, nb=layout.nb, nk=layout.nk, basis=layout.bases,
+                svd=split, accuracy=1e-10, prove=False).model
+    model = recursion.model(split)
+    np.testing.assert_allclose(model.a, batch.a, atol=1e-9)
+    for c in range(layout.m):
+        np.testing.assert_allclose(model.b[c], batch.b[c], atol=1e-9)
+        np.testing.assert_allclose(model.theta(c), batch.theta(c), atol=1e-9)
+    np.testing.assert_allclose(model.predict(data), batch.predict(data), atol=1e-9)
+
+
 def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
     """Where the Gram matrix is exactly a Kronecker product, the whitened SVD is the least-squares optimum."""
     from optid.splitting import leading_pair
@@ -391,6 +410,10 @@ def test_bad_settings():
         recursion.model("best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match="raw"):
         RecursiveARX.like(Data(u, y).detrend(), na=1, nb=1, basis="triangular:3")
+    with pytest.raises(DataError, match="raw"):
+        recursion.read(Data(u, y).scale())
+    with pytest.raises(DataError, match="valve -> y, the model u -> y"):
+        recursion.read(Data(u, y, inputs="valve"))
 
 
 def test_bad_samples_leave_the_state_alone():
