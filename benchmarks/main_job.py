@@ -93,7 +93,8 @@ def main(argv=None) -> dict:
     t = fit.solution.times
     print(f"exact, N = {options.samples}, na 2, nb 10, 20 cells: {1e3 * seconds:.1f} ms in all, "
           f"status {fit.solution.status}, proof {fit.solution.proof} ({fit.solution.bound.method})")
-    print(f"  build {1e3 * t.build:.1f}, solve {1e3 * t.solve:.1f}, judge {1e3 * t.judge:.1f}, prove {1e3 * t.prove:.1f} ms")
+    print(f"  build {1e3 * t.build:.1f}, solve {1e3 * t.solve:.1f}, judge {1e3 * t.judge:.1f}, "
+          f"prove {1e3 * t.prove:.1f} ms")
     figures["exact_ms"] = 1e3 * seconds
     if not options.skip_raw:
         raw, objective = casadi_raw(data, 2, 10, structure["basis"], fit.program.start)
@@ -103,10 +104,11 @@ def main(argv=None) -> dict:
         figures.update(exact_ratio=raw / seconds, exact_agreement=same)
 
     data = record(options.nuclear, 10)
-    arguments = {**structure, "accuracy": 1e-10, "weight": 1e-4 * fit.solution.scale * options.nuclear / options.samples}
+    weight = 1e-4 * fit.solution.scale * options.nuclear / options.samples
+    arguments = {**structure, "accuracy": 1e-10, "weight": weight}
     optid.fit(data, "hammerstein_arx.nuclear", **arguments)
     seconds, fit = best(lambda: optid.fit(data, "hammerstein_arx.nuclear", **arguments), 3)
-    raw, theta = nuclear_raw(data, 2, 10, structure["basis"], arguments["weight"])
+    raw, theta = nuclear_raw(data, 2, 10, structure["basis"], weight)
     difference = float(np.linalg.norm(theta - fit.solution.values["Theta"]) / np.linalg.norm(theta))
     print(f"nuclear, N = {options.nuclear}: {1e3 * seconds:.0f} ms; raw samples in CVXPY {raw:.1f} s, "
           f"{raw / seconds:.0f} times as long; Theta agrees to {difference:.0e} (relative)")
@@ -119,7 +121,8 @@ def main(argv=None) -> dict:
     extra = seconds - fit.solution.times.solve
     print(f"small problem (N = 1000, na 2, nb 2, 10 cells): {1e3 * seconds:.1f} ms in all, "
           f"{1e3 * extra:.1f} ms beyond the solver, proof included")
-    command = [sys.executable, "-c", "import time; t = time.perf_counter(); import optid; print(time.perf_counter() - t)"]
+    code = "import time; t = time.perf_counter(); import optid; print(time.perf_counter() - t)"
+    command = [sys.executable, "-c", code]
     imports = float(np.median([float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
                                for _ in range(5)]))
     print(f"import optid: {imports:.3f} s")

@@ -15,8 +15,8 @@ from optid.bases import Linear
 from optid.data import Data
 from optid.models import HammersteinARX
 from optid.program import Program, Values
-from optid.streams import Stream
 from optid.solving import Procedure
+from optid.streams import Stream
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,

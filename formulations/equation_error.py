@@ -4,7 +4,7 @@
 ``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,15 +12,15 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from optid.bases import parse
+from optid.bases import fitted_bases
 from optid.basis import Basis
 from optid.data import Data
-from optid.errors import DataError, StructureError
+from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity
 from optid.program import Program, View
 from optid.rank_one import RankOne
-from optid.streams import Stream
 from optid.regressors import Layout, Statistics, collect
+from optid.streams import Stream
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class EquationError:
 
     def linear_variables(self) -> dict[str, cp.Variable]:
         """Return new CVXPY variables ``a`` ((na,) or (l, na l) = [A_1 .. A_na]) and ``offset`` (l,)."""
-        l, na = self.outputs, self.layout.na
+        ny, na = self.outputs, self.layout.na
         found = {}
         if na:
-            found["a"] = cp.Variable(na if l == 1 else (l, na * l), name="a")
-        found["offset"] = cp.Variable(l, name="offset")
+            found["a"] = cp.Variable(na if ny == 1 else (ny, na * ny), name="a")
+        found["offset"] = cp.Variable(ny, name="offset")
         return found
 
     def b_shape(self, channel: int) -> tuple[int, ...]:
@@ -84,10 +84,10 @@ class EquationError:
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""
-        l, na = self.outputs, self.layout.na
-        found = {"offset": np.array(w[na * l * l :])}
+        ny, na = self.outputs, self.layout.na
+        found = {"offset": np.array(w[na * ny * ny :])}
         if na:
-            found["a"] = np.array(w[:na]) if l == 1 else np.reshape(w[: na * l * l], (l, na * l), order="F")
+            found["a"] = np.array(w[:na]) if ny == 1 else np.reshape(w[: na * ny * ny], (ny, na * ny), order="F")
         return found
 
     def matrices(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
@@ -102,12 +102,12 @@ class EquationError:
 
     def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the coefficients (n_columns, l) of the regressor's columns in the order of the layout."""
-        l, na = self.outputs, self.layout.na
-        theta = np.zeros((self.layout.n_columns, l))
+        ny, na = self.outputs, self.layout.na
+        theta = np.zeros((self.layout.n_columns, ny))
         if na:
-            theta[: na * l] = np.reshape(values["a"], (l, na * l), order="F" if l > 1 else "C").T
+            theta[: na * ny] = np.reshape(values["a"], (ny, na * ny), order="F" if ny > 1 else "C").T
         for c, matrix in enumerate(self.matrices(values)):
-            theta[self.layout.block(c)] = matrix.reshape(-1, l, order="F")
+            theta[self.layout.block(c)] = matrix.reshape(-1, ny, order="F")
         theta[-1] = values["offset"]
         return theta
 
@@ -133,10 +133,10 @@ class EquationError:
             gauge: the gauge to report in.
             flip: make the first non-zero of every b positive.
         """
-        l, na = self.outputs, self.layout.na
+        ny, na = self.outputs, self.layout.na
         a = np.asarray(values.get("a", np.zeros(0)))
-        if l > 1:
-            a = np.stack([a[:, i * l : (i + 1) * l] for i in range(na)]) if na else np.zeros((0, l, l))
+        if ny > 1:
+            a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
         signs = [leading_sign(b) if flip else 1.0 for b in bs]
         model = HammersteinARX(
             a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
@@ -165,7 +165,9 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
 
     Args:
         data: the record.
-        na: order of A; nb: number of numerator coefficients per input; nk: delay per input.
+        na: order of A.
+        nb: number of numerator coefficients, one per input or one for all.
+        nk: delay in samples, one per input or one for all.
         basis: one basis for all inputs or one per input; a basis without interval takes the range of its input.
         ridge: weight of ``‖Theta‖²``.
         curvature: weight of the integral of ``f''²`` summed over the columns of Theta.
@@ -206,62 +208,32 @@ def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], lo
     return tuple(int(v) for v in values)
 
 
-def fitted_bases(data: Data | Stream, basis: Basis | str | Sequence[Basis | str]) -> tuple[Basis, ...]:
-    """Return one basis per input, with its interval set from the record where the user gave none."""
-    several = list(basis) if isinstance(basis, list | tuple) else [basis] * len(data.inputs)
-    if len(several) != len(data.inputs):
-        raise StructureError(f"{len(several)} bases for {len(data.inputs)} inputs ({', '.join(data.inputs)})")
-    low, high = input_ranges(data)
-    fitted = []
-    for channel, one, lo, hi in zip(data.inputs, several, low, high):
-        one = parse(one) if isinstance(one, str) else one
-        if not np.isfinite(lo):
-            raise DataError(f"input {channel!r} has no sample at all")
-        if lo == hi and one.interval is None:
-            raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
-                            "excite the input or drop the channel")
-        fitted.append(one.fitted(float(lo), float(hi)))
-    return tuple(fitted)
-
-
-def input_ranges(data: Data | Stream) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest sample of every input over all experiments."""
-    if isinstance(data, Stream):
-        return data.ranges()
-    stacked = [e.u for e in data.experiments]
-    empty = np.array([all(np.all(np.isnan(u[:, c])) for u in stacked) for c in range(data.m)])
-    pick: Callable[[Any], np.ndarray] = lambda f: np.array(  # noqa: E731
-        [np.nan if empty[c] else f([f(u[:, c][~np.isnan(u[:, c])]) for u in stacked if not np.all(np.isnan(u[:, c]))])
-         for c in range(data.m)])
-    return pick(np.min), pick(np.max)
-
-
 def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> RankOne:
     """Order the triangular system of the statistics by z and add the quadratic penalties on Theta."""
-    layout, l = statistics.layout, len(statistics.layout.outputs)
+    layout, ny = statistics.layout, len(statistics.layout.outputs)
     n, na = layout.n_columns, layout.na
     sizes = [b.size for b in layout.bases]
-    blocks = tuple((p, q * l) for p, q in zip(sizes, layout.nb))
-    linear = na * l * l + l
-    total = linear + sum(p * q for p, q in zip(sizes, layout.nb)) * l
-    where = np.zeros((l, n), dtype=int)
-    for o in range(l):
-        where[o, : na * l] = np.arange(na * l) * l + o
-        where[o, n - 1] = na * l * l + o
+    blocks = tuple((p, q * ny) for p, q in zip(sizes, layout.nb))
+    linear = na * ny * ny + ny
+    total = linear + sum(p * q for p, q in zip(sizes, layout.nb)) * ny
+    where = np.zeros((ny, n), dtype=int)
+    for o in range(ny):
+        where[o, : na * ny] = np.arange(na * ny) * ny + o
+        where[o, n - 1] = na * ny * ny + o
         position = linear
         for c, (p, q) in enumerate(zip(sizes, layout.nb)):
             where[o, layout.block(c)] = position + o * p * q + np.arange(p * q)
-            position += p * q * l
+            position += p * q * ny
     root = statistics.root
-    system = np.zeros((l * n + (total - linear if ridge else 0), total + 1))
+    system = np.zeros((ny * n + (total - linear if ridge else 0), total + 1))
     remainder = 0.0
-    for o in range(l):
+    for o in range(ny):
         rows = slice(o * n, (o + 1) * n)
         system[rows, where[o]] = root[:n, :n]
         system[rows, -1] = root[:n, n + o]
         remainder += float(np.sum(root[n:, n + o] ** 2))
     if ridge:
-        system[l * n :, linear:-1] = np.sqrt(ridge) * np.eye(total - linear)
+        system[ny * n :, linear:-1] = np.sqrt(ridge) * np.eye(total - linear)
     if curvature:
         extra = np.zeros((total - linear, total + 1))
         position = linear
@@ -273,7 +245,7 @@ def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> Ra
         system = np.vstack([system, extra])
     triangle = np.triu(np.linalg.qr(system, mode="r"))
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
-    scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(l)))
+    scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(ny)))
     return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,
                    blocks=blocks, scale=scale)
 
@@ -294,5 +266,5 @@ def residual_programme(problem: EquationError, name: str, variables: dict[str, c
     constraints = {"residual": (r == residual,), **parts.pop("constraints", {})}
     objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + penalty)
     return Program(name=name, objective=objective, constraints=constraints, variables={**variables, "residual": r},
-                   structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale, compressed=problem,
-                   **parts)
+                   structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
+                   compressed=problem, **parts)

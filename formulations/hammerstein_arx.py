@@ -23,16 +23,16 @@ import numpy as np
 from formulations.equation_error import EquationError, compress, residual_programme
 from formulations.losses import with_loss
 from optid.basis import Basis
-from optid.data import Data
 from optid.bilinear import starts
+from optid.data import Data
 from optid.errors import StructureError
+from optid.gauges import gauge_factor
 from optid.lifting import certify_nuclear, certify_rank_one
 from optid.models import HammersteinARX
 from optid.program import Program, RankOneForm, Values
-from optid.gauges import gauge_factor
 from optid.rank_one import Core, reduce
-from optid.streams import Stream
 from optid.solving import Procedure
+from optid.streams import Stream
 
 GAUGES = ("norm", "gain", "b0")
 

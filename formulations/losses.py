@@ -14,10 +14,10 @@ from formulations.equation_error import EquationError
 from optid.data import Data
 from optid.errors import StructureError, nearest
 from optid.program import Program
-from optid.streams import Stream
 from optid.regressors import residuals
 from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
+from optid.streams import Stream
 
 Pose = Callable[[list[np.ndarray] | None], tuple[Program, EquationError]]
 

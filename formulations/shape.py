@@ -22,13 +22,12 @@ from formulations.stability import stable
 from optid.errors import StructureError
 from optid.program import View
 
-
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
-    """f is increasing or decreasing over the interval of its basis.
+    """The nonlinearity is increasing or decreasing over the interval of its basis.
 
     Exact for piecewise linear and constant bases, sufficient for splines (control points), on a dense grid otherwise.
 
@@ -44,12 +43,12 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
 
 
 def convex(channel: str | None = None) -> Rule:
-    """f is convex over the interval of its basis."""
+    """The nonlinearity is convex over the interval of its basis."""
     return _cone("convex", "", channel, lambda basis: basis.curvature())
 
 
 def concave(channel: str | None = None) -> Rule:
-    """f is concave over the interval of its basis."""
+    """The nonlinearity is concave over the interval of its basis."""
     return _cone("concave", "", channel, lambda basis: -basis.curvature())
 
 
@@ -59,12 +58,12 @@ def odd(channel: str | None = None) -> Rule:
 
 
 def even(channel: str | None = None) -> Rule:
-    """f is even where the interval is symmetric about zero."""
+    """The nonlinearity is even where the interval is symmetric about zero."""
     return _linear("even", channel, lambda basis: _mirror(basis, -1.0))
 
 
 def dead_zone(low: float, high: float, channel: str | None = None) -> Rule:
-    """f is constant on [low, high]; cells of the basis that the zone only touches become constant as a whole.
+    """The nonlinearity is constant on [low, high]; cells that the zone only touches become constant as a whole.
 
     Raises:
         StructureError: an empty zone.
@@ -75,7 +74,7 @@ def dead_zone(low: float, high: float, channel: str | None = None) -> Rule:
 
 
 def saturation(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
-    """f is constant below ``low`` and above ``high``.
+    """The nonlinearity is constant below ``low`` and above ``high``.
 
     Raises:
         StructureError: neither level given.

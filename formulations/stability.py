@@ -72,7 +72,7 @@ def central(a: np.ndarray, radius: float) -> np.ndarray:
 
 def _real(a: Any, na: int, radius: float, points: np.ndarray) -> list[Any]:
     if points.size != na - 1 or np.any(np.diff(points) >= 0) or np.any(np.abs(points) >= radius):
-        raise StructureError(f"real= needs {na - 1} separating points in decreasing order inside the radius {radius:g}; "
+        raise StructureError(f"real= needs {na - 1} separating points in decreasing order inside {radius:g}; "
                              f"got {points.tolist()}")
     where = np.concatenate([[radius], points, [-radius]])
     constraints = []

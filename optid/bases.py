@@ -1,12 +1,16 @@
 """The bases by name: what a user imports, writes on a command line and finds in a model file."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 from optid.basis import Basis
-from optid.errors import LookupFailed, StructureError, nearest
+from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.expansions import Linear, Polynomial, Trigonometric, UserFunctions, restore
 from optid.splines import BSpline, PiecewiseConstant, Triangular
+
+if TYPE_CHECKING:
+    from optid.data import Data
+    from optid.streams import Stream
 
 __all__ = [
     "BSpline",
@@ -17,6 +21,7 @@ __all__ = [
     "Triangular",
     "Trigonometric",
     "UserFunctions",
+    "fitted_bases",
     "from_dict",
     "parse",
 ]
@@ -62,6 +67,33 @@ def parse(text: str) -> Basis:
         raise StructureError(
             f"Basis {text!r} cannot be read ({error}): write {name}:10, then options such as outside=extrapolate."
         ) from error
+
+
+def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | str]") -> tuple[Basis, ...]:
+    """Return one basis per input; a basis without an interval takes the range of its input.
+
+    Args:
+        data: the record.
+        basis: one basis (or its name, as for `parse`) for all inputs, or one per input.
+
+    Raises:
+        StructureError: a wrong number of bases.
+        DataError: an input that is constant or without any sample.
+    """
+    inputs = data.inputs
+    several = list(basis) if isinstance(basis, list | tuple) else [basis] * len(inputs)
+    if len(several) != len(inputs):
+        raise StructureError(f"{len(several)} bases for {len(inputs)} inputs ({', '.join(inputs)}): give one each")
+    fitted = []
+    for channel, one, lo, hi in zip(inputs, several, *data.ranges()):
+        one = parse(one) if isinstance(one, str) else one
+        if lo != lo:
+            raise DataError(f"input {channel!r} has no sample at all; choose another column or drop the input")
+        if lo == hi:
+            raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
+                            "excite the input or drop the channel")
+        fitted.append(one.fitted(float(lo), float(hi)))
+    return tuple(fitted)
 
 
 def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:

@@ -193,6 +193,15 @@ class Data:
             summaries.append(Channel.of(x, name, unit, "input" if c < self.m else "output"))
         return tuple(summaries)
 
+    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest sample of every input, (m,) each; NaN where every sample is missing."""
+        low, high = np.full(self.m, np.nan), np.full(self.m, np.nan)
+        for e in self.experiments:
+            if e.n_samples:
+                low = np.fmin(low, np.fmin.reduce(e.u, axis=0))
+                high = np.fmax(high, np.fmax.reduce(e.u, axis=0))
+        return low, high
+
     def __repr__(self) -> str:
         runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
         title = f"Data {self.name!r}: " if self.name else "Data: "

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.bases import Linear, fitted_bases
 from optid.data import Data
 from optid.doctor import examine, examine_rows
 from optid.errors import (
@@ -189,13 +190,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
     if isinstance(data, Stream):
         return []
-    from optid.bases import Linear, parse
-
-    basis = arguments.get("basis", Linear())
-    several = list(basis) if isinstance(basis, list | tuple) else [basis] * data.m
-    if len(several) != data.m:
-        raise StructureError(f"{len(several)} bases for {data.m} inputs ({', '.join(data.inputs)})")
-    return examine(data, [parse(b) if isinstance(b, str) else b for b in several])
+    return examine(data, fitted_bases(data, arguments.get("basis", Linear())))
 
 
 def _raise_failure(outcome: Outcome) -> None:
@@ -205,8 +200,8 @@ def _raise_failure(outcome: Outcome) -> None:
 
         raise InfeasibleError(explain(program))
     if solution.status is Status.UNBOUNDED:
-        raise UnboundedError(f"{program.name!r} has no minimum (according to {solution.solver}): the constraints or the "
-                             "penalty leave a direction in which the objective falls for ever")
+        raise UnboundedError(f"{program.name!r} has no minimum (according to {solution.solver}): the constraints or "
+                             "the penalty leave a direction in which the objective falls for ever")
     if solution.status is Status.FAILED or not solution.has_point:
         raise SolverFailed(f"{solution.solver} gave no usable answer for {program.name!r}: "
                            f"{solution.reason or solution.claimed}. Try another solver (optid solvers)")
