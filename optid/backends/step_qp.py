@@ -211,13 +211,13 @@ class StepQP:
         """Gradients (r, size) of the equalities and of the inequalities with a multiplier, at x."""
         self.at.assign(x)
         found = [np.zeros((0, self.at.size))]
+        least = 1e-6 * max((float(np.max(np.abs(dual), initial=0.0)) for dual in duals.values()), default=0.0)
         for name, group in self.at.program.constraints.items():
             for member, span in zip(group, _spans(group)) if name in duals else ():
                 if isinstance(member, EQUALITIES):
                     found.append(self._slope(member.expr))
                 elif isinstance(member, INEQUALITIES):
-                    weight = duals[name][span]
-                    found.append(self._slope(member.expr)[weight > 1e-6 * max(float(np.max(weight)), 1e-300)])
+                    found.append(self._slope(member.expr)[duals[name][span] > least])
         return np.vstack(found)
 
     def _slope(self, expression: cp.Expression) -> np.ndarray:
@@ -245,14 +245,15 @@ def _cholesky(matrix: np.ndarray, shift: float) -> np.ndarray | None:
 
 
 def _definite(matrix: np.ndarray, rows: np.ndarray, shift: float) -> np.ndarray:
-    """Cholesky factor of a matrix made definite, across the active rows where that is enough."""
+    """Cholesky factor of a matrix made definite: across the active rows, and where that is not enough along them."""
     size = float(np.max(np.abs(matrix)))
-    basis = np.linalg.svd(rows, full_matrices=False)[2][: np.linalg.matrix_rank(rows)] if len(rows) else rows
-    across = basis.T @ basis
+    rank = np.linalg.matrix_rank(rows) if len(rows) else 0
+    basis = np.linalg.svd(rows, full_matrices=True)[2] if len(rows) else np.eye(len(matrix))
+    across, along = basis[:rank].T @ basis[:rank], basis[rank:].T
     for weight in (1.0, 1e2, 1e4):
         factor = _cholesky(matrix + weight * size * across, shift)
         if factor is not None:
             return factor
-    values, vectors = np.linalg.eigh(matrix)
-    values = np.maximum(np.abs(values), 1e-10 * size) + shift
-    return np.linalg.cholesky((vectors * values) @ vectors.T)
+    values, vectors = np.linalg.eigh(along.T @ matrix @ along)
+    vectors, values = along @ vectors, np.maximum(np.abs(values), 1e-10 * size)
+    return np.linalg.cholesky((vectors * values) @ vectors.T + size * across + shift * np.eye(len(matrix)))
