@@ -2,11 +2,16 @@
 
 import cvxpy as cp
 import numpy as np
-from cvxpy.constraints import PSD, SOC, Equality, Inequality, NonNeg, NonPos, Zero
 from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.psd import PSD
+from cvxpy.constraints.second_order import SOC
+from cvxpy.constraints.zero import Equality, Zero
 
 from optid.program import Program, Values
 from optid.solution import Residuals
+
+ZERO = 1e-9  # a variable smaller than this has no size of its own to measure by
 
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
@@ -39,8 +44,9 @@ def _rank_one_residuals(program: Program) -> tuple[float, float]:
     form = program.rank_one
     assert form is not None
     problem = form.problem
-    w = np.concatenate([np.ravel(program.variables[name].value, order="F") for name in form.linear] or [np.zeros(0)])
-    pairs = [(program.variables[mu].value, np.ravel(program.variables[b].value, order="F")) for mu, b in form.blocks]
+    flat = {name: _flat(variable) for name, variable in program.variables.items()}
+    w = np.concatenate([flat[name] for name in form.linear] or [np.zeros(0)])
+    pairs = [(flat[mu], flat[b]) for mu, b in form.blocks]
     z = np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
     r = problem.root @ z - problem.target
     pull = 2.0 * problem.root.T @ r
@@ -51,6 +57,11 @@ def _rank_one_residuals(program: Program) -> tuple[float, float]:
         position += mu.size * b.size
     size = 2.0 * float(np.max(np.abs(problem.root.T @ problem.target), initial=0.0))
     return float(r @ r) + problem.remainder, float(np.max(np.abs(np.concatenate(parts)))) / (1.0 + size)
+
+
+def _flat(expression: cp.Expression) -> np.ndarray:
+    """Value of an expression as a flat array, column by column."""
+    return np.ravel(np.asarray(expression.value, dtype=float), order="F")
 
 
 def measure_violation(program: Program) -> tuple[float, str]:
@@ -116,12 +127,12 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
 
 
 class _Gradient:
-    """Gradient of the Lagrangian, block by block, with the size of the terms it is a sum of."""
+    """Gradient of the Lagrangian, with the size of the terms every component is a sum of."""
 
     def __init__(self, program: Program) -> None:
         self.variables = list(program.variables.values())
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
-        self.largest = {v.id: 0.0 for v in self.variables}
+        self.terms = {v.id: np.zeros(v.size) for v in self.variables}
 
     def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
         """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
@@ -131,9 +142,9 @@ class _Gradient:
             if jacobian is None:
                 return False
             if variable.id in self.total:
-                part = np.asarray(jacobian @ weights).ravel()
-                self.total[variable.id] += part
-                self.largest[variable.id] = max(self.largest[variable.id], float(np.max(np.abs(part), initial=0.0)))
+                jacobian = jacobian if np.ndim(jacobian) else np.full((1, 1), jacobian)
+                self.total[variable.id] += np.asarray(jacobian @ weights).ravel()
+                self.terms[variable.id] += np.asarray(abs(jacobian) @ np.abs(weights)).ravel()
         return True
 
     def residual(self, yardstick: float) -> float:
@@ -143,13 +154,14 @@ class _Gradient:
             part = _free_part(variable, self.total[variable.id])
             if part is None:
                 return float("nan")
-            size = float(np.max(np.abs(variable.value), initial=0.0)) or 1.0
-            worst = max(worst, part / (yardstick / size + self.largest[variable.id]))
+            size = float(np.max(np.abs(_flat(variable)), initial=0.0))
+            floor = yardstick / (size if size > ZERO else 1.0)
+            worst = max(worst, float(np.max(part / (floor + self.terms[variable.id]), initial=0.0)))
         return worst
 
 
-def _free_part(variable: cp.Variable, gradient: np.ndarray) -> float | None:
-    """Largest gradient component that the variable's own attributes leave free; None where that is not known."""
+def _free_part(variable: cp.Variable, gradient: np.ndarray) -> np.ndarray | None:
+    """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
     flags = variable.attributes
     if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
         return None
@@ -157,12 +169,12 @@ def _free_part(variable: cp.Variable, gradient: np.ndarray) -> float | None:
     if flags["symmetric"]:
         gradient = (gradient + gradient.T) / 2
     if has_bounds(variable):
-        lower, upper = variable.get_bounds()
+        lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
         value = np.asarray(variable.value)
         margin = 1e-6 * (1.0 + np.abs(value))
         held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
         gradient = np.where(held, 0.0, gradient)
-    return float(np.max(np.abs(gradient), initial=0.0))
+    return np.abs(np.ravel(gradient, order="F"))
 
 
 def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
@@ -183,7 +195,7 @@ def _first_order(program: Program, duals: Values, objective: float) -> tuple[flo
                 if terms is None or not all(gradient.add(expression, weights) for expression, weights in terms):
                     return unknown
                 if not isinstance(member, Equality | Zero):
-                    products = [np.ravel(expression.value, order="F") * weights for expression, weights in terms]
+                    products = [_flat(expression) * weights for expression, weights in terms]
                     whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
                     complementarity += abs(sum(map(np.sum, products))) if whole else float(np.sum(np.abs(products[0])))
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape

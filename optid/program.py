@@ -8,6 +8,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.nonpos import Inequality, NonPos
+from cvxpy.constraints.zero import Equality, Zero
 
 from optid.errors import StructureError, nearest
 from optid.solution import Bound
@@ -253,7 +255,7 @@ class Program:
         held = {name: parameters[name] for name in values}
 
         def recover(found: Values) -> Any:
-            return self.recover({**found, **{name: p.value for name, p in held.items()}})
+            return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, rank_one=None, certify=None,
@@ -274,9 +276,9 @@ class Program:
             raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
         penalty: Any = 0.0
         for member in self.constraints[name]:
-            if isinstance(member, cp.constraints.Zero | cp.constraints.Equality):
+            if isinstance(member, Zero | Equality):
                 penalty = penalty + cp.sum_squares(member.expr)
-            elif isinstance(member, cp.constraints.NonPos | cp.constraints.Inequality):
+            elif isinstance(member, NonPos | Inequality):
                 penalty = penalty + cp.sum_squares(cp.pos(member.expr))
             else:
                 raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
@@ -314,7 +316,7 @@ class Program:
         for name, group in self.constraints.items():
             parts = [d.value for member in group for d in member.dual_variables]
             if parts and all(part is not None for part in parts):
-                found[name] = np.concatenate([np.ravel(part, order="F") for part in parts]).astype(float)
+                found[name] = np.concatenate([np.ravel(np.asarray(part, dtype=float), order="F") for part in parts])
         return found
 
     def clear_duals(self) -> None:
@@ -330,18 +332,22 @@ class Program:
         return sum(v.size for v in self.variables.values())
 
 
+_MATRIX_ATOMS = {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac", "matrix_frac", "tr_inv"}
+_EXPONENTIAL_ATOMS = {"exp", "log", "log1p", "log_sum_exp", "logistic", "entr", "kl_div", "rel_entr", "xexp", "log_det",
+                      "Power", "GeoMean", "Pnorm"}  # the last three are power cones; their approximations are not
+
+
 def _convex_class(problem: cp.Problem) -> str:
     if problem.is_lp():
         return "LP"
     if problem.is_qp():
         return "QP"
-    atoms = {type(atom).__name__ for atom in problem.atoms()}
+    atoms = {atom.__name__ for atom in problem.atoms()}  # CVXPY lists the types
     cones = {type(c).__name__ for c in problem.constraints}
-    if cones & {"PSD"} or atoms & {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac"} or any(
+    if cones & {"ExpCone", "PowCone3D", "PowConeND"} or atoms & _EXPONENTIAL_ATOMS:
+        return "conic"
+    if cones & {"PSD"} or atoms & _MATRIX_ATOMS or any(
         v.attributes["PSD"] or v.attributes["NSD"] for v in problem.variables()
     ):
         return "SDP"
-    if cones & {"ExpCone", "PowCone3D", "PowConeND"} or atoms & {"exp", "log", "log_sum_exp", "logistic", "entr",
-                                                               "kl_div", "rel_entr", "log_det", "power", "geo_mean"}:
-        return "conic"
     return "SOCP"

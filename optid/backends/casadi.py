@@ -75,7 +75,7 @@ class _Graph:
         if isinstance(expr, cp.Variable | cp.Parameter):
             return self.leaves[expr.id]
         if expr.is_constant() and not expr.parameters():
-            return constant(expr.value, (expr.size, 1))
+            return constant(expr.value, (int(expr.size), 1))
         name = type(expr).__name__
         columns = [self.column(arg) for arg in expr.args]
         if name in MOVES:
@@ -151,8 +151,9 @@ def _sum(expr: Any, columns: list) -> Any:
     kept = tuple(1 if i in axes else n for i, n in enumerate(shape))
     group = np.broadcast_to(np.reshape(np.arange(int(np.prod(kept))), kept, order="F"), shape)
     group = np.ravel(group, order="F")
-    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(int(np.prod(kept)), group.size))
-    return ca.mtimes(constant(adding, adding.shape), columns[0])
+    kept_size = int(np.prod(kept))
+    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(kept_size, group.size))
+    return ca.mtimes(constant(adding, (kept_size, group.size)), columns[0])
 
 
 def _cumsum(expr: Any, columns: list) -> Any:
@@ -270,15 +271,16 @@ def options(name: str, settings: Settings) -> dict[str, Any]:
         StructureError: a Hessian that is not exact.
     """
     eps, limit = settings.accuracy, settings.time_limit
-    chosen: dict[str, Any] = {"print_time": settings.verbose, "error_on_fail": False}
+    loud = settings.verbose
+    chosen: dict[str, Any] = {"print_time": loud, "show_eval_warnings": loud, "error_on_fail": False}
     if name == "ipopt":
         chosen |= {"ipopt.tol": eps, "ipopt.constr_viol_tol": eps, "ipopt.compl_inf_tol": eps,
                    "ipopt.acceptable_iter": 0, "ipopt.bound_relax_factor": 0.1 * eps, "ipopt.max_iter": LIMIT,
-                   "ipopt.print_level": 5 if settings.verbose else 0, "ipopt.sb": "yes"}
+                   "ipopt.print_level": 5 if loud else 0, "ipopt.sb": "yes"}
         if limit is not None:
             chosen["ipopt.max_wall_time"] = float(limit)
     if name == "fatrop":
-        chosen |= {"fatrop.tol": eps, "fatrop.max_iter": LIMIT, "fatrop.print_level": 5 if settings.verbose else 0}
+        chosen |= {"fatrop.tol": eps, "fatrop.max_iter": LIMIT, "fatrop.print_level": 5 if loud else 0}
     chosen.update({key if "." in key else f"{name}.{key}": value for key, value in settings.options.items()})
     if chosen.get("ipopt.hessian_approximation", "exact") != "exact":
         raise StructureError("ipopt with a limited-memory Hessian does not converge on these programmes; "
@@ -316,14 +318,14 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
-    """Read IPOPT's words; fatrop only says whether it succeeded."""
+    """Read IPOPT's words; fatrop only says whether it succeeded, so that its point has to speak for itself."""
     word = str(statistics.get("return_status", ""))
     if word in STATUS:
         return word, STATUS[word]
     if statistics.get("success"):
         return "success", Status.LOCAL
     stopped = int(statistics.get("iter_count", 0)) >= LIMIT
-    return ("iteration limit", Status.LIMIT) if stopped else (f"no success ({word})", Status.FAILED)
+    return ("iteration limit", Status.LIMIT) if stopped else (f"no success ({word})", Status.INACCURATE)
 
 
 def _compiled(name: str, form: Smooth, chosen: dict[str, Any]) -> Any:
