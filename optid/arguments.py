@@ -16,7 +16,7 @@ def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, s
 
     Args:
         files: paths.
-        how: the options of the command line: inputs, outputs, columns (words), dt, time, experiment, delimiter, decimal.
+        how: options: inputs, outputs and columns (words), dt, time, experiment, delimiter, decimal.
         stream: read chunk by chunk.
 
     Raises:
@@ -28,8 +28,13 @@ def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, s
         raise DataError("give a data file, or --example NAME (optid examples lists them)")
     time = how["time"]
     options: dict[str, Any] = {
-        **how, "inputs": listed(how["inputs"]), "outputs": listed(how["outputs"]), "columns": listed(how["columns"]),
-        "time": False if time == "none" else time, "delimiter": how["delimiter"].replace("\\t", "\t")}
+        **how,
+        "inputs": listed(how["inputs"]),
+        "outputs": listed(how["outputs"]),
+        "columns": listed(how["columns"]),
+        "time": False if time == "none" else time,
+        "delimiter": how["delimiter"].replace("\\t", "\t"),
+    }
     if not stream:
         return read([Path(name) for name in files], **options)
     if len(files) > 1 or options.pop("experiment") is not None:
@@ -63,6 +68,17 @@ def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
     if isinstance(record, Stream):
         raise DataError("--split needs the record in memory; leave --stream out, or give --test another file")
     return record.split(share)
+
+
+def check_folders(*paths: Path | None) -> None:
+    """Refuse a file to be written into a folder that does not exist, before any work is done.
+
+    Raises:
+        DataError: naming the folder.
+    """
+    for path in paths:
+        if path is not None and not path.absolute().parent.is_dir():
+            raise DataError(f"{path} cannot be written: there is no folder {path.absolute().parent}")
 
 
 def listed(words: Sequence[str] | None) -> list[str] | None:

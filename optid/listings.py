@@ -16,20 +16,32 @@ Show = Callable[[], None]
 
 
 def solvers() -> Show:
-    """Return what prints every back end: installed ones first, then those that a pip line away."""
+    """Return what prints every back end: those that are installed, then those that are a pip line away."""
     from optid.backends import back_ends
 
     order = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
-    known = sorted(back_ends().values(), key=lambda b: (not b.installed, b.name))
     rows = []
-    for back_end in known:
+    for back_end in sorted(back_ends().values(), key=lambda b: (not b.installed, b.name)):
         classes = [name for name in order if name in back_end.classes] + sorted(back_end.classes - set(order))
-        how = f"pip install {back_end.pip}" if back_end.pip else "vendor's package and licence"
-        rows.append((Text(back_end.name, "bold" if back_end.installed else "dim"),
-                     " ".join(classes), Text("yes", "green") if back_end.installed else Text(how, "dim"),
-                     "yes" if back_end.duals else "no", "yes" if back_end.warm else "no", back_end.about))
-    return _table("Back ends", ("solver", "takes", "installed", "prices", "warm start", "about"), rows,
-                  "Use one with --solver NAME. 'prices': returns multipliers, so that constraints have prices.")
+        missing = f"pip install {back_end.pip}" if back_end.pip else "from its vendor"
+        rows.append(
+            (
+                Text(back_end.name, "bold" if back_end.installed else "dim"),
+                Text(" ".join(classes)),
+                _mark(back_end.duals),
+                _mark(back_end.warm),
+                _mark(back_end.installed),
+                back_end.about if back_end.installed else Text(missing, "dim"),
+            )
+        )
+    return _table(
+        "Back ends",
+        ("solver", "takes", "prices", "warm", "here", "about"),
+        rows,
+        "Use one with --solver NAME. prices: returns multipliers, so that constraints have prices. "
+        "warm: can start from a given point. here: installed.",
+        firm=2,
+    )
 
 
 def formulations() -> Show:
@@ -39,12 +51,22 @@ def formulations() -> Show:
     rows = []
     for name, point in sorted(registered(FORMULATIONS).items()):
         function = point.load()
-        about = Text.assemble(_summary(function), ("\narguments: ", "dim"), _arguments(function), ("\nvariables: ", "dim"),
-                              " ".join(_variables(function)), "\n")
+        about = Text.assemble(
+            _summary(function),
+            ("\narguments: ", "dim"),
+            _arguments(function),
+            ("\nvariables: ", "dim"),
+            " ".join(_variables(function)),
+            "\n",
+        )
         rows.append((Text(name, "bold"), about))
-    return _table("Formulations", ("formulation", "what it poses"), rows,
-                  "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
-                  "Arguments in brackets may be left out.")
+    return _table(
+        "Formulations",
+        ("formulation", "what it poses"),
+        rows,
+        "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
+        "Arguments in brackets may be left out.",
+    )
 
 
 def constraints() -> Show:
@@ -55,8 +77,12 @@ def constraints() -> Show:
     for name, point in sorted(registered(CONSTRAINTS).items()):
         function = point.load()
         rows.append((Text(name, "bold"), _arguments(function), _summary(function)))
-    return _table("Constraints", ("constraint", "arguments", "what it demands"), rows,
-                  "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets may be left out.")
+    return _table(
+        "Constraints",
+        ("constraint", "arguments", "what it demands"),
+        rows,
+        "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets may be left out.",
+    )
 
 
 def examples() -> Show:
@@ -67,11 +93,17 @@ def examples() -> Show:
     return _table("Built-in records", ("example", "what it is"), rows, "Use one with optid fit --example NAME.")
 
 
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], footer: str) -> Show:
+def _mark(yes: bool) -> Text:
+    return Text("yes", "green") if yes else Text("no", "dim")
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], footer: str, firm: int = 1) -> Show:
+    """Return what prints a table; the first `firm` columns are never broken."""
+
     def show() -> None:
         table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
-        for column in columns:
-            table.add_column(column, overflow="fold", no_wrap=column == columns[0])
+        for c, column in enumerate(columns):
+            table.add_column(column, overflow="fold", no_wrap=c < firm)
         for row in rows:
             table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
         output().print(table)

@@ -9,20 +9,47 @@ from matplotlib.patches import Circle, FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
 from optid.basis import Array
+from optid.correlations import Correlation
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
 BLUE, ORANGE, GREEN, RED = "#0b6fb8", "#d9660a", "#00845f", "#c2344d"
 """Blue, orange and green of a colour-blind safe palette; red marks what lies outside a band."""
 
 STYLE: dict[str, Any] = {
-    "font.family": "sans-serif", "font.size": 9.0, "axes.titlesize": 10.0, "axes.titleweight": "bold",
-    "axes.titlelocation": "left", "axes.titlepad": 8.0, "axes.labelsize": 9.0, "axes.labelcolor": MUTED,
-    "axes.edgecolor": MUTED, "axes.linewidth": 0.8, "axes.spines.top": False, "axes.spines.right": False,
-    "axes.grid": True, "axes.axisbelow": True, "grid.color": GRID, "grid.linewidth": 0.7, "text.color": INK,
-    "axes.titlecolor": INK, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5,
-    "xtick.major.size": 3.0, "ytick.major.size": 3.0, "legend.frameon": False, "legend.fontsize": 8.5,
-    "lines.linewidth": 1.5, "lines.solid_capstyle": "round", "figure.facecolor": PANEL, "axes.facecolor": PANEL,
-    "axes.unicode_minus": True, "savefig.facecolor": PANEL, "axes.prop_cycle": f"cycler('color', ['{BLUE}', '{ORANGE}', '{GREEN}'])",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8.0,
+    "axes.labelsize": 9.0,
+    "axes.labelcolor": MUTED,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "text.color": INK,
+    "axes.titlecolor": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.5,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": PANEL,
+    "axes.facecolor": PANEL,
+    "figure.constrained_layout.w_pad": 0.1,
+    "figure.constrained_layout.h_pad": 0.08,
+    "savefig.facecolor": PANEL,
+    "axes.prop_cycle": f"cycler('color', ['{BLUE}', '{ORANGE}', '{GREEN}'])",
 }
 
 POINTS = 2000
@@ -35,8 +62,13 @@ def with_unit(name: str, unit: str) -> str:
     return label.replace("$", r"\$")
 
 
+def shorten(name: str, most: int = 18) -> str:
+    """Cut a long name, so that it fits above a small panel."""
+    return name if len(name) <= most else name[: most - 1] + "\N{HORIZONTAL ELLIPSIS}"
+
+
 def thinned(t: Array, y: Array) -> tuple[Array, Array]:
-    """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become at most `POINTS` long."""
+    """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:
         return t, y
     edges = np.linspace(0, y.size, POINTS // 2 + 1).astype(int)
@@ -57,7 +89,9 @@ def draw_record(ax: Axes, t: Array, lines: Sequence[tuple[str, Array, dict[str, 
     ax.margins(x=0.01)
 
 
-def draw_nonlinearity(ax: Axes, f: Any, u: Array, band: tuple[Array, Array, Array] | None, *, name: str, label: str) -> None:
+def draw_nonlinearity(
+    ax: Axes, f: Any, u: Array, band: tuple[Array, Array, Array] | None, *, name: str, label: str
+) -> None:
     """Draw f over the range of its input, its confidence band, and where the samples lie.
 
     Args:
@@ -82,26 +116,37 @@ def draw_nonlinearity(ax: Axes, f: Any, u: Array, band: tuple[Array, Array, Arra
     here = u[(u >= low) & (u <= high)]
     if here.size:
         counts, edges = np.histogram(here, bins=40, range=(low, high))
-        ax.bar(edges[:-1], 0.16 * counts / counts.max(), np.diff(edges), align="edge", color=MUTED, alpha=0.3,
-               linewidth=0, transform=ax.get_xaxis_transform(), label="samples")
+        ax.bar(
+            edges[:-1],
+            0.16 * counts / counts.max(),
+            np.diff(edges),
+            align="edge",
+            color=MUTED,
+            alpha=0.3,
+            linewidth=0,
+            transform=ax.get_xaxis_transform(),
+            label="samples",
+        )
     ax.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
     ax.set_xlabel(name)
     ax.legend(loc="upper left", handlelength=1.4)
 
 
-def draw_correlation(ax: Axes, lags: Array, values: Array, band: float, *, title: str, xlabel: str = "lag") -> None:
-    """Draw a correlation (L,) over its lags as stems with a band of +- `band`; values outside it in red."""
-    outside = np.abs(values) > band
-    outside &= ~((lags == 0) & (np.abs(values - 1) < 1e-9))  # an autocorrelation is one at lag zero
-    ax.axhspan(-band, band, color=MUTED, alpha=0.16, linewidth=0)
+def draw_correlation(ax: Axes, test: Correlation, title: str) -> None:
+    """Draw the correlations of a residual test as stems, with their 99 % band; values outside it as red diamonds."""
+    lags, values = test.lags, test.values
+    tested = lags != 0 if test.input is None else np.full(lags.size, True)  # an autocorrelation is one at lag zero
+    lags, values, band = lags[tested], values[tested], test.band[tested]
+    ax.fill_between(lags, -band, band, color=MUTED, alpha=0.16, linewidth=0)
     ax.axhline(0, color=MUTED, linewidth=0.8)
-    for mask, colour in ((~outside, BLUE), (outside, RED)):
+    outside = np.abs(values) > band
+    for mask, colour, marker in ((~outside, BLUE, "o"), (outside, RED, "D")):
         ax.vlines(lags[mask], 0, values[mask], color=colour, linewidth=1.3)
-        ax.plot(lags[mask], values[mask], "o" if colour == BLUE else "D", color=colour, markersize=3.2)
-    reach = max(1.5 * band, 1.15 * float(np.max(np.abs(values[lags != 0]), initial=0.0)))
+        ax.plot(lags[mask], values[mask], marker, color=colour, markersize=3.2)
+    reach = 1.15 * float(np.nanmax(np.abs(values), initial=1.3 * float(np.nanmax(band, initial=1e-3))))
     ax.set_ylim(-reach, reach)
     ax.set_title(title)
-    ax.set_xlabel(xlabel)
+    ax.set_xlabel("lag")
     ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
 
 
@@ -119,8 +164,9 @@ def draw_poles(ax: Axes, poles: Array) -> None:
     ax.set_title("Poles")
 
 
-def draw_response(ax: Axes, w: Array, response: Array, bands: Sequence[tuple[Array, Array] | None],
-                  labels: Sequence[str]) -> None:
+def draw_response(
+    ax: Axes, w: Array, response: Array, bands: Sequence[tuple[Array, Array] | None], labels: Sequence[str]
+) -> None:
     """Draw magnitudes in dB over the frequency.
 
     Args:
@@ -134,14 +180,18 @@ def draw_response(ax: Axes, w: Array, response: Array, bands: Sequence[tuple[Arr
     for k, (label, band) in enumerate(zip(labels, bands)):
         colour, dash = styles[k % len(styles)]
         if band is not None:
-            ax.fill_between(w, *(20 * np.log10(np.maximum(edge, 1e-12)) for edge in band), color=colour, alpha=0.2, linewidth=0)
-        ax.plot(w, 20 * np.log10(np.maximum(np.abs(response[:, k]), 1e-300)), dash, color=colour, label=label)
+            ax.fill_between(w, _decibels(band[0]), _decibels(band[1]), color=colour, alpha=0.2, linewidth=0)
+        ax.plot(w, _decibels(np.abs(response[:, k])), dash, color=colour, label=label)
     ax.set_xscale("log")
     ax.set_xlim(w[0], w[-1])
     ax.set(xlabel="frequency (rad per unit of time)", ylabel="magnitude (dB)")
-    ax.set_title("Frequency response of the linear part")
+    ax.set_title("Frequency response")
     if len(labels) > 1:
         ax.legend(loc="lower left", ncols=2, handlelength=1.6)
+
+
+def _decibels(magnitude: Array) -> Array:
+    return 20 * np.log10(np.maximum(magnitude, 1e-12))
 
 
 def draw_gap(ax: Axes, gap: float, threshold: float) -> None:
@@ -149,17 +199,46 @@ def draw_gap(ax: Axes, gap: float, threshold: float) -> None:
     low, high = 1e-16, 1.0
     ax.axvspan(low, threshold, color=GREEN, alpha=0.14, linewidth=0)
     ax.axvspan(threshold, high, color=ORANGE, alpha=0.12, linewidth=0)
-    ax.text(np.sqrt(low * threshold), 0.83, "proved", color=GREEN, ha="center", va="center", transform=ax.get_xaxis_transform())
-    ax.text(np.sqrt(threshold * high), 0.83, "not proved", color=ORANGE, ha="center", va="center",
-            transform=ax.get_xaxis_transform())
+    ax.text(
+        np.sqrt(low * threshold),
+        0.83,
+        "proved",
+        color=GREEN,
+        ha="center",
+        va="center",
+        transform=ax.get_xaxis_transform(),
+    )
+    ax.text(
+        np.sqrt(threshold * high),
+        0.83,
+        "not proved",
+        color=ORANGE,
+        ha="center",
+        va="center",
+        transform=ax.get_xaxis_transform(),
+    )
     if np.isfinite(gap):
         at = float(np.clip(gap, 2 * low, high))
-        ax.plot([at], [0.42], "D", color=GREEN if gap <= threshold else ORANGE, markersize=9,
-                transform=ax.get_xaxis_transform(), clip_on=False)
+        ax.plot(
+            [at],
+            [0.42],
+            "D",
+            color=GREEN if gap <= threshold else ORANGE,
+            markersize=9,
+            transform=ax.get_xaxis_transform(),
+            clip_on=False,
+        )
         left = at < threshold
-        ax.annotate(f"{gap:.1e}" if gap else "0", (at, 0.42), xycoords=ax.get_xaxis_transform(),
-                    xytext=(9 if left else -9, 0), textcoords="offset points", va="center", ha="left" if left else "right",
-                    fontweight="bold")
+        ax.annotate(
+            f"{gap:.1e}" if gap else "0",
+            (at, 0.42),
+            xycoords=ax.get_xaxis_transform(),
+            xytext=(9 if left else -9, 0),
+            textcoords="offset points",
+            va="center",
+            ha="left" if left else "right",
+            fontweight="bold",
+        )
     ax.set_xscale("log")
     ax.set(xlim=(low, high), yticks=[], xlabel="relative gap between objective and certified bound")
     ax.spines["left"].set_visible(False)
@@ -173,13 +252,34 @@ def draw_ladder(ax: Axes, rungs: Sequence[str], reached: int, closed: bool) -> N
     for i, rung in enumerate(rungs):
         last = i == reached
         colour = (GREEN if closed else ORANGE) if last else MUTED
-        ax.add_patch(FancyBboxPatch((i + 0.08, 0.2), 0.84, 0.6, boxstyle="round,pad=0,rounding_size=0.1",
-                                    facecolor=colour if last else "none", edgecolor=colour, linewidth=1.1,
-                                    alpha=1.0 if i <= reached else 0.4, mutation_aspect=0.5))
-        ax.text(i + 0.5, 0.5, rung, ha="center", va="center", color=PANEL if last else (INK if i <= reached else MUTED),
-                fontsize=8.5, fontweight="bold" if last else "normal", alpha=1.0 if i <= reached else 0.6)
+        ax.add_patch(
+            FancyBboxPatch(
+                (i + 0.08, 0.2),
+                0.84,
+                0.6,
+                boxstyle="round,pad=0,rounding_size=0.1",
+                facecolor=colour if last else "none",
+                edgecolor=colour,
+                linewidth=1.1,
+                alpha=1.0 if i <= reached else 0.4,
+                mutation_aspect=0.5,
+            )
+        )
+        ax.text(
+            i + 0.5,
+            0.5,
+            rung,
+            ha="center",
+            va="center",
+            color=PANEL if last else (INK if i <= reached else MUTED),
+            fontsize=8.5,
+            fontweight="bold" if last else "normal",
+            alpha=1.0 if i <= reached else 0.6,
+        )
         if i + 1 < len(rungs):
-            ax.annotate("", (i + 1.08, 0.5), (i + 0.92, 0.5), arrowprops={"arrowstyle": "-", "color": MUTED, "alpha": 0.6})
+            ax.annotate(
+                "", (i + 1.08, 0.5), (i + 0.92, 0.5), arrowprops={"arrowstyle": "-", "color": MUTED, "alpha": 0.6}
+            )
 
 
 def draw_singular_values(ax: Axes, values: Array, name: str) -> None:

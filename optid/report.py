@@ -1,0 +1,204 @@
+"""The report: one HTML page that carries its figures and its style with it."""
+
+import platform
+import warnings
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from optid import __version__, estimates, plots, summary, wording
+from optid.data import Data
+from optid.errors import DataError, DataWarning
+from optid.printing import describe
+from optid.svg import inline
+from optid.validation import Validation, validate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from optid.fitting import Fit
+
+
+def write(fit: "Fit", path: str | Path, test: Data | None = None, *, command: str = "") -> Path:
+    """Write a self-contained HTML page: it opens offline and makes no request.
+
+    Args:
+        fit: the fit.
+        path: the file, replaced when it exists.
+        test: record the fit has not seen; adds its validation.
+        command: the command line behind the fit, for the section that says how to reproduce it.
+
+    Returns:
+        The path.
+
+    Raises:
+        DataError: the fit has no model to report.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    path.write_text(render(fit, test, command=command), encoding="utf-8")
+    return path
+
+
+def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
+    """Return the page that `write` writes."""
+    if fit.model is None:
+        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
+    environment = Environment(
+        loader=PackageLoader("optid"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template("report.html.j2").render(_content(fit, test, command))
+
+
+def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
+    tone, word, sentence = summary.verdict(fit)
+    tables = [estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
+    return {
+        "version": __version__,
+        "title": summary.title(fit),
+        "lead": " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit)) if part),
+        "tone": tone,
+        "word": word[:1].upper() + word[1:],
+        "sentence": sentence,
+        "findings": fit.findings,
+        "cards": _cards(fit, test),
+        "equation": fit.model.equation().splitlines(),
+        "model_notes": [f"{name}: {value}" for name, value in summary.model_facts(fit)],
+        "model_tables": tables,
+        "coefficients": estimates.coefficient_table(fit),
+        "figures": _figures(fit),
+        "constraints": summary.constraint_table(fit) if fit.prices else None,
+        "certificate": summary.certificate_facts(fit),
+        "certificate_figure": _figure(
+            "certificate",
+            lambda: plots.certificate(fit),
+            "How far the proof of global optimality went, and the gap that is left.",
+        ),
+        "validation": _validation(fit, test),
+        "record": summary.record_facts(fit),
+        "channels": summary.channel_table(fit),
+        "solver": summary.solver_facts(fit),
+        "call": "\n".join(part for part in (command, summary.call(fit)) if part),
+        "versions": [
+            ("optid", __version__),
+            *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
+            ("Python", platform.python_version()),
+            ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ],
+        "text": describe(fit),
+        "sections": [
+            (id, name)
+            for id, name, present in (
+                ("model", "Model", True),
+                ("figures", "Figures", True),
+                ("constraints", "Constraints", bool(fit.prices)),
+                ("certificate", "Certificate", True),
+                ("validation", "Validation", test is not None or isinstance(fit.data, Data)),
+                ("data", "Data", True),
+                ("solver", "Solver", True),
+                ("reproduce", "Reproduce", True),
+            )
+            if present
+        ],
+    }
+
+
+def _checked(fit: "Fit", record: Data) -> Validation:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes
+        return validate(fit.model, record)
+
+
+def _length(fit: "Fit") -> str:
+    return f"{fit.data.n_samples} samples" if fit.data.n_samples else ""
+
+
+def _cards(fit: "Fit", test: Data | None) -> list[dict[str, str]]:
+    """The figures of the first glance; of several outputs the lowest."""
+    solution = fit.solution
+    fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
+    if test is not None:
+        simulated = [q.fit for q in _checked(fit, test).simulation.values()]
+        fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
+    which = ", lowest output" if fit.model.l > 1 else ""
+    cards = [(label + which, wording.percent(np.min(values))) for label, values in fits]
+    cards.append(("relative gap to the bound", "none" if solution.bound is None else wording.gap_text(solution.gap)))
+    if fit.prices:
+        cards.append(("constraints active", f"{sum(p.binding for p in fit.prices)} of {len(fit.prices)}"))
+    cards.append(("time", wording.seconds(fit.seconds)))
+    return [{"label": label, "value": value} for label, value in cards]
+
+
+def _figures(fit: "Fit") -> list[dict[str, Any]]:
+    found = []
+    if isinstance(fit.data, Data):
+        found.append(
+            _figure(
+                "time",
+                lambda: plots.fit_over_time(fit),
+                "Measured, simulated and one-step predicted output on "
+                "the estimation record; the simulation starts from the initial state that fits best.",
+            )
+        )
+    found.append(
+        _figure(
+            "nonlinearity",
+            lambda: plots.nonlinearity(fit),
+            "Static nonlinearity with its 95 % band. The bars show where the samples of the input lie.",
+        )
+    )
+    if plots.theta_singular_values(fit):
+        found.append(
+            _figure(
+                "theta",
+                lambda: plots.singular_values(fit),
+                "Singular values of the coefficient matrix before "
+                "its rank is forced to one. A single one that stands out speaks for the Hammerstein structure.",
+            )
+        )
+    found.append(
+        _figure(
+            "dynamics",
+            lambda: plots.poles_and_response(fit),
+            "Poles and frequency response of the linear part, with 95 % bands, up to the Nyquist frequency.",
+        )
+    )
+    return found
+
+
+def _figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, Any]:
+    return {"svg": inline(draw(), name, caption), "caption": caption}
+
+
+def _validation(fit: "Fit", test: Data | None) -> list[dict[str, Any]]:
+    blocks = []
+    records = [("est", "Estimation record", fit.data, None), ("test", "Test record, not seen by the fit", test, test)]
+    for name, title, record, given in records:
+        if not isinstance(record, Data):
+            continue
+        checked = _checked(fit, record)
+        figures = [
+            _figure(
+                f"{name}-residuals",
+                lambda given=given: plots.residual_tests(fit, given),
+                "Autocorrelation of the residuals and their cross-correlation with the inputs; shaded: 99 % bands.",
+            )
+        ]
+        if given is not None:
+            figures.insert(
+                0,
+                _figure(
+                    f"{name}-time",
+                    lambda given=given: plots.fit_over_time(fit, given),
+                    "Measured, simulated and one-step predicted output on the test record.",
+                ),
+            )
+        blocks.append(
+            {"title": title, "tables": summary.validation_tables(checked), "notes": checked.notes, "figures": figures}
+        )
+    return blocks

@@ -1,0 +1,43 @@
+"""Numbers and tables as text."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a heading.
+
+    Attributes:
+        title: heading.
+        head: one word per column.
+        rows: cells, the name of the row first.
+        note: sentence below the table.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    note: str = ""
+
+
+def number(value: float, digits: int = 5) -> str:
+    """Write a number with so many significant digits; a dash where there is none."""
+    return "-" if value is None or np.isnan(value) else f"{value:.{digits}g}"
+
+
+def percent(values: Any) -> str:
+    """Write one or several percentages with two decimals."""
+    return ", ".join("-" if np.isnan(v) else f"{v:.2f} %" for v in np.atleast_1d(values))
+
+
+def gap_text(gap: float) -> str:
+    """Write a relative gap; a dash where there is no bound."""
+    return "-" if not np.isfinite(gap) else f"{gap:.1e}" if gap else "0"
+
+
+def seconds(value: float) -> str:
+    """Write a time in the unit that suits it."""
+    return f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"

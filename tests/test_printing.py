@@ -1,0 +1,110 @@
+import re
+
+import numpy as np
+import pytest
+from sample_fits import example_fit, linear_fit, mimo_fit
+
+import optid
+from optid.printing import describe, describe_validation
+
+
+def rows(text: str, title: str) -> dict[str, list[str]]:
+    """Cells of a printed table by the first cell of their row."""
+    body = text[text.index(title) :].split("\n---")[0].splitlines()[2:]
+    return {line.split()[0]: line.split()[1:] for line in body}
+
+
+@pytest.mark.parametrize("make", [lambda: example_fit("thruster"), lambda: example_fit("two_inputs"), mimo_fit, linear_fit,
+                                  lambda: example_fit("dead_zone", "hammerstein_arx.nuclear", weight=0.5)])
+def test_no_line_is_wider_than_80_columns(make):
+    text = describe(make())
+    assert max(map(len, text.splitlines())) <= 80
+    assert text == str(make())
+
+
+def test_the_printed_equation_is_the_true_one():
+    text = describe(linear_fit())
+    equation = next(line for line in text.splitlines() if line.startswith("y(k) = "))
+    assert equation == "y(k) = 0.5 y(k-1) - 0.2 y(k-2) + 2 u(k-1) - 3"
+    assert "Linear ARX model of y from u" in text
+
+
+def test_parameters_are_those_of_the_model_to_the_digits_of_their_errors():
+    fit = example_fit("two_inputs")
+    table = rows(describe(fit), "Parameters")
+    a, b = fit.model.a, fit.model.b
+    expected = {"a1": a[0], "a2": a[1], "b0[valve]": b[0][0], "b1[valve]": b[0][1], "b0[heater]": b[1][0],
+                "b1[heater]": b[1][1], "offset": fit.model.offset[0]}
+    assert list(table) == list(expected)
+    for name, value in expected.items():
+        estimate, error, low, high = map(float, table[name])
+        assert abs(estimate - value) <= 0.051 * error  # two digits of the error are printed
+        assert low < estimate < high
+        assert 0.7 * error < (high - low) / 4 < 1.3 * error
+
+
+def test_the_nonlinearity_is_listed_at_its_nodes():
+    fit = example_fit("thruster")
+    table = rows(describe(fit), "Nonlinearity f,")
+    points = np.array([float(u) for u in table])
+    assert np.allclose(points, np.linspace(*fit.model.f.basis.interval, 11), atol=1e-3)
+    printed = np.array([float(cells[0]) for cells in table.values()])
+    errors = np.array([float(cells[1]) for cells in table.values()])
+    assert np.all(np.abs(printed - fit.model.f(points)) <= 0.06 * errors + 1e-3 * np.abs(printed))
+
+
+def test_proved_is_printed_only_with_a_proof():
+    proved, unproved = describe(example_fit("dead_zone")), describe(example_fit("dead_zone", prove=False))
+    assert "optimal (proved)" in proved and "global optimality is proved" in " ".join(proved.split())
+    assert "(proved)" not in unproved and "locally optimal (not proved)" in unproved
+    assert "is not known" in " ".join(unproved.split())
+
+
+def test_constraints_are_listed_with_state_and_price():
+    text = describe(example_fit("thruster"))
+    price = example_fit("thruster").prices[0]
+    line = next(line for line in text.splitlines() if line.startswith(price.name))
+    assert f"active ({price.active} of {price.rows})" in line
+    assert float(line.split()[-1]) == pytest.approx(price.fit_points, rel=5e-3)
+
+
+def test_an_inactive_constraint_shows_its_slack_and_no_price():
+    fit = example_fit("two_inputs")
+    line = next(line for line in describe(fit).splitlines() if line.startswith(fit.prices[0].name))
+    assert "not active" in line and line.split()[-2:] == ["-", "-"]
+    assert float(line.split()[-3]) == pytest.approx(fit.prices[0].slack, rel=5e-3)
+
+
+def test_missing_samples_and_rows_used_are_stated():
+    text = describe(mimo_fit())
+    assert re.search(r"Missing:? +level_a ", text)
+    assert re.search(rf"Rows used +{mimo_fit().figures['rows']} of {mimo_fit().figures['candidates']}", text)
+
+
+def test_why_there_are_no_standard_errors_is_said():
+    text = " ".join(describe(example_fit("dead_zone", "hammerstein_arx.nuclear", weight=0.5)).split())
+    assert "No standard errors: the nuclear norm shrinks Theta" in text
+
+
+def test_findings_of_the_examination_are_printed():
+    rng = np.random.default_rng(0)
+    u = rng.choice(np.linspace(-1, 1, 7), 400)
+    y = np.convolve(u**3, [1.0, 0.5])[:400] + 0.01 * rng.standard_normal(400)
+    with pytest.warns(optid.errors.DataWarning, match="too few levels"):
+        fit = optid.fit(optid.Data(u, y), na=1, nb=2, basis="polynomial:3")
+    assert "Note: too few levels: input 'u' takes 7 distinct values" in describe(fit)
+
+
+def test_a_fit_without_a_point_is_described():
+    data = example_fit("dead_zone").data
+    fit = optid.fit(data, na=2, nb=2, basis="triangular:8", raises=False, constraints=[
+        lambda v: {"low": v["a"][0] <= -1}, lambda v: {"high": v["a"][0] >= 1}])
+    text = describe(fit)
+    assert fit.model is None and "No model: infeasible" in text and "Is there a point: no" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_validation_text_has_the_fit_that_the_formula_gives():
+    fit = linear_fit()
+    text = describe_validation(fit.model, fit.data)
+    assert re.search(r"y +one step +100\.00", text)
