@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.accumulate import rows_present
-from optid.arrays import check_finite
 from optid.bases import parse
 from optid.basis import Array, Basis
 from optid.channels import channel_units, check_distinct, listed, sampling_time
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.factors import add_to_root, dependent_column
+from optid.factors import dependent_column
 from optid.layout import Layout
 from optid.models import HammersteinARX
 from optid.nonlinearity import Nonlinearity
+from optid.recursion_intake import as_block, prior_factor, row_weights
 from optid.recursion_trace import Trace
 from optid.regressors import Statistics
 from optid.splitting import block_grams, leading_pair, theta_matrices
@@ -115,7 +115,7 @@ class RecursiveARX:
         self.input_units = channel_units(input_units, m, "input_units")
         self.output_units = channel_units(output_units, self.layout.l, "output_units")
         self.samples = self.candidates = self.rows = 0
-        self.root = _prior(theta0, P0, self.layout)
+        self.root = prior_factor(theta0, P0, self.layout)
         self.restart()
 
     @classmethod
@@ -202,11 +202,11 @@ class RecursiveARX:
         from optid import recursion_kernel
 
         layout, reach = self.layout, self.layout.first_row
-        u, y = _block(u, layout.inputs, "u", self.samples), _block(y, layout.outputs, "y", self.samples)
+        u, y = as_block(u, layout.inputs, "u", self.samples), as_block(y, layout.outputs, "y", self.samples)
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
         self._check_inside(u)
-        weights = _row_weights(weights, len(u))
+        weights = row_weights(weights, len(u))
         source, lag = _columns(layout)
         innovations = np.full(y.shape, np.nan)
         marks = np.zeros(len(u), bool)
@@ -363,58 +363,6 @@ def _check_raw(data: Data | Stream) -> None:
 
 def _ranges(data: Data) -> tuple[list[float], list[float]]:
     return [c.low for c in data.channels[: data.m]], [c.high for c in data.channels[: data.m]]
-
-
-def _prior(theta0: Any, P0: Any, layout: Layout) -> Array:
-    """Return the factor [R | R theta_0; 0 | 0] with R^T R = P_0^-1."""
-    n, l = layout.n_columns, layout.l  # noqa: E741
-    theta, covariance = np.asarray(theta0, dtype=float), np.asarray(P0, dtype=float)
-    if theta.shape not in ((), (n,), (n, l)) or not np.all(np.isfinite(theta)):
-        raise StructureError(f"theta0 has shape {theta.shape}: a number, ({n},) or ({n}, {l}), all finite, is needed.")
-    start = np.broadcast_to(theta[:, None] if theta.ndim == 1 else theta, (n, l))
-    if covariance.shape not in ((), (n,), (n, n)):
-        raise StructureError(f"P0 has shape {covariance.shape}: a number, ({n},) or ({n}, {n}) is needed.")
-    if covariance.ndim < 2:
-        if not np.all(covariance > 0):
-            raise StructureError("P0 must be positive: it is a covariance. Infinity means no prior.")
-        factor = np.diag(np.broadcast_to(1 / np.sqrt(covariance), n))
-    else:
-        try:
-            lower = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            lower = np.full((n, n), np.nan)
-        if not (np.all(np.isfinite(lower)) and np.allclose(covariance, covariance.T, rtol=1e-10, atol=0)):
-            raise StructureError("P0 is not a symmetric positive definite matrix; give (n,) variances to use infinity.")
-        factor = add_to_root(np.zeros((n, n)), np.asarray(invert_triangular(lower), dtype=float))
-    root = np.zeros((n + l, n + l))
-    root[:n, :n], root[:n, n:] = factor, factor @ start
-    return root
-
-
-def _block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array:
-    """Return samples as (N, channels), finite or NaN, or refuse their shape."""
-    samples, width = np.asarray(values, dtype=float), len(names)
-    if samples.ndim == 0 and width == 1 or samples.ndim == 1 and width > 1 and samples.size == width:
-        samples = samples.reshape(1, width)
-    elif samples.ndim == 1 and width == 1:
-        samples = samples[:, None]
-    if samples.ndim != 2 or samples.shape[1] != width:
-        raise DataError(
-            f"{what} has shape {np.shape(values)}: a block (N, {width}) or one sample of {width} "
-            f"channel{'s' if width > 1 else ''} ({', '.join(names)}) is needed."
-        )
-    if samples.size:
-        check_finite(samples, [f"{what}, channel {name!r}" for name in names], seen)
-    return samples
-
-
-def _row_weights(weights: Any, count: int) -> Array:
-    given = np.asarray(weights, dtype=float)
-    if given.shape not in ((), (count,)):
-        raise DataError(f"weights have shape {given.shape}: one number, or one for each of the {count} samples.")
-    if not np.all(np.isfinite(given) & (given >= 0)):
-        raise DataError("weights must be finite and not negative; 0 leaves a row out.")
-    return np.array(np.broadcast_to(given, count))
 
 
 def _columns(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

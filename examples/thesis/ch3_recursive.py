@@ -42,7 +42,7 @@ def main(folder: Path) -> dict[str, float]:
                 line, = panel.plot(time, value, label=f"estimate of {word}")
                 panel.axhline(aim, color=line.get_color(), linestyle="--", linewidth=0.8)
             panel.set(title=f"{name}: {'A' if words[0] == 'a1' else 'B'}", ylim=(aims.min() - 0.7, aims.max() + 0.7))
-            panel.legend(loc="lower right")
+            panel.legend(loc="upper right", ncols=2)
         column[-1].set(xlabel="time (s)")
     save(figure, folder, "ch3_recursive.png")
     return found
