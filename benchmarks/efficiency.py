@@ -12,7 +12,7 @@ re-estimated for the split f and B. Figure 3: b1 / b0 for a function that is not
 import argparse
 
 import numpy as np
-from montecarlo import A, B, STRUCTURE, TRUTHS, mapped, noise_level, record
+from montecarlo import STRUCTURE, TRUTHS, A, B, mapped, noise_level, record
 from scipy.linalg import null_space
 
 import optid
@@ -70,7 +70,7 @@ def main(argv=None) -> dict:
               f"(root mean square of the ratios), each {ratio.min():.3f} .. {ratio.max():.3f}")
         print("  " + ", ".join(f"{name} {r:.3f}" for name, r in zip(NAMES, ratio)))
         print(f"  plain SVD split: objective {100 * np.mean(above[:, 0]):.2f} % above the fit on average "
-              f"({100 * np.mean(above[:, 1]):.2f} % with A and offset re-estimated); the fit is above it in {worse} runs")
+              f"({100 * np.mean(above[:, 1]):.2f} % with A and offset re-estimated), below it in {worse} runs")
     data = record(TRUTHS["non-odd"], 1000, 0, sigma=0.0)
     for formulation in ("hammerstein_arx.exact", "hammerstein_arx.overparametrised"):
         b = optid.fit(data, formulation, **STRUCTURE).model.b[0]
