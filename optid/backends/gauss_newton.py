@@ -5,6 +5,7 @@ model of the Lagrangian over the programme's own convex constraints and the tang
 that the tangents misled is corrected by solving for everything but b, which is convex.
 """
 
+import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, find
@@ -82,7 +83,10 @@ class _Constrained:
         self.half, self.full = StepQP(self.at, pinned=True), StepQP(self.at, pinned=False)
 
     def solve(self, count: int, seed: int) -> Answer:
-        tried = [t for t in (self._settle(point) for point in self._candidates(count, seed)) if t is not None]
+        points = self._candidates(count, seed)
+        tried = [t for t in map(self._settle, points) if t is not None]
+        if not tried:  # none of these directions is allowed: start from the nearest ones that are
+            tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
             return self._no_start()
         tried.sort(key=lambda pair: pair[0])
@@ -109,6 +113,26 @@ class _Constrained:
                 signed.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
                                     tuple(s * b for s, b in zip(signs, point.bs))))
         return signed
+
+    def _allowed(self, points: list[Point]) -> list[Point]:
+        """Move every b to the nearest one that the convex constraints admit."""
+        names = [name for _, name in self.form.blocks]
+        wanted = [cp.Parameter(self.program.variables[name].shape) for name in names]
+        distance = sum(cp.sum_squares(self.program.variables[name] - b) for name, b in zip(names, wanted))
+        nearest = Program("nearest", cp.Minimize(distance),
+                          {name: tuple(c for c in group if c.is_dcp())
+                           for name, group in self.program.user_constraints.items()},
+                          {name: self.program.variables[name] for name in names}, {}, dict, self.program.view)
+        found = []
+        for point in points:
+            for b, value in zip(wanted, point.bs):
+                b.value = np.reshape(value, b.shape, order="F")
+            answer = self.inner.run(nearest, self.settings)
+            if answer.values:
+                bs = tuple(np.ravel(answer.values[name], order="F") for name in names)
+                if all(np.linalg.norm(b) > 1e-6 for b in bs):
+                    found.append(Point(point.w, point.mus, bs))
+        return found
 
     def _settle(self, point: Point) -> tuple[float, np.ndarray] | None:
         """Solve for everything but b, which keeps its direction; None where the constraints forbid it."""

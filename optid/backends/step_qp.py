@@ -179,7 +179,7 @@ class StepQP:
         jacobian = problem.root @ lift
         hessian = jacobian.T @ jacobian
         diagonal = np.diag(hessian)
-        scale = np.sqrt(np.maximum(diagonal, 1e-14 * max(float(np.max(diagonal)), 1e-300)))
+        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), 1e-300)))
         if second_order:
             hessian = hessian + self.at.curvature(x, pull)
         scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
