@@ -3,9 +3,9 @@
     python benchmarks/interval_coverage.py [--runs 1000] [--samples 200 1000] [--truths ...] [--workers 2]
 
 Every record of the simulation example is fitted without and with the constraint that f increases. Counted are a, b,
-and f (its offset included, gauge norm of b one) at 41 points, nodes and cell interiors. The truths: strictly increasing;
-with a flat piece inside (dead zone); on the boundary of the cone at both ends (saturation). Width is the mean width of
-the band under the constraint relative to the one without, averaged over the points.
+and f (its offset included, gauge norm of b one) at 41 points, nodes and cell interiors. The truths: strictly
+increasing; with a flat piece inside (dead zone); on the boundary of the cone at both ends (saturation). Width is the
+mean width of the band under the constraint relative to the one without, averaged over the points.
 """
 
 import argparse
