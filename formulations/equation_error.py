@@ -31,11 +31,13 @@ class EquationError:
         statistics: what one pass over the record left.
         problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
         meta: dt, names and units for the model.
+        unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
     """
 
     statistics: Statistics
     problem: RankOne
     meta: Mapping[str, Any]
+    unweighted: Statistics | None = None
 
     @property
     def layout(self) -> Layout:
@@ -111,16 +113,19 @@ class EquationError:
         theta[-1] = values["offset"]
         return theta
 
+    @property
+    def energy(self) -> np.ndarray:
+        """Sum of squares of every output about its mean over the rows used: what a one-step fit of 0 % leaves."""
+        statistics = self.unweighted or self.statistics
+        n, root = self.layout.n_columns, statistics.root
+        columns = root[:, n:]
+        return np.sum(columns**2, axis=0) - (root[:n, n - 1] @ columns[:n]) ** 2 / statistics.rows
+
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the one-step fit in % of every output over the rows used, from the statistics alone."""
-        n, root = self.layout.n_columns, self.statistics.root
-        theta, found = self.regression(values), []
-        for o in range(self.outputs):
-            column = root[:, n + o]
-            rest = float(np.sum((root[:n, :n] @ theta[:, o] - column[:n]) ** 2) + np.sum(column[n:] ** 2))
-            total = float(np.sum(column**2)) - float(root[:n, n - 1] @ column[:n]) ** 2 / self.statistics.rows
-            found.append(100.0 * (1.0 - np.sqrt(rest / total)) if total > 0 else np.nan)
-        return np.array(found)
+        n, root = self.layout.n_columns, (self.unweighted or self.statistics).root
+        rest = np.sum((root[:, :n] @ self.regression(values) - root[:, n:]) ** 2, axis=0)
+        return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
               gauge: str, flip: bool = True) -> HammersteinARX:

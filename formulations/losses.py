@@ -22,8 +22,10 @@ from optid.streams import Stream
 Pose = Callable[[list[np.ndarray] | None], tuple[Program, EquationError]]
 
 HUBER = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
-KINK = 1e-6  # half-width of the rounded kink of l1, in robust standard deviations
+KINK = 1e-6  # half-width at which the rounded kink of l1 ends, in robust standard deviations
 PASSES = 200
+SETTLING = 3  # passes in which the robust scale is estimated
+CLOSED = 1e-9  # relative gap at which a convex loss needs no further pass
 
 
 def parse_loss(loss: str) -> tuple[str, float]:
@@ -68,31 +70,40 @@ def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Pr
 
 
 def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: bool) -> Procedure:
-    weights: list[np.ndarray] | None = None
-    width, value = 0.0, np.inf
     program, problem = pose(None)
-    scale = program.scale  # of the unweighted record: the weights of a pass are no unit of the data
+    scale, unweighted = program.scale, problem.statistics  # the weights of a pass are no unit of the data
+    weights: list[np.ndarray] | None = None
+    spread = width = 0.0
+    final, best, gap = False, np.inf, np.inf
     for step in range(PASSES):
-        used = weights
         solution: Solution = yield program
         if not solution.has_point:
             return None
         sizes = _row_sizes(data, problem, solution)
-        pooled = np.concatenate(sizes)
-        pooled = pooled[~np.isnan(pooled)]
-        if step < 3:  # the scale settles before the loss is fixed; afterwards the loss cannot rise
-            width = max(threshold * float(np.median(pooled)) / 0.6745, 1e-300)
-            value = np.inf
-        found = _loss(pooled, kind, width)
-        if value - found <= 1e-12 * max(abs(found), 1e-300) and step >= 3:
+        if step < SETTLING:  # the scale settles before the loss is fixed; afterwards the objective cannot rise
+            spread = max(float(np.nanmedian(np.concatenate(sizes))) / 0.6745, 1e-300)
+            width = spread * (1.0 if kind == "l1" else threshold)
+        elif kind == "l1" and weights is not None and _steady(sizes, weights):
+            width = max(width / 3, spread * threshold)  # the kink sharpens as the rounded problem is solved
+        found = _evidence(program, solution, sizes, weights, kind, width, convex)
+        stalled = final and best - found.objective <= 1e-12 * max(abs(found.objective), 1e-300)
+        now = relative_gap(found.objective, found.bound.value, scale)
+        if (convex and step >= SETTLING and now <= CLOSED) or (stalled and not now < 0.9 * gap):
             break
-        value = found
+        best, gap = min(best, found.objective) if final else np.inf, now
+        final = step >= SETTLING and width <= spread * threshold
         weights = [_weights(r, kind, width) for r in sizes]
         program, problem = pose(weights)
-        if step:  # the answer of the pass before is the best start, and no proof belongs to a weighted pass
-            program = replace(program, start=dict(solution.values))
-        program = replace(program, certify=None, scale=scale)
-    return _evidence(program, problem, solution, sizes, used, kind, width, convex)
+        # the answer of the pass before is the best start, and no proof belongs to a weighted pass
+        start = dict(solution.values) if step else program.start
+        program = replace(program, start=start, certify=None, scale=scale,
+                          compressed=replace(problem, unweighted=unweighted))
+    return found
+
+
+def _steady(sizes: list[np.ndarray], weights: list[np.ndarray]) -> bool:
+    """Whether no residual has outgrown by much the weight it was given."""
+    return all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.1 for w, r in zip(weights, sizes))
 
 
 def _row_sizes(data: Data, problem: EquationError, solution: Solution) -> list[np.ndarray]:
@@ -112,13 +123,13 @@ def _weights(sizes: np.ndarray, kind: str, width: float) -> np.ndarray:
     return width / safe if kind == "huber" else 0.5 / safe
 
 
-def _evidence(program: Program, problem: EquationError, solution: Solution, sizes: list[np.ndarray],
-              weights: list[np.ndarray] | None, kind: str, width: float, convex: bool) -> Evidence:
+def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], weights: list[np.ndarray] | None,
+              kind: str, width: float, convex: bool) -> Evidence:
+    """Objective in the loss itself, and the bound that the weighted residuals of the pass give."""
     pooled, w = np.concatenate(sizes), np.concatenate(weights or [np.ones_like(r) for r in sizes])
     keep = ~np.isnan(pooled)
     pooled, w = pooled[keep], w[keep]
-    weighted = float(np.sum(w * pooled**2))
-    penalty = max(0.0, solution.objective - weighted)
+    penalty = max(0.0, solution.objective - float(np.sum(w * pooled**2)))
     objective = _loss(pooled, kind, width) + penalty
     model = program.recover(solution.values)
     if not convex:
@@ -128,7 +139,7 @@ def _evidence(program: Program, problem: EquationError, solution: Solution, size
     dual = 2 * w * pooled  # satisfies the stationarity of the weighted pass, hence of the dual, exactly
     shrink = min(1.0, limit / max(float(np.max(dual, initial=0.0)), 1e-300))
     conjugate = float(np.sum(dual**2)) / 4 if kind == "huber" else 0.0
-    value = shrink * float(dual @ pooled) - shrink**2 * conjugate + shrink * (2 - shrink) * penalty
+    value = shrink * float(dual @ pooled) - shrink**2 * conjugate + shrink * penalty
     gap = relative_gap(objective, value, program.scale)
     proved = gap < 1e-6
     bound = Bound(value, proved, f"{kind} dual", f"dual point of the last pass, gap {gap:.1e}")

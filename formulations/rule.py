@@ -1,7 +1,7 @@
 """A named constraint that is built when the variables of a formulation exist."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from optid.program import View
@@ -22,3 +22,7 @@ class Rule:
     def __call__(self, view: View) -> dict[str, Any]:
         """Build the constraint in the variables of a formulation."""
         return {self.name: self.build(view)}
+
+    def named(self, name: str) -> "Rule":
+        """Return the same constraint under another name, for two of a kind."""
+        return replace(self, name=name)

@@ -7,8 +7,8 @@ Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kind
   characteristic. In the relaxed ones they act on ``Theta``; an inequality then speaks of the static characteristic,
   the sum over the lags, which is implied by the exact statement when the lags sum to a positive number.
 * about the *static characteristic* ``y = (f(u) sum(b) + d) / (1 + sum(a))``, in units of the output: slope, range,
-  points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge; bounds
-  presume ``1 + sum(a) > 0``, which every stable model satisfies.
+  points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge. They
+  include ``1 + sum(a) > 0``, which every stable model satisfies: without it there is no static characteristic.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,6 +24,8 @@ from optid.program import View
 
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
+
+SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -120,7 +122,7 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
 
     def build(view: View) -> Any:
         basis, theta = _basis(view, channel), _static_theta(view, channel)
-        return basis.values(us) @ theta + view["offset"][0] == cp.multiply(ys, _denominator(view))
+        return [basis.values(us) @ theta + view["offset"][0] == cp.multiply(ys, _denominator(view)), *_settles(view)]
 
     return Rule(_label("through", channel), build)
 
@@ -278,9 +280,9 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
             curve = curve + view["offset"][0]
         size = _denominator(view)
         if low == high:
-            return curve - low * size == 0
+            return [curve - low * size == 0, *_settles(view)]
         return ([curve - low * size >= 0] if low is not None else []) + (
-            [curve - high * size <= 0] if high is not None else [])
+            [curve - high * size <= 0] if high is not None else []) + _settles(view)
 
     return Rule(_label(word, channel), build)
 
@@ -297,6 +299,10 @@ def _static_theta(view: View, channel: str | None) -> cp.Expression:
 
 def _denominator(view: View) -> Any:
     return 1 + cp.sum(view["a"]) if "a" in view else 1.0
+
+
+def _settles(view: View) -> list[Any]:
+    return [_denominator(view) >= SETTLES] if "a" in view else []
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:

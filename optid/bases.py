@@ -87,6 +87,9 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
     fitted = []
     for channel, one, lo, hi in zip(inputs, several, *data.ranges()):
         one = parse(one) if isinstance(one, str) else one
+        if not hasattr(one, "fitted"):
+            raise StructureError(f"the basis of input {channel!r} is {one!r}: give one such as Triangular(10) or "
+                                 "its name, 'triangular:10'")
         if lo != lo:
             raise DataError(f"input {channel!r} has no sample at all; choose another column or drop the input")
         if lo == hi:

@@ -1,8 +1,11 @@
 """Explain an infeasible set of constraints by a smallest conflicting subset, in the user's names."""
 
+from collections.abc import Sequence
+
 import cvxpy as cp
 import numpy as np
 
+from optid.lifting import lift_exact, places
 from optid.program import Program
 
 
@@ -10,11 +13,13 @@ def explain(program: Program) -> str:
     """Return a sentence that lists a conflicting subset of the user's constraints.
 
     The subset is irreducible: without any one of its members the rest can be satisfied (deletion filter, Chinneck
-    and Dravnieks 1991). Constraints that are not convex take part through their linearisation at the start, and the
-    sentence says so.
+    and Dravnieks 1991). Constraints that are neither convex nor linear in ``mu bᵀ`` take part through their
+    linearisation at the start, and the sentence says so.
     """
     names = list(program.user_constraints)
-    linearised = [name for name in names if not all(c.is_dcp() for c in program.constraints[name])]
+    stand_in = {} if program.rank_one is None else places(program, program.rank_one).stand_in
+    linearised = [name for name in names
+                  if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     conflict = conflicting_subset(program)
     if conflict is None:
         return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(names) or 'none'}) can be "
@@ -29,43 +34,53 @@ def explain(program: Program) -> str:
 
 
 def conflicting_subset(program: Program) -> list[str] | None:
-    """Return the names of an irreducible infeasible subset, or None where all can be satisfied together."""
-    groups = {name: _convex(program, name) for name in program.user_constraints}
-    # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
-    fixed = [c for name in program.structural for c in program.constraints[name] if c.is_dcp()]
-    kept = list(groups)
-    if _feasible(fixed + [c for name in kept for c in groups[name]]):
+    """Return the names of an irreducible infeasible subset, or None where all can be satisfied together.
+
+    What can be satisfied is judged on a convex outer approximation, so that a subset returned is a contradiction
+    indeed: bilinear constraints are read as constraints on the matrices ``mu bᵀ``.
+    """
+    kept = list(program.user_constraints)
+    if satisfiable(program, kept):
         return None
-    for name in list(groups):
+    for name in list(kept):
         trial = [other for other in kept if other != name]
-        if not _feasible(fixed + [c for other in trial for c in groups[other]]):
+        if not satisfiable(program, trial):
             kept = trial
     return kept
 
 
-def _convex(program: Program, name: str) -> list[cp.Constraint]:
-    found: list[cp.Constraint] = []
-    program.assign({key: value for key, value in program.start.items()})
-    for member in program.constraints[name]:
-        if member.is_dcp():
-            found.append(member)
-            continue
-        expression = member.expr
-        linear = np.ravel(expression.value, order="F")
-        for variable, gradient in expression.grad.items():
-            slope = gradient.toarray() if hasattr(gradient, "toarray") else np.asarray(gradient)
-            flat = variable if variable.ndim <= 1 else cp.vec(variable, order="F")
-            linear = linear + np.reshape(slope, (variable.size, -1)).T @ (flat - np.ravel(variable.value, order="F"))
-        equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
-        found.append(linear == 0 if equal else linear <= 0)
-    return found
-
-
-def _feasible(constraints: list[cp.Constraint]) -> bool:
-    if not constraints:
+def satisfiable(program: Program, names: Sequence[str]) -> bool:
+    """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
+    form = program.rank_one
+    # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
+    found = [c for name in program.structural for c in program.constraints[name] if c.is_dcp()]
+    where = None if form is None else places(program, form)
+    if program.start:
+        program.assign(program.start)
+    for member in (c for name in names for c in program.constraints[name]):
+        copy = member if where is None else member.tree_copy(where.stand_in)
+        found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
+    if form is not None and where is not None:
+        lifted = lift_exact(program.without(*(set(program.user_constraints) - set(names))), form)
+        lifted.rows, lifted.right, lifted.equality = [], [], []  # these are there already
+        lifted.add_products(form.problem)
+        rows = lifted.linear()
+        if rows is not None:
+            thetas = [cp.vec(theta, order="F") for theta in where.stand_in.values()]
+            found.append(rows[0][:, form.problem.linear :] @ cp.hstack(thetas) <= rows[1])
+    if not found:
         return True
-    problem = cp.Problem(cp.Minimize(0), constraints)
+    problem = cp.Problem(cp.Minimize(0), found)
     problem.solve(solver=cp.CLARABEL)
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
+def _linearised(member: cp.Constraint) -> cp.Constraint:
+    expression = member.expr
+    linear = np.ravel(expression.value, order="F")
+    for variable, gradient in expression.grad.items():
+        slope = gradient.toarray() if hasattr(gradient, "toarray") else np.asarray(gradient)
+        flat = variable if variable.ndim <= 1 else cp.vec(variable, order="F")
+        linear = linear + np.reshape(slope, (variable.size, -1)).T @ (flat - np.ravel(variable.value, order="F"))
+    equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
+    return linear == 0 if equal else linear <= 0

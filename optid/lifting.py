@@ -46,6 +46,23 @@ class Lifted:
         self.right += [float(value) for value in right]
         self.equality += [equal] * len(rows)
 
+    def add_products(self, problem: RankOne) -> list[int]:
+        """Turn constraints on both factors of a block into rows on Theta, and return the blocks with some on b alone.
+
+        ``B b >= 0`` and ``C mu >= 0`` imply ``C Theta Bᵀ >= 0``.
+        """
+        alone = []
+        for i, rows in self.directions.items():
+            if i not in self.cones:
+                alone.append(i)
+                continue
+            start, (p, q) = _block_starts(problem)[i], problem.blocks[i]
+            cone = self.cones.pop(i)
+            products = np.zeros((len(rows) * len(cone), self.size))
+            products[:, start : start + p * q] = -np.kron(rows, cone)
+            self.add(products, np.zeros(len(products)), False)
+        return alone
+
     def linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return (E, f, equality mask), or None without rows."""
         if not self.rows:
@@ -97,17 +114,7 @@ def _named(program: Program, form: RankOneForm, point: Point) -> Values:
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:
     """Settle constraints on b: products with those on mu are linear in Theta; alone, the block is transposed."""
-    transposed: list[int] = []
-    starts = _block_starts(problem)
-    for i, rows in lifted.directions.items():
-        p, q = problem.blocks[i]
-        if i in lifted.cones:
-            cone = lifted.cones.pop(i)
-            products = np.zeros((len(rows) * len(cone), lifted.size))
-            products[:, starts[i] : starts[i] + p * q] = -np.kron(rows, cone)
-            lifted.add(products, np.zeros(len(products)), False)
-        else:
-            transposed.append(i)
+    transposed, starts = lifted.add_products(problem), _block_starts(problem)
     if not transposed:
         return problem, point, False
     order, blocks = np.arange(lifted.size), list(problem.blocks)

@@ -42,14 +42,14 @@ class Price:
 def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]:
     """Return the price of every user constraint; empty without a point.
 
-    ``fit = 100 (1 - sqrt(F / S))`` with S the objective of the zero model, so that a multiplier lambda = -dF/d(bound)
-    is worth ``50 lambda / sqrt(F S)`` points.
+    ``fit = 100 (1 - sqrt(F / S))`` with S the energy of the outputs about their means, so that a multiplier
+    lambda = -dF/d(bound) is worth ``50 lambda / sqrt(F S)`` points.
     """
     if not solution.has_point:
         return ()
     program.assign(solution.values)
-    floor = 1e-9 * solution.scale
-    worth = 50.0 / np.sqrt(max(solution.objective, floor) * solution.scale) if solution.scale > 0 else np.nan
+    energy = float(np.sum(getattr(program.compressed, "energy", solution.scale)))
+    worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
     found = []
     for name, group in program.user_constraints.items():
         active = rows = 0

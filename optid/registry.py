@@ -27,8 +27,8 @@ def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]
     if callable(name):
         return getattr(name, "__name__", "formulation"), name
     known = registered(FORMULATIONS)
-    if name not in known:
-        raise LookupFailed(f"no formulation is called {name!r}. {nearest(name, known)}")
+    if not isinstance(name, str) or name not in known:
+        raise LookupFailed(f"no formulation is called {name!r}. {nearest(str(name), known)}")
     return name, known[name].load()
 
 

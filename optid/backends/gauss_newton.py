@@ -13,6 +13,7 @@ from optid.backends.step_qp import Coordinates, StepQP
 from optid.bilinear import minimise, starts
 from optid.errors import StructureError
 from optid.gauges import gauge_factor
+from optid.infeasibility import satisfiable
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
 from optid.solution import Status
@@ -200,9 +201,9 @@ class _Constrained:
         return self._merit(x, weight), Answer(status, word, self.at.unpack(x), duals, count)
 
     def _no_start(self) -> Answer:
-        answer = self.full.run(self.inner, self.settings)
-        status = answer.status if answer.status in (Status.INFEASIBLE, Status.UNBOUNDED) else Status.FAILED
-        return Answer(status, f"the first step is {answer.word} (by {self.inner.name})")
+        if not satisfiable(self.program, list(self.program.user_constraints)):
+            return Answer(Status.INFEASIBLE, "the constraints contradict each other")
+        return Answer(Status.FAILED, "no start satisfies the constraints, although they do not contradict each other")
 
 
 def _distance(z: np.ndarray, reached: np.ndarray) -> float:
