@@ -50,11 +50,22 @@ def cases() -> tuple[Case, ...]:
 
 
 def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: list[cp.Variable],
-         start: Mapping[str, Any] | None = None, **parts: Any) -> Program:
-    """Make a programme of plain parts: named constraints (or lists of them), variables under their own names."""
+         start: Mapping[str, Any] | None = None, expressions: Mapping[str, cp.Expression] | None = None,
+         **parts: Any) -> Program:
+    """Make a programme of plain parts: named constraints (or lists of them), variables under their own names.
+
+    Args:
+        name: name of the programme.
+        objective: what is minimised.
+        constraints: {name: constraint or list of constraints}.
+        variables: the variables, each with its own name.
+        start: {variable: value}.
+        expressions: further named expressions that constraints may speak about.
+        parts: further attributes of `Program`.
+    """
     groups = {key: tuple(group) if isinstance(group, list | tuple) else (group,) for key, group in constraints.items()}
     named = {variable.name(): variable for variable in variables}
-    view = View(named, kind="exact")
+    view = View({**named, **(expressions or {})}, kind="exact")
     return Program(name, cp.Minimize(objective), groups, named, dict(start or {}), dict, view, **parts)
 
 
@@ -306,12 +317,14 @@ def _rank_one() -> list[Case]:
 
         a, mu, b = cp.Variable(1, name="a"), cp.Variable(4, name="mu"), cp.Variable(2, name="b")
         r = cp.Variable(root.shape[0], name="r")
-        residual = root @ cp.hstack([a, cp.vec(cp.outer(mu, b), order="F")]) - target
+        theta = cp.outer(mu, b)
+        residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
         constraints = {"residual": r == residual, "gauge": cp.sum_squares(b) == 1, **extra(mu)}
         form = RankOneForm(RankOne(root, target, remainder, ((4, 2),), 1, float(y @ y)), ("a",), (("mu", "b"),))
         return pose(name, cp.sum_squares(r) + remainder, constraints, [a, mu, b, r],
                     start={"a": np.zeros(1), **start},
-                    structural=frozenset({"residual", "gauge"}), derived={"r": residual}, rank_one=form,
+                    structural=frozenset({"residual", "gauge"}), derived={"r": residual},
+                    rank_one=form, expressions={"Theta": theta},
                     scale=float(y @ y))
 
     def rank_one_fit() -> Program:

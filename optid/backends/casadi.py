@@ -115,10 +115,10 @@ def _move(expr: Any, columns: list) -> Any:
     moved = np.ravel(moved.toarray() if sp.issparse(moved) else np.asarray(moved), order="F").astype(int)
     source = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
     if moved.all():
-        return source if np.array_equal(moved, np.arange(1, count + 1)) else source[(moved - 1).tolist()]
+        return source if np.array_equal(moved, np.arange(1, count + 1)) else source[(moved - 1).tolist(), 0]
     kept = np.flatnonzero(moved)
     place = ca.Sparsity(moved.size, 1, [0, kept.size], kept.tolist())
-    return ca.MX(place, ca.densify(source)[(moved[kept] - 1).tolist()])
+    return ca.MX(place, ca.densify(source)[(moved[kept] - 1).tolist(), 0])
 
 
 def _matrix(column: Any, shape: tuple[int, ...], *, row: bool = False) -> Any:

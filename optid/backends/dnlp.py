@@ -237,11 +237,12 @@ def _apply(problem: cp.Problem) -> Smooth:
 
 
 class _SmoothChain(Dnlp2Smooth):
-    """CVXPY's smooth chain, with three of its canonicalisations replaced because they change the problem.
+    """CVXPY's smooth chain, with those of its canonicalisations replaced that change the problem or its start.
 
     * Division by a constant or parameter: CVXPY forces the divisor to be nonnegative, so that ``x / -2`` becomes
       infeasible. It is smooth as it stands.
     * ``quad_over_lin`` along an axis: CVXPY sums over everything.
+    * ``log_sum_exp``: CVXPY starts its value at that of the first entry alone.
     * ``quad_over_lin``, ``rel_entr`` and ``kl_div`` with a parameter: CVXPY freezes its value of the first solve.
     """
 
@@ -252,6 +253,7 @@ class _SmoothChain(Dnlp2Smooth):
             **originals,
             DivExpression: _divide(originals[DivExpression]),
             quad_over_lin: _quad_over_lin(originals[quad_over_lin]),
+            cp.log_sum_exp: _log_sum_exp(originals[cp.log_sum_exp]),
             cp.rel_entr: _refuse_parameters(originals[cp.rel_entr]),
             cp.kl_div: _refuse_parameters(originals[cp.kl_div]),
         }
@@ -273,6 +275,15 @@ def _quad_over_lin(original: Any) -> Any:
         total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
         unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
         return (total if unit else total / args[1]), []
+
+    return canonicalise
+
+
+def _log_sum_exp(original: Any) -> Any:
+    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
+        level, constraints = original(expr, args)
+        level.value = expr.copy(args).value
+        return level, constraints
 
     return canonicalise
 

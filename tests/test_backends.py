@@ -1,0 +1,238 @@
+"""Every installed back end over the zoo of its classes, and the translator against CVXPY's own values."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from cvxpy.atoms.elementwise.hyperbolic import asinh, sinh, tanh
+from cvxpy.atoms.elementwise.trig import cos, sin, tan
+from hypothesis import given
+from hypothesis import strategies as st
+from zoo import CASES, case, pose
+
+from optid.backends import BackEnd, Settings, back_ends
+from optid.backends import casadi as casadi_backend
+from optid.backends.conic import tolerances
+from optid.backends.dnlp import smooth
+from optid.conformance import SUCCESS, ConformanceError, check_back_end, run_case, value_error
+from optid.errors import StructureError
+from optid.solution import Status
+from optid.solving import solve
+
+INSTALLED = sorted(name for name, back_end in back_ends().items() if back_end.installed)
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_back_end_is_conformant(name):
+    rows = check_back_end(back_ends()[name])
+    assert any(row.solution.status in SUCCESS for row in rows)
+    for row in rows:
+        if row.solution.status in SUCCESS:
+            assert value_error(row.case, row.solution) <= 1e-6
+
+
+def test_every_class_has_a_solver_that_solves_all_of_it():
+    for kind, name in {"LP": "clarabel", "QP": "clarabel", "SOCP": "clarabel", "SDP": "clarabel", "conic": "clarabel",
+                       "NLP": "ipopt"}.items():
+        rows = [run_case(back_ends()[name], c) for c in CASES.values()
+                if c.outcome == "solved" and c.build().kind == kind and not back_ends()[name].refuses(c.build())]
+        assert rows and all(row.solution.status in SUCCESS and not row.complaints for row in rows), kind
+
+
+def test_known_multipliers_satisfy_the_optimality_conditions():
+    # the zoo is checked without any solver: points and multipliers known in closed form must be stationary
+    from optid.judging import judge
+
+    checked = 0
+    for entry in CASES.values():
+        program = entry.build()
+        named = set(entry.point) | set(program.derived)
+        if entry.outcome != "solved" or named < set(program.variables) or set(entry.duals) < set(program.constraints):
+            continue
+        duals = {k: np.ravel(np.asarray(v, dtype=float)) for k, v in entry.duals.items()}
+        objective, residuals = judge(program, {k: np.asarray(v, dtype=float) for k, v in entry.point.items()}, duals)
+        assert objective == pytest.approx(entry.value, rel=1e-12, abs=1e-12), entry.name
+        assert max(residuals.violation, residuals.stationarity, residuals.complementarity) < 1e-12, entry.name
+        checked += 1
+    assert checked >= 12
+
+
+def test_conformance_names_what_is_wrong():
+    right = back_ends()["clarabel"]
+
+    def run(program, settings):
+        answer = right.run(program, settings)
+        return type(answer)(answer.status, answer.word, {k: v + 1e-2 for k, v in answer.values.items()}, answer.duals)
+
+    with pytest.raises(ConformanceError, match="qp_equality"):
+        check_back_end(BackEnd("shifted", frozenset({"QP"}), run), [case("qp_equality"), case("qp_box")])
+
+
+@pytest.mark.parametrize("name", ["ipopt", "fatrop", "uno"])
+def test_multipliers_are_the_prices_of_the_right_hand_side(name):
+    # L = f + dual (lhs - rhs): the value falls by dual per unit that the right-hand side is raised
+    def value(radius: float, level: float):
+        x = cp.Variable(2, name="x")
+        program = pose("priced", x[0] * x[1] + x[0], {
+            "level": x[1] - cp.square(x[0]) == level, "radius": cp.sum_squares(x) <= radius,
+            "floor": -2.5 <= x[0]}, [x], start={"x": np.array([-1.0, 1.0])})
+        return solve(program, name)
+
+    base, step = value(4.0, 0.3), 1e-5
+    assert base.status is Status.LOCAL
+    radius = (value(4.0 + step, 0.3).objective - value(4.0 - step, 0.3).objective) / (2 * step)
+    level = (value(4.0, 0.3 + step).objective - value(4.0, 0.3 - step).objective) / (2 * step)
+    assert base.duals["radius"] == pytest.approx(-radius, abs=1e-5)
+    assert base.duals["level"] == pytest.approx(-level, abs=1e-5)
+    assert abs(radius) > 0.1 and abs(level) > 0.1
+    assert base.duals["floor"] == pytest.approx(0.0, abs=1e-6)
+
+
+# the translator
+
+def translated(expression: cp.Expression):
+    """Value of an expression by CasADi at the values its variables hold."""
+    import casadi as ca
+
+    weights = np.cos(np.arange(expression.size)).reshape(expression.shape, order="F")
+    problem = cp.Problem(cp.Minimize(cp.sum(cp.multiply(weights, expression))))
+    form = smooth(problem)
+    parts = casadi_backend.translate(form)
+    function = ca.Function("f", [parts["x"], parts["p"]], [parts["f"], parts["g"]])
+    value, rows = function(form.start(), form.parameter_values())
+    return float(value), float(np.ravel(weights, order="F") @ np.ravel(expression.value, order="F")), np.asarray(rows).ravel()
+
+
+rng = np.random.default_rng(0)
+X, Y = cp.Variable((3, 4), name="X"), cp.Variable((4, 2), name="Y")
+v, w, s = cp.Variable(4, name="v"), cp.Variable(3, name="w"), cp.Variable(name="s")
+X.value, Y.value = rng.uniform(0.5, 1.5, (3, 4)), rng.uniform(0.5, 1.5, (4, 2))
+v.value, w.value, s.value = rng.uniform(0.5, 1.5, 4), rng.uniform(0.5, 1.5, 3), 0.7
+P = cp.Parameter((3, 3), value=rng.standard_normal((3, 3)), name="P")
+Q = rng.standard_normal((4, 4))
+ATOMS = {
+    "add": X + X[0:1, :] + 1, "neg": -X, "scalar times": s * X, "elementwise": cp.multiply(X, 2 * X),
+    "broadcast": cp.multiply(X, cp.reshape(v, (1, 4), order="F")),
+    "matmul": X @ Y, "matrix vector": X @ v, "vector matrix": w @ X, "inner": v @ v, "constant left": Q @ v,
+    "constant right": v @ Q, "sparse": sp.csc_array(np.diag([1.0, 0, 2, 3])) @ v,
+    "parameter": P @ X, "outer": cp.outer(w, v), "divided by a constant": X / -2.0, "divided": v / (1 + s),
+    "power 2": X**2, "power 3": v**3, "power -1": v**-1, "square root": cp.sqrt(v), "sum squares": cp.sum_squares(X),
+    "sum squares of columns": cp.sum_squares(X, axis=0), "quad over lin": cp.quad_over_lin(v, 2.0),
+    "quad form": cp.quad_form(v, Q @ Q.T), "sum": cp.sum(X), "sum of rows": cp.sum(X, axis=1),
+    "sum of columns kept": cp.sum(X, axis=0, keepdims=True), "reshape F": cp.reshape(X, (2, 6), order="F"),
+    "reshape C": cp.reshape(X, (2, 6), order="C"), "vec C": cp.vec(X, order="C"), "vec F": cp.vec(X, order="F"),
+    "hstack": cp.hstack([X, X @ Y, w[:, None]]), "vstack": cp.vstack([v, X]), "stack 1-D": cp.hstack([v, w, s]),
+    "concatenate": cp.concatenate([X, X], axis=1), "slice": X[1:, ::-1], "item": X[2, 1], "list index": v[[3, 0, 0]],
+    "mask": v[np.array([True, False, True, True])], "new axis": v[None, :],
+    "transpose": X.T, "trace": cp.trace(X[:, :3] + 1),
+    "diag of vector": cp.diag(v), "diag of matrix": cp.diag(X @ X.T), "upper triangle": cp.upper_tri(X @ X.T),
+    "kron left": cp.kron(np.arange(4.0).reshape(2, 2), X), "kron right": cp.kron(X, np.arange(4.0).reshape(2, 2)),
+    "cumsum": cp.cumsum(v), "cumsum rows": cp.cumsum(X, axis=1), "diff": cp.diff(v, 2),
+    "block": cp.bmat([[X, X], [X, X]]),
+    "convolution": cp.convolve(np.array([1.0, -2.0]), v), "exp": cp.exp(X), "log": cp.log(X), "log1p": cp.log1p(X),
+    "sin": sin(v), "cos": cos(v), "tan": tan(0.5 * v), "tanh": tanh(v), "sinh": sinh(v), "asinh": asinh(v),
+    "logistic": cp.logistic(v), "entr": cp.entr(v), "rel entr": cp.rel_entr(v, v[::-1]),
+    "kl div": cp.kl_div(v, v[::-1]),
+    "product": cp.prod(v), "norm": cp.norm(v), "norm1": cp.norm1(v), "abs": cp.abs(v - 1), "max": cp.max(v),
+    "pos": cp.pos(v - 1), "huber": cp.huber(v, 0.8),
+    "log sum exp": cp.log_sum_exp(v), "geometric mean": cp.geo_mean(v),
+    "composition": sin(X @ v) + cp.exp(-w), "scalars": s * s + cp.exp(s),
+}
+
+
+@pytest.mark.parametrize("name", sorted(ATOMS))
+@pytest.mark.filterwarnings("ignore:.*denominator.*")
+def test_translation_agrees_with_cvxpy(name):
+    value, known, rows = translated(ATOMS[name])
+    assert value == pytest.approx(known, rel=1e-9, abs=1e-9)
+    if name != "log sum exp":  # its auxiliary variables are moved off their bounds on purpose
+        assert np.all(rows <= 1e-9)  # auxiliary variables start consistent: equalities hold, epigraphs are not cut
+
+
+@given(rows=st.integers(1, 4), inner=st.integers(1, 4), columns=st.integers(1, 3), flat=st.sampled_from(["", "l", "r"]))
+def test_products_follow_numpy_in_every_shape(rows, inner, columns, flat):
+    left = cp.Variable(inner if flat == "l" else (rows, inner))
+    right = cp.Variable(inner if flat == "r" else (inner, columns))
+    generator = np.random.default_rng(rows + 10 * inner + 100 * columns)
+    left.value, right.value = generator.standard_normal(left.shape), generator.standard_normal(right.shape)
+    value, known, _ = translated(left @ right)
+    assert value == pytest.approx(known, rel=1e-12, abs=1e-12)
+
+
+def test_unknown_atom_is_named():
+    from cvxpy.atoms.elementwise.normcdf import normcdf
+
+    x = cp.Variable(2, name="x")
+    x.value = np.zeros(2)
+    assert translated(normcdf(x))[0] == pytest.approx(translated(normcdf(x))[1])
+    saved = casadi_backend.ATOMS.pop("normcdf")
+    try:
+        program = pose("unknown", cp.sum(normcdf(x)), {"floor": x >= -1}, [x], start={"x": np.zeros(2)})
+        with pytest.raises(StructureError, match="normcdf"):
+            solve(program, "ipopt")
+        with pytest.raises(StructureError, match="normcdf"):
+            solve(program, "ipopt", isolate=True)
+    finally:
+        casadi_backend.ATOMS["normcdf"] = saved
+
+
+def test_cone_in_a_nonconvex_programme_is_refused_with_the_remedy():
+    x = cp.Variable(2, name="x")
+    with pytest.raises(StructureError, match="ball"):
+        solve(pose("cone", x[0] * x[1], {"ball": cp.SOC(cp.Constant(1.0), x)}, [x]), "ipopt")
+
+
+@pytest.mark.parametrize("name", ["ipopt", "uno"])
+def test_symmetric_and_bounded_variables_go_there_and_back(name):
+    a = np.array([[2.0, 1.0], [1.0, 3.0]])
+    x = cp.Variable((2, 2), name="x", symmetric=True)
+    y = cp.Variable(2, name="y", bounds=[0.0, 0.25])
+    program = pose("attributes", cp.sum_squares(x - a) + cp.sum_squares(y - np.array([1.0, 0.1]))
+                   + 0 * x[0, 0] * y[0] ** 3, {"corner": x[0, 1] + x[1, 0] == 1}, [x, y], start={"x": np.eye(2), "y": np.zeros(2)})
+    found = solve(program, name)
+    assert found.status in SUCCESS
+    assert found.values["x"] == pytest.approx(np.array([[2.0, 0.5], [0.5, 3.0]]), abs=1e-6)
+    assert found.values["y"] == pytest.approx([0.25, 0.1], abs=1e-6)
+    assert found.duals["corner"] == pytest.approx([1.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["ipopt", "fatrop", "uno"])
+def test_nothing_is_printed_unless_asked(name, capfd):
+    solve(case("nlp_hs071").build(), name)
+    solve(case("nlp_unbounded").build(), name)
+    captured = capfd.readouterr()
+    assert captured.out == "" and captured.err == ""
+
+
+NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating"}
+
+
+def test_one_accuracy_is_translated_for_every_solver():
+    for name in INSTALLED:
+        coarse, fine = (tolerances(name, Settings(accuracy=eps)) for eps in (1e-4, 1e-8))
+        assert coarse != fine or name in NO_TOLERANCE, name
+    assert tolerances("scs", Settings(accuracy=1e-5, time_limit=3.0))["time_limit_secs"] == 3.0
+    assert tolerances("clarabel", Settings(options={"tol_feas": 1e-3}))["tol_feas"] == 1e-3
+
+
+def test_alternating_agrees_with_a_search_over_the_angle_and_reports_multipliers():
+    for name in ("rank_one_fit", "rank_one_convex"):
+        found = solve(case(name).build(), "alternating")
+        assert found.status in SUCCESS and value_error(case(name), found) < 1e-8
+        assert found.residuals.stationarity < 1e-5 and set(found.duals) >= {"residual"}
+
+
+def test_alternating_keeps_its_half_steps_compiled(monkeypatch):
+    from optid.backends import alternating
+
+    compiled, seen = [], alternating.solve
+
+    def counting(half, *args, **options):
+        solution = seen(half, *args, **options)
+        compiled.append(half.problem._cache.param_prog)
+        return solution
+
+    monkeypatch.setattr(alternating, "solve", counting)
+    solve(case("rank_one_fit").build(), "alternating")
+    assert len(compiled) > 6
+    assert None not in compiled and len({id(form) for form in compiled}) == 2
