@@ -18,7 +18,7 @@ from optid.certificate_sdp import relax, relaxation_size
 from optid.errors import StructureError
 from optid.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
 from optid.rank_one import Array, Core, Point, RankOne, matrices, reduce
-from optid.shape_duals import Linear, Multipliers, align_cuts, as_cones, as_linear, kkt_multipliers, sign_free_cut
+from optid.shape_duals import ACTIVE, Linear, Multipliers, align_cuts, as_cones, as_linear, kkt_multipliers, sign_free_cut
 from optid.solution import Bound
 
 TOLERANCE = 1e-8
@@ -107,6 +107,18 @@ class Case:
         """Entries of the minors that do not touch the gradient at the point, in rotated coordinates, by block."""
         return [np.ones((p * nb, p * nb), bool) if vanishes else free_mask((p, nb))
                 for vanishes, (p, nb) in zip(self.vanishing, self.core.shapes)]
+
+    def violation(self) -> float:
+        """Largest violation of the constraints at the point, relative to the size of their terms."""
+        found = [np.zeros(1)]
+        for i, cone in self.cones.items():
+            terms = np.abs(cone) @ np.abs(self.mus[i])
+            found.append(-(cone @ self.mus[i]) / np.maximum(terms, np.finfo(float).tiny))
+        if self.linear is not None:
+            slack, terms = self.linear.slack(self.objective.z)
+            excess = np.where(self.linear.equality, np.abs(slack), -slack)
+            found.append(excess / np.maximum(terms, np.finfo(float).tiny))
+        return float(np.concatenate(found).max())
 
     def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
         """The objective with the linear terms, at the KKT multipliers or others."""
@@ -345,8 +357,12 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     value = case.objective.value
     bound = float(case.lagrangian(linear).bound(minors, case.cut_form(cuts)))
     gap = float(case.problem.gap(value, bound))
-    proved = gap <= TOLERANCE
-    if proved:
+    broken = case.violation()
+    undercut = case.problem.gap(bound, value) > TOLERANCE
+    proved = gap <= TOLERANCE and not undercut and broken <= ACTIVE
+    if broken > ACTIVE or undercut:
+        reason = f"not proved: the point violates its constraints (relative violation {broken:.1e})"
+    elif proved:
         reason = f"globally optimal, relative gap {gap:.1e}: {how}"
     elif np.isfinite(bound):
         reason = f"not proved, relative gap {gap:.1e}: {how}"

@@ -248,6 +248,17 @@ def test_monotone_bound_with_two_lags_against_a_search_over_directions():
     assert found.value <= best <= found.value * (1 + 1e-5)
 
 
+def test_a_point_outside_its_constraints_is_never_proved():
+    problem, increments = monotone(0, 3, 5, 100, snr=0.3)
+    free = minimise(problem).point
+    for effort in ("ascent", "sdp"):
+        bound = certify(problem, free, cones=[increments], effort=effort).bound
+        assert not bound.proved and "violates" in bound.reason
+    row = np.ones((1, len(problem.target)))
+    right = np.array([row[0] @ free.lift() - 1.0])
+    assert not certify(problem, free, linear=(row, right, np.array([False]))).bound.proved
+
+
 def test_constrained_optimum_is_not_proved_without_its_cone_and_no_cone_is_needed_when_inactive():
     problem, increments = monotone(0, 3, 5, 100, snr=0.3)
     found = minimise_in_cones(problem, {0: increments})
