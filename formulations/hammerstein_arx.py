@@ -208,15 +208,15 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
     penalty = 2 * tau * sum(cp.normNuc(t) for t in thetas.values()) if name.endswith("nuclear") else 0.0
     program = residual_programme(
         problem, name, {**linear, **thetas}, problem.residual(linear, list(thetas.values())), penalty=penalty,
-        start={}, recover=partial(_split_model, problem, keys, gauge, svd),
+        start={}, recover=partial(_split_model, problem, reduce(problem.problem), keys, gauge, svd),
         view=problem.view({**linear, **thetas}, "relaxed"),
         parameters={"weight": tau} if name.endswith("nuclear") else {},
         certify=partial(certify_nuclear, problem.problem) if name.endswith("nuclear") else None)
     return program.subject_to(*constraints)
 
 
-def _split_model(problem: EquationError, keys: Sequence[str], gauge: str, svd: str, values: Values) -> HammersteinARX:
-    core = reduce(problem.problem)
+def _split_model(problem: EquationError, core: Core, keys: Sequence[str], gauge: str, svd: str, values: Values
+                 ) -> HammersteinARX:
     mus, bs = [], []
     for c, key in enumerate(keys):
         mu, b = _leading_pair(core, c, np.reshape(values[key], problem.problem.blocks[c]), svd == "whitened")
