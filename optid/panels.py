@@ -12,7 +12,7 @@ from optid.basis import Array
 from optid.correlations import Correlation
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
-BLUE, ORANGE, GREEN, RED = "#0b6fb8", "#d9660a", "#00845f", "#c2344d"
+BLUE, ORANGE, GREEN, RED = "#1063b5", "#d9660a", "#008c66", "#c2344d"
 """Blue, orange and green of a colour-blind safe palette; red marks what lies outside a band."""
 
 STYLE: dict[str, Any] = {

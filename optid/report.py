@@ -50,7 +50,12 @@ def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
     if fit.model is None:
         raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
     environment = Environment(
-        loader=PackageLoader("optid"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("optid"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
     return environment.get_template("report.html.j2").render(_content(fit, test, command))
 

@@ -1,0 +1,384 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import optid
+from optid.cli import app
+from optid.examples import EXAMPLES, example
+from optid.terminal import spread
+
+
+def run(*words: object):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def table(path: Path, **columns: np.ndarray) -> Path:
+    rows = zip(*columns.values())
+    path.write_text(
+        "\n".join([",".join(columns), *(",".join("" if v != v else repr(float(v)) for v in row) for row in rows)])
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def csv(tmp_path_factory) -> Path:
+    rng = np.random.default_rng(0)
+    u1, u2, y = rng.uniform(-1, 1, 400), rng.uniform(-1, 1, 400), np.zeros(400)
+    for k in range(1, 400):
+        y[k] = 0.6 * y[k - 1] + u1[k] ** 3 + 0.5 * abs(u2[k - 1]) + 0.01 * rng.standard_normal()
+    folder = tmp_path_factory.mktemp("records")
+    table(folder / "second.csv", u1=u1[200:], u2=u2[200:], y1=y[200:])
+    return table(folder / "record.csv", u1=u1, u2=u2, y1=y)
+
+
+ORDERS = ["--na", 1, "--nb", 2, "--basis", "polynomial:3"]
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+
+values = st.text("abc13", min_size=1, max_size=3)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["--in", "--out", "--dt"]), st.lists(values, min_size=1, max_size=4)), max_size=5
+    ),
+    st.lists(values, max_size=2),
+)
+def test_spreading_repeats_the_option_before_each_value(options, before):
+    words, expected = list(before), list(before)
+    for option, given_values in options:
+        listed = given_values[:1] if option == "--dt" else given_values
+        words += [option, *listed]
+        expected += [option, *listed] if option == "--dt" else [part for value in listed for part in (option, value)]
+    assert spread(words, {"--in": False, "--out": False}) == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("--in a b data.csv", "--in a --in b data.csv"),
+        ("--in a data.csv --in b", "--in a data.csv --in b"),
+        ("--files a.csv b.csv", "--files a.csv --files b.csv"),
+        ("--in=a b", "--in=a --in b"),
+        ("--in a -- b", "--in a -- b"),
+        ("--in -1.5 -2", "--in -1.5 --in -2"),
+        ("--in", "--in"),
+        ("--in --out a", "--in --out a"),
+    ],
+)
+def test_spreading_stops_where_the_list_ends(words, expected):
+    assert spread(words.split(), {"--in": False, "--out": False, "--files": True}) == expected.split()
+
+
+def test_several_values_by_spaces_commas_and_repetition_are_the_same(csv, tmp_path):
+    models = []
+    for k, names in enumerate((["--inputs", "u1", "u2"], ["--inputs", "u1,u2"], ["--inputs", "u1", "--inputs", "u2"])):
+        path = tmp_path / f"{k}.json"
+        result = run("fit", *names, "--outputs", "y1", csv, *ORDERS, "--nk", 0, 0, "--model", path)
+        assert result.exit_code == 0, result.output
+        models.append(path.read_text())
+    assert models[0] == models[1] == models[2]
+    assert optid.load(tmp_path / "0.json").inputs == ("u1", "u2")
+
+
+# -- fit ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_line_and_python_give_the_same_model(csv, tmp_path):
+    result = run(
+        "fit",
+        csv,
+        "--dt",
+        0.5,
+        "--na",
+        1,
+        "--nb",
+        1,
+        2,
+        "--nk",
+        0,
+        1,
+        "--basis",
+        "polynomial:3",
+        "polynomial:2",
+        "--constraint",
+        "monotone:increasing,channel=u1",
+        "--gauge",
+        "b0",
+        "--ridge",
+        1e-3,
+        "--model",
+        tmp_path / "m.json",
+    )
+    assert result.exit_code == 0, result.output
+    from formulations import shape
+
+    fit = optid.fit(
+        optid.read(csv, dt=0.5),
+        na=1,
+        nb=[1, 2],
+        nk=[0, 1],
+        basis=["polynomial:3", "polynomial:2"],
+        constraints=[shape.monotone("increasing", channel="u1")],
+        gauge="b0",
+        ridge=1e-3,
+    )
+    loaded = optid.load(tmp_path / "m.json")
+    assert np.array_equal(loaded.a, fit.model.a) and loaded.dt == 0.5
+    assert all(np.array_equal(one, other) for one, other in zip(loaded.b, fit.model.b))
+    assert fit.model.equation().split(" = ")[0] in result.output and "model written to" in result.output
+
+
+def test_split_validates_on_the_rest_and_the_report_has_it(csv, tmp_path):
+    result = run("fit", csv, *ORDERS, "--split", 0.75, "--report", tmp_path / "r.html")
+    assert result.exit_code == 0, result.output
+    assert "100 samples held out of the fit" in result.output
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Test record, not seen by the fit" in page
+
+
+def test_a_test_file_is_validated_on(csv):
+    result = run("fit", csv, *ORDERS, "--test", csv.parent / "second.csv")
+    assert result.exit_code == 0 and "200 samples held out" in result.output
+
+
+def test_other_arguments_of_the_formulation_pass_through_set(csv):
+    result = run(
+        "fit", csv, "--inputs", "u1", "--formulation", "hammerstein_arx.nuclear", *ORDERS, "--set", "weight=0.25"
+    )
+    assert result.exit_code == 0, result.output
+    assert "nuclear dual" in result.output
+    wrong = run("fit", csv, "--inputs", "u1", *ORDERS, "--set", "wait=3")
+    assert wrong.exit_code == 2 and "takes no argument 'wait'" in wrong.output
+
+
+def test_a_stream_gives_the_same_model(csv, tmp_path):
+    for name, more in (("a.json", []), ("b.json", ["--stream"])):
+        assert run("fit", csv, "--inputs", "u1", *ORDERS, *more, "--model", tmp_path / name).exit_code == 0
+    assert np.allclose(optid.load(tmp_path / "a.json").a, optid.load(tmp_path / "b.json").a, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_every_example_runs_as_suggested(name):
+    result = run("fit", "--example", name, "--seed", 1)
+    assert result.exit_code == 0, result.output
+    assert "optimal (proved)" in result.output
+    assert np.array_equal(example(name, seed=1).data.y, example(name, seed=1).data.y)
+
+
+def test_a_suggestion_is_overruled_and_cut_to_what_the_formulation_takes():
+    result = run("fit", "--example", "dead_zone", "--formulation", "arx", "--na", 1)
+    assert result.exit_code == 0 and "Linear ARX model" in result.output and "a2" not in result.output
+    free = run("fit", "--example", "dead_zone", "--constraint", "none")
+    assert free.exit_code == 0 and "monotone" not in free.output
+
+
+def test_a_solver_is_chosen_by_one_word():
+    result = run(
+        "fit", "--example", "dead_zone", "--formulation", "hammerstein_arx.overparametrised", "--solver", "scs"
+    )
+    assert result.exit_code == 0 and "scs" in result.output
+
+
+# -- validate and listings ---------------------------------------------------------------------------------------------
+
+
+def test_validate_takes_names_and_sampling_time_from_the_model(csv, tmp_path):
+    assert run("fit", csv, "--dt", 0.5, *ORDERS, "--model", tmp_path / "m.json").exit_code == 0
+    result = run("validate", tmp_path / "m.json", csv.parent / "second.csv")
+    assert result.exit_code == 0, result.output
+    model = optid.load(tmp_path / "m.json")
+    expected = optid.validate(model, optid.read(csv.parent / "second.csv", dt=0.5))
+    assert f"{expected.one_step['y1'].fit:.2f}" in result.output
+    assert model.equation() in result.output
+
+
+def test_solvers_are_listed_from_the_registry():
+    from optid.backends import back_ends
+
+    result = run("solvers")
+    assert result.exit_code == 0
+    lines = {line.split()[0]: line for line in reversed(result.output.splitlines()) if line.strip()}
+    for name, back_end in back_ends().items():
+        assert name in lines
+        assert all(kind in lines[name] for kind in back_end.classes)
+        if not back_end.installed and back_end.pip:
+            assert f"pip install {back_end.pip}" in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "group"), [("formulations", "optid.formulations"), ("constraints", "optid.constraints")]
+)
+def test_registered_names_are_listed(command, group):
+    from importlib.metadata import entry_points
+
+    result = run(command)
+    assert result.exit_code == 0
+    names = {point.name for point in entry_points(group=group)}
+    assert names <= set(result.output.split())
+
+
+def test_formulations_name_their_variables():
+    text = " ".join(run("formulations").output.split())
+    assert "variables: Theta a b mu offset" in text and "variables: Theta a offset" in text
+
+
+def test_examples_are_listed():
+    assert set(EXAMPLES) <= set(run("examples").output.split())
+
+
+# -- errors: one clean message and an exit code ------------------------------------------------------------------------
+
+ramp = np.linspace(-1, 1, 100)
+
+
+def bad(folder: Path, kind: str) -> list[object]:
+    """Words of a command that must fail, for one kind of bad input."""
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 100), rng.standard_normal(100)
+    spoiled = {
+        "infinite": (np.where(np.arange(100) == 7, np.inf, u), y),
+        "constant": (np.ones(100), y),
+        "binary": (np.sign(u), y),
+        "levels": (np.round(u), y),
+        "short": (u[:6], y[:6]),
+    }
+    if kind in spoiled:
+        return ["fit", table(folder / "bad.csv", u=spoiled[kind][0], y=spoiled[kind][1]), *ORDERS]
+    good = table(folder / "good.csv", u=u, y=y)
+    (folder / "empty.csv").write_text("")
+    (folder / "model.json").write_text('{"format": "optid model", "vers')
+    time = np.arange(100.0)
+    time[50:] += 0.5
+    stamped = table(folder / "stamped.csv", time=time, u=u, y=y)
+    return {
+        "empty": ["fit", folder / "empty.csv", *ORDERS],
+        "no file": ["fit", folder / "nothing.csv", *ORDERS],
+        "no data": ["fit", *ORDERS],
+        "column": ["fit", good, "--inputs", "v", *ORDERS],
+        "stamps": ["fit", stamped, *ORDERS],
+        "formulation": ["fit", good, *ORDERS, "--formulation", "hammerstein_arx.exakt"],
+        "solver": ["fit", good, *ORDERS, "--solver", "clarabell"],
+        "constraint": ["fit", good, *ORDERS, "--constraint", "monoton:increasing"],
+        "example": ["fit", "--example", "thrster"],
+        "basis": ["fit", good, "--na", 1, "--nb", 2, "--basis", "triangle:5"],
+        "order": ["fit", good, "--na", 1, "--nb", "two", "--basis", "triangular:5"],
+        "missing order": ["fit", good, "--na", 1],
+        "refused solver": ["fit", good, *ORDERS, "--solver", "osqp"],
+        "truncated model": ["validate", folder / "model.json", good],
+        "no folder": ["fit", good, *ORDERS, "--report", folder / "nowhere" / "r.html"],
+        "contradiction": ["fit", good, *ORDERS, "--constraint", "coefficients:a,low=0.5", "stable:0.3"],
+        "not installed": ["fit", good, *ORDERS, "--solver", "mosek"],
+        "pair": ["fit", good, *ORDERS, "--set", "weight"],
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "words"),
+    [
+        ("infinite", 2, ["bad.csv", "'u'", "7"]),
+        ("constant", 2, ["'u'", "constant", "excite"]),
+        ("binary", 2, ["'u'", "binary", "arx"]),
+        ("levels", 2, ["'u'", "levels", "basis"]),
+        ("short", 2, ["rows"]),
+        ("empty", 2, ["empty.csv"]),
+        ("no file", 2, ["nothing.csv"]),
+        ("no data", 2, ["--example"]),
+        ("column", 2, ["no column 'v'"]),
+        ("stamps", 2, ["stamped.csv", "50"]),
+        ("formulation", 2, ["'hammerstein_arx.exakt'", "Did you mean 'hammerstein_arx.exact'?"]),
+        ("solver", 2, ["'clarabell'", "Did you mean 'clarabel'?"]),
+        ("constraint", 2, ["'monoton'", "Did you mean 'monotone'?"]),
+        ("example", 2, ["'thrster'", "Did you mean 'thruster'?"]),
+        ("basis", 2, ["'triangle'", "Did you mean 'triangular'?"]),
+        ("order", 2, ["--nb two", "whole number"]),
+        ("missing order", 2, ["needs nb, basis"]),
+        ("refused solver", 2, ["osqp", "not convex", "gauss_newton"]),
+        ("truncated model", 2, ["model.json", "truncated"]),
+        ("no folder", 2, ["nowhere"]),
+        ("contradiction", 3, ["contradict"]),
+        ("not installed", 4, ["pip install"]),
+        ("pair", 2, ["--set weight", "key=value"]),
+    ],
+)
+def test_bad_input_ends_with_one_message_and_its_code(kind, code, words, tmp_path):
+    result = run(*bad(tmp_path, kind))
+    assert result.exit_code == code, result.output
+    message = next(line for line in result.output.splitlines() if line.startswith("error: "))
+    assert all(word in message for word in words), message
+    assert "Traceback" not in result.output
+
+
+def test_an_unknown_option_is_refused_with_code_2(csv):
+    result = run("fit", csv, "--bases", "triangular:4")
+    assert result.exit_code == 2 and "--basis" in result.output
+
+
+def test_a_weakness_of_the_record_is_a_note_and_not_an_error(tmp_path):
+    rng = np.random.default_rng(0)
+    u = rng.choice(np.linspace(-1, 1, 7), 300)
+    result = run("fit", table(tmp_path / "few.csv", u=u, y=u**3 + 0.1 * rng.standard_normal(300)), *ORDERS)
+    assert result.exit_code == 0 and "Note: too few levels" in result.output
+
+
+def test_debug_shows_where_it_happened(tmp_path):
+    result = run("fit", tmp_path / "nothing.csv", *ORDERS, "--debug")
+    assert result.exit_code == 1 and isinstance(result.exception, optid.errors.DataError)
+
+
+# -- as a program ------------------------------------------------------------------------------------------------------
+
+
+def program(*words: object) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "optid", *map(str, words)], capture_output=True, text=True, timeout=120
+    )
+
+
+def test_the_module_runs_and_says_its_version():
+    result = program("--version")
+    assert (result.returncode, result.stdout.strip()) == (0, f"optid {optid.__version__}")
+
+
+def test_help_needs_nothing_heavy():
+    code = (
+        "import sys; from typer.testing import CliRunner; from optid.cli import app;"
+        "assert CliRunner().invoke(app, ['fit', '--help']).exit_code == 0;"
+        "print([m for m in ('numpy', 'scipy', 'cvxpy', 'casadi', 'numba', 'matplotlib', 'pandas') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_an_error_goes_to_the_error_stream(tmp_path):
+    result = program("fit", tmp_path / "nothing.csv", *ORDERS)
+    assert result.returncode == 2 and result.stdout == ""
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+
+
+def test_a_fit_without_a_report_needs_no_figures(csv, tmp_path):
+    code = (
+        "import sys; from typer.testing import CliRunner; from optid.cli import app;"
+        f"r = CliRunner().invoke(app, ['fit', {str(csv)!r}, '--na', '1', '--nb', '1', '--basis', 'polynomial:3']);"
+        "assert r.exit_code == 0, r.output; print([m for m in ('matplotlib', 'pandas') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_the_first_command_of_the_readme(tmp_path):
+    result = program(
+        "fit", "--example", "thruster", "--report", tmp_path / "thruster.html", "--model", tmp_path / "m.json"
+    )
+    assert result.returncode == 0, result.stderr
+    assert "optimal (proved)" in result.stdout and result.stderr == ""
+    assert (tmp_path / "thruster.html").read_text(encoding="utf-8").endswith("</html>\n")
+    assert json.loads((tmp_path / "m.json").read_text())["format"] == "optid model"
