@@ -73,7 +73,8 @@ def measure_violation(program: Program) -> tuple[float, str]:
     for key, group in program.constraints.items():
         for member in group:
             size = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
-            amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / size
+            with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
+                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / size
             if not amount <= worst:  # also true for nan
                 worst, name = amount, key
     for key, variable in program.variables.items():
@@ -121,7 +122,7 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
         length = float(np.linalg.norm(rest))
         if length > level:  # projection on the second-order cone
             factor = max(0.0, (level + length) / 2)
-            level, rest = factor, factor * rest / length
+            level, rest = factor, factor * rest / max(length, np.finfo(float).tiny)
         return [(member.args[0], -np.array([level])), (member.args[1], -rest)]
     return None
 

@@ -100,7 +100,8 @@ def translated(expression: cp.Expression):
     parts = casadi_backend.translate(form)
     function = ca.Function("f", [parts["x"], parts["p"]], [parts["f"], parts["g"]])
     value, rows = function(form.start(), form.parameter_values())
-    return float(value), float(np.ravel(weights, order="F") @ np.ravel(expression.value, order="F")), np.asarray(rows).ravel()
+    known = float(np.ravel(weights, order="F") @ np.ravel(expression.value, order="F"))
+    return float(value), known, np.asarray(rows).ravel()
 
 
 rng = np.random.default_rng(0)
@@ -188,7 +189,8 @@ def test_symmetric_and_bounded_variables_go_there_and_back(name):
     x = cp.Variable((2, 2), name="x", symmetric=True)
     y = cp.Variable(2, name="y", bounds=[0.0, 0.25])
     program = pose("attributes", cp.sum_squares(x - a) + cp.sum_squares(y - np.array([1.0, 0.1]))
-                   + 0 * x[0, 0] * y[0] ** 3, {"corner": x[0, 1] + x[1, 0] == 1}, [x, y], start={"x": np.eye(2), "y": np.zeros(2)})
+                   + 0 * x[0, 0] * y[0] ** 3, {"corner": x[0, 1] + x[1, 0] == 1}, [x, y],
+                   start={"x": np.eye(2), "y": np.zeros(2)})
     found = solve(program, name)
     assert found.status in SUCCESS
     assert found.values["x"] == pytest.approx(np.array([[2.0, 0.5], [0.5, 3.0]]), abs=1e-6)

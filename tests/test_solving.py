@@ -1,0 +1,289 @@
+"""solve: look-up, refusal, misbehaving back ends, time limits, re-solving without compiling again."""
+
+import time
+from dataclasses import replace
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
+
+from optid import backends
+from optid.backends import Answer, BackEnd, Settings, back_ends
+from optid.errors import LookupFailed, SolverMissing, StructureError
+from optid.solution import Bound, Status
+from optid.solving import run, solve
+
+
+def projection():
+    """min ‖x - (2, 2)‖² on x1 + x2 <= 2: x = (1, 1), value 2, multiplier 2."""
+    x = cp.Variable(2, name="x")
+    return pose("projection", cp.sum_squares(x - 2), {"budget": cp.sum(x) <= 2}, [x], start={"x": np.zeros(2)})
+
+
+# what a claim is worth
+
+def test_success_at_an_infeasible_point_is_refused():
+    found = solve(projection(), claiming({"x": [2.0, 2.0]}, duals={"budget": np.array([0.0])}))
+    assert found.status is Status.FAILED and found.claimed == "optimal"
+    assert "budget" in found.reason and "claims success" in found.reason
+    assert found.residuals.worst == "budget" and found.objective == 0.0
+
+
+def test_success_slightly_outside_is_inaccurate():
+    found = solve(projection(), claiming({"x": [1.0 + 1e-5] * 2}, duals={"budget": np.array([2.0])}))
+    assert found.status is Status.INACCURATE and "budget" in found.reason
+
+
+def test_success_at_a_point_that_is_not_stationary_is_inaccurate():
+    found = solve(projection(), claiming({"x": [0.5, 0.5]}, duals={"budget": np.array([0.0])}))
+    assert found.status is Status.INACCURATE and "not stationary" in found.reason
+    assert not found.proof
+
+
+def test_multiplier_of_the_wrong_sign_does_not_make_a_point_stationary():
+    # the minimum is inside; at (1, 1) on the border the dual -2 would balance a gradient that points inwards
+    x = cp.Variable(2, name="x")
+    program = pose("side", cp.sum_squares(x - 2), {"floor": cp.sum(x) >= 2}, [x])
+    found = solve(program, claiming({"x": [1.0, 1.0]}, duals={"floor": np.array([-2.0])}))
+    assert found.status is Status.INACCURATE and found.residuals.stationarity > 0.1
+
+
+@pytest.mark.parametrize(("constraint", "dual"), [
+    (lambda x: cp.diag(x) >> 0, np.array([-2.0, 0, 0, 0])),
+    (lambda x: cp.SOC(x[0], x[1:]), np.array([-2.0, 0.0])),
+])
+def test_multipliers_outside_their_cone_count_as_missing(constraint, dual):
+    x = cp.Variable(2, name="x")
+    program = pose("cone", cp.sum_squares(x - np.array([2.0, 0.0])), {"cone": constraint(x)}, [x])
+    found = solve(program, claiming({"x": [1.0, 0.0]}, duals={"cone": dual}))
+    assert found.status is Status.INACCURATE
+
+
+def test_right_point_without_multipliers_is_locally_optimal_without_proof():
+    found = solve(projection(), claiming({"x": [1.0, 1.0]}))
+    assert found.status is Status.LOCAL and not found.proof and np.isnan(found.residuals.stationarity)
+
+
+def test_right_point_with_multipliers_is_proved():
+    found = solve(projection(), claiming({"x": [1.0, 1.0]}, duals={"budget": np.array([2.0])}))
+    assert found.status is Status.OPTIMAL and found.proof and found.objective == pytest.approx(2.0)
+
+
+def test_inaccurate_claim_is_raised_when_our_residuals_are_clean():
+    answer = claiming({"x": [1.0, 1.0]}, Status.INACCURATE, {"budget": np.array([2.0])}, "almost")
+    assert solve(projection(), answer).status is Status.OPTIMAL
+    unsure = claiming({"x": [1.0, 1.0]}, Status.INACCURATE, word="almost")
+    assert solve(projection(), unsure).status is Status.INACCURATE
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_a_failure(bad):
+    found = solve(projection(), claiming({"x": [bad, 1.0]}))
+    assert found.status is Status.FAILED and "non-finite" in found.reason and not found.has_point
+
+
+def test_success_without_a_point_or_with_half_of_one_is_a_failure():
+    assert "no point" in solve(projection(), claiming({})).reason
+    x, y = cp.Variable(name="x"), cp.Variable(name="y")
+    program = pose("two", cp.square(x) + cp.square(y), {"sum": x + y == 1}, [x, y])
+    found = solve(program, claiming({"x": 0.5}))
+    assert found.status is Status.FAILED and "y" in found.reason
+
+
+def test_infeasible_is_not_believed_when_the_start_is_feasible():
+    found = solve(projection(), claiming({}, Status.INFEASIBLE, word="infeasible"))
+    assert found.status is Status.FAILED and "start" in found.reason
+    found = solve(projection(), claiming({"x": [0.0, 0.0]}, Status.INFEASIBLE, word="infeasible"))
+    assert found.status is Status.FAILED and "satisfies every constraint" in found.reason
+
+
+def test_why_it_stopped_survives_a_bad_point():
+    found = solve(projection(), claiming({"x": [2.0, 2.0]}, Status.LIMIT, word="iteration limit"))
+    assert found.status is Status.LIMIT and "iteration limit" in found.reason and "budget" in found.reason
+
+
+def test_bounds_of_the_variables_themselves_are_judged():
+    x = cp.Variable(2, name="x", nonneg=True)
+    program = pose("bounded", cp.sum(x), {"sum": x[0] - x[1] == 0}, [x])
+    found = solve(program, claiming({"x": [-0.5, -0.5]}, duals={"sum": np.array([0.0])}))
+    assert found.status is Status.FAILED and found.residuals.worst == "x"
+    found = solve(program, claiming({"x": [0.0, 0.0]}, duals={"sum": np.array([0.0])}))
+    assert found.status is Status.OPTIMAL
+    found = solve(program, claiming({"x": [0.5, 0.5]}, duals={"sum": np.array([0.0])}))
+    assert found.status is Status.INACCURATE
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_the_verdict_does_not_depend_on_units(unit):
+    def pose_in(unit):
+        x = cp.Variable(2, name="x")
+        return pose("units", cp.sum_squares(x - 2 * unit), {"budget": cp.sum(x) <= 2 * unit}, [x], scale=8 * unit**2)
+
+    right = claiming({"x": np.ones(2) * unit}, duals={"budget": np.array([2.0 * unit])})
+    wrong = claiming({"x": 0.9 * np.ones(2) * unit}, duals={"budget": np.array([0.0])})
+    assert solve(pose_in(unit), right).status is Status.OPTIMAL
+    assert solve(pose_in(unit), wrong).status is Status.INACCURATE
+
+
+def test_certificate_judges_where_the_objective_has_kinks():
+    x = cp.Variable(name="x")
+
+    def certify(program, values, duals):
+        gap = abs(float(values["x"]))
+        return Bound(0.0, gap < 1e-9, "by hand", f"off by {gap:.0e}"), None
+
+    program = pose("kink", cp.abs(x), {}, [x], certify=certify)
+    assert solve(program, claiming({"x": 0.0})).status is Status.OPTIMAL
+    refuted = solve(program, claiming({"x": 1e-3}))
+    assert refuted.status is Status.INACCURATE and "off by" in refuted.reason
+
+
+def test_better_start_of_a_certificate_is_tried_and_kept_only_when_better():
+    x = cp.Variable(name="x")
+    value = cp.square(cp.square(x) - 1) + 0.2 * x  # minima near -1 (global) and near 1
+
+    def certify(program, values, duals):
+        return Bound(-1.0, False, "by hand"), {"x": np.array(-0.9)}
+
+    program = pose("two valleys", value, {"box": cp.square(x) <= 9}, [x], start={"x": np.array(0.9)}, certify=certify)
+    assert solve(program, "ipopt", prove=False).values["x"] > 0.5
+    assert solve(program, "ipopt").values["x"] < -0.5
+
+
+# crashes and time
+
+def test_exception_inside_a_solver_is_an_outcome():
+    found = solve(projection(), RAISING)
+    assert found.status is Status.FAILED and "ZeroDivisionError" in found.reason
+
+
+def test_abort_inside_a_solver_is_an_outcome():
+    found = solve(projection(), ABORTING, isolate=True)
+    assert found.status is Status.FAILED and "SIGABRT" in found.reason
+
+
+def test_time_limit_is_kept_for_a_solver_that_does_not():
+    clock = time.monotonic()
+    found = solve(projection(), HANGING, time_limit=0.2)
+    assert found.status is Status.LIMIT and time.monotonic() - clock < 3.0
+
+
+@pytest.mark.parametrize("name", ["clarabel", "ipopt", "uno", "highs"])
+def test_answer_in_a_process_of_its_own_is_the_same(name):
+    here, there = solve(case("qp_box").build(), name), solve(case("qp_box").build(), name, time_limit=30.0)
+    assert there.status is here.status is Status.OPTIMAL
+    assert there.values["x"] == pytest.approx(here.values["x"], abs=1e-9)
+    assert set(there.duals) == {"upper", "lower"}
+
+
+# look-up and refusal
+
+def test_unknown_solver_names_the_nearest():
+    with pytest.raises(LookupFailed, match="clarabel"):
+        solve(projection(), "clarabell")
+
+
+def test_name_is_accepted_in_any_case():
+    assert solve(projection(), "CLARABEL").solver == "clarabel"
+
+
+def test_missing_solver_comes_with_the_pip_line(monkeypatch):
+    known = {**back_ends(), "absent": BackEnd("absent", EVERYTHING, RAISING.run, False, "absent-solver"),
+             "vendor": BackEnd("vendor", EVERYTHING, RAISING.run, False)}
+    monkeypatch.setattr(backends, "back_ends", lambda: known)
+    with pytest.raises(SolverMissing, match="pip install absent-solver"):
+        solve(projection(), "absent")
+    with pytest.raises(SolverMissing, match="vendor's package"):
+        solve(projection(), "vendor")
+
+
+def test_convex_solver_refuses_a_nonconvex_programme_by_the_name_of_its_part():
+    with pytest.raises(StructureError, match="constraint 'product'"):
+        solve(case("nlp_hyperbola").build(), "clarabel")
+    with pytest.raises(StructureError, match="class SDP"):
+        solve(case("sdp_largest_eigenvalue").build(), "osqp")
+
+
+def test_auto_says_what_it_chose():
+    for name, solver in {"qp_box": "clarabel", "nlp_hs071": "uno", "rank_one_fit": "gauss_newton"}.items():
+        found = solve(case(name).build())
+        assert found.solver == solver and solver in found.chosen
+
+
+def test_plain_function_is_a_solver_too():
+    def by_hand(program, settings: Settings) -> Answer:
+        assert settings.accuracy == 1e-6 and settings.options == {"depth": 3}
+        return Answer(Status.LOCAL, "done", {"x": np.ones(2)}, {"budget": np.array([2.0])})
+
+    found = solve(projection(), by_hand, accuracy=1e-6, depth=3)
+    assert found.status is Status.OPTIMAL and found.solver == "by_hand"
+
+
+def test_old_multipliers_do_not_survive():
+    program = projection()
+    assert "budget" in solve(program, "clarabel").duals
+    found = solve(program, claiming({"x": [1.0, 1.0]}))
+    assert found.duals == {} and program.duals() == {}
+
+
+# paths and procedures
+
+def path():
+    x, level = cp.Variable(2, name="x"), cp.Parameter(name="level", value=2.0)
+    return pose("path", cp.sum_squares(x - 2) + 0 * x[0], {"budget": cp.sum(x) <= level}, [x],
+                parameters={"level": level}), level
+
+
+@pytest.mark.parametrize("name", ["clarabel", "osqp", "highs"])
+def test_convex_path_is_compiled_once(name):
+    program, level = path()
+    forms = []
+    for value in (2.0, 1.0, 0.0):
+        level.value = value
+        found = solve(program, name)
+        assert found.values["x"] == pytest.approx([value / 2] * 2, abs=1e-6)
+        assert found.duals["budget"] == pytest.approx([4 - value], abs=1e-5)
+        forms.append(program.problem._cache.param_prog)
+    assert forms[0] is not None and forms[0] is forms[1] is forms[2]
+
+
+@pytest.mark.parametrize("name", ["ipopt", "fatrop", "uno"])
+def test_nonconvex_path_is_compiled_once(name, monkeypatch):
+    from optid.backends import casadi, dnlp
+
+    made = []
+    for module, function in ((casadi, "translate"), (dnlp, "_apply")):
+        original = getattr(module, function)
+        monkeypatch.setattr(module, function, lambda *a, original=original, function=function: (
+            made.append(function), original(*a))[1])
+    engine = dnlp.Derivatives
+    monkeypatch.setattr(dnlp, "Derivatives", lambda form: (made.append("engine"), engine(form))[1])
+    x, level = cp.Variable(2, name="x"), cp.Parameter(name="level", value=1.0, pos=True)
+    program = pose("path", cp.sum(x), {"product": x[0] * x[1] >= level, "sign": x >= 0}, [x], start={"x": np.array([3.0, 1.0])},
+                   parameters={"level": level})
+    for value in (1.0, 4.0, 9.0):
+        level.value = value
+        found = solve(program, name)
+        assert found.objective == pytest.approx(2 * np.sqrt(value), rel=1e-6)
+        assert found.duals["product"] == pytest.approx([1 / np.sqrt(value)], rel=1e-5)
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize("name", ["ipopt", "uno"])
+def test_warm_start_begins_at_the_start_of_the_programme(name):
+    program = case("nlp_rosenbrock").build()
+    cold = solve(program, name)
+    warm = solve(replace(program, start=cold.values), name)
+    assert warm.status is Status.LOCAL and warm.iterations <= cold.iterations / 2
+
+
+def test_procedure_gets_its_solutions_and_returns_its_model():
+    def procedure():
+        first = yield projection()
+        second = yield case("qp_equality").build()
+        return first.objective + second.objective
+
+    outcome = run(procedure(), "clarabel")
+    assert outcome.model == pytest.approx(2.0 + 1 / 9, rel=1e-6)
+    assert [name for name, _ in outcome.steps] == ["projection", "qp_equality"]
