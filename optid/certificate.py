@@ -18,7 +18,16 @@ from optid.certificate_sdp import relax, relaxation_size
 from optid.errors import StructureError
 from optid.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
 from optid.rank_one import Array, Core, Point, RankOne, matrices, reduce
-from optid.shape_duals import ACTIVE, Linear, Multipliers, align_cuts, as_cones, as_linear, kkt_multipliers, sign_free_cut
+from optid.shape_duals import (
+    ACTIVE,
+    Linear,
+    Multipliers,
+    align_cuts,
+    as_cones,
+    as_linear,
+    kkt_multipliers,
+    sign_free_cut,
+)
 from optid.solution import Bound
 
 TOLERANCE = 1e-8
