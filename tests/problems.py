@@ -1,0 +1,74 @@
+"""Records, raw-sample routes and searches that the tests of the formulations share."""
+
+import cvxpy as cp
+import numpy as np
+from scipy.optimize import minimize_scalar
+from systems import by_hand
+
+import optid
+from optid.bases import Triangular
+from optid.models import HammersteinARX, Nonlinearity
+
+BASIS = Triangular(6).fitted(-1.0, 1.0)
+NODES = np.linspace(-1, 1, 7)
+
+
+def plant(gain=1.0, a=(-1.2, 0.5), b=(1.0, 0.6), f=lambda u: np.tanh(2 * u), offset=0.3):
+    """A SISO plant whose nonlinearity is in the basis (up to a constant)."""
+    values = f(NODES) - f(0.0)
+    return HammersteinARX(list(a), (gain * np.array(b),), (Nonlinearity(BASIS, np.delete(values, 3)),), (0,), offset)
+
+
+def record(gain=1.0, count=150, noise=0.4, seed=0, model=None):
+    model = plant(gain) if model is None else model
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1, 1, (count, model.m))
+    return optid.Data(u=u, y=by_hand(model, u, noise=noise * rng.standard_normal((count, model.l))))
+
+
+def dense(data, na, nb, nk, bases):
+    """Form regressor and outputs sample by sample; rows with anything missing are left out."""
+    rows, targets = [], []
+    for e in data.experiments:
+        etas = [basis.values(np.nan_to_num(e.u[:, c])) for c, basis in enumerate(bases)]
+        etas = [np.where(np.isnan(e.u[:, c])[:, None], np.nan, eta) for c, eta in enumerate(etas)]
+        for k in range(max([na, *(d + q - 1 for d, q in zip(nk, nb))]), len(e.u)):
+            row = [-e.y[k - i] for i in range(1, na + 1)]
+            row += [eta[k - d - j] for eta, d, q in zip(etas, nk, nb) for j in range(q)]
+            row = np.concatenate([*row, [1.0]])
+            if not (np.isnan(row).any() or np.isnan(e.y[k]).any()):
+                rows.append(row)
+                targets.append(e.y[k])
+    return np.array(rows), np.array(targets)
+
+
+def raw_problem(phi, y, na, shapes, loss, weight=0.0, constrain=lambda a, thetas, d: []):
+    """Solve a one-output problem in (a, Theta, d) on the raw samples with CVXPY; returns the optimal value and Thetas."""
+    a, d = cp.Variable(na), cp.Variable()
+    thetas = [cp.Variable(shape) for shape in shapes]
+    z = cp.hstack([a, *(cp.vec(t, order="F") for t in thetas), d])
+    penalty = 2 * weight * sum(cp.normNuc(t) for t in thetas) if weight else 0.0
+    problem = cp.Problem(cp.Minimize(loss(y[:, 0] - phi @ z) + penalty), constrain(a, thetas, d))
+    problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+    return float(problem.value), [t.value for t in thetas]
+
+
+def search(program, points=72):
+    """Global minimum of a programme with one input and n_b = 2: for a fixed direction b a convex problem is left."""
+    frozen = program.freeze(b=np.array([1.0, 0.0]))
+    problem, b = frozen.problem, frozen.parameters["b"]
+
+    def value(angle):
+        b.value = np.array([np.cos(angle), np.sin(angle)])
+        problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+        return float(problem.value) if problem.status == cp.OPTIMAL else np.inf
+
+    angles = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    values = np.array([value(angle) for angle in angles])
+    step, best = angles[1], float(np.min(values))
+    for i in np.argsort(values)[:2]:
+        if np.isfinite(values[i]):
+            found = minimize_scalar(value, bounds=(angles[i] - step, angles[i] + step), method="bounded",
+                                    options={"xatol": 1e-6})
+            best = min(best, float(found.fun))
+    return best
