@@ -339,7 +339,7 @@ def relaxed(case: Case, found: Certification, steps: int) -> Certification:
     if risen is not None:
         bound = conclude(case, method, f"relaxation aligned with the point, {taken} projections", risen, cuts)
         if bound.bound.value > found.bound.value:
-            return replace(bound, better=better)
+            return replace(bound, better=() if bound.bound.proved else better)
     return found
 
 
@@ -378,4 +378,5 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     else:
         reason = f"not proved, no finite bound: {how}"
     evidence = Evidence(case.core, minors, cuts, case.multipliers.linear if linear is None else linear)
-    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap, better)
+    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
+                         () if proved else better)
