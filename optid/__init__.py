@@ -36,6 +36,7 @@ _HOME = {
     "validate": "validation",
     "load": "io",
     "RecursiveARX": "recursion",
+    "bootstrap": "resampling",
 }
 _MODULES = {"signals", "bases", "plots", "report", "errors", "examples"}
 

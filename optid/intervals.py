@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from optid.basis import Array
 from optid.errors import StructureError
@@ -85,7 +85,7 @@ class LocalEstimate:
         """
         if not self.held:
             error = np.linalg.norm(slopes @ self.scatter, axis=1)
-            half = float(student.ppf(0.5 + level / 2, self.dof)) * error
+            half = float(stdtrit(self.dof, 0.5 + level / 2)) * error
             return error, -half, half
         posterior, scattered = (points @ slopes.T for points in self.samples)
         tails = [0.5 - level / 2, 0.5 + level / 2]

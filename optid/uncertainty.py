@@ -3,8 +3,8 @@
 Every quantity, a coefficient or a whole curve, is a function of the model. Its derivative is taken through the model
 itself (unit changes, gauge and rank-one split included), and its error follows from the estimate in the tangent space
 of the rank-one manifold. With inequality constraints in reach the interval is the one of `optid.intervals`, which keeps
-its coverage where treating active constraints as equalities loses it. `optid.bootstrap` offers the same quantities from
-refits.
+its coverage where treating active constraints as equalities loses it. `optid.resampling` offers the same quantities
+from refits.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ class Uncertainty:
     Attributes:
         fit: the fit.
         level: probability that an interval contains the truth.
-        source: where they come from; `Linearised` or `optid.bootstrap.Refits`.
+        source: where they come from; `Linearised` or `optid.resampling.Refits`.
     """
 
     fit: "Fit" = field(repr=False)
@@ -83,6 +83,14 @@ class Uncertainty:
     def meaning(self) -> str:
         """What the intervals are, in words."""
         return self.source.meaning
+
+    def at_level(self, level: float) -> "Uncertainty":
+        """Return the same with another probability inside.
+
+        Raises:
+            StructureError: not a probability between 0 and 1.
+        """
+        return replace(self, level=_checked_level(level))
 
     # -- coefficients --------------------------------------------------------------------------------------------
 
@@ -268,9 +276,7 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    if not 0 < level < 1:
-        raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")
-    return Uncertainty(fit, float(level), Linearised(fit, linearise(fit, draws, seed)))
+    return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
 
 
 def aligned(model: "HammersteinARX", reference: "HammersteinARX") -> "HammersteinARX":
@@ -286,3 +292,9 @@ def _row(interval: Interval, i: int) -> tuple[float, float, float, float]:
     value, error, lower, upper = (float(np.ravel(part)[i]) for part in
                                   (interval.value, interval.error, interval.lower, interval.upper))
     return value, error, lower, upper
+
+
+def _checked_level(level: float) -> float:
+    if not 0 < level < 1:
+        raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")
+    return float(level)

@@ -12,7 +12,6 @@ from scipy.stats import t as student
 
 import optid
 from formulations import shape
-from optid.bootstrap import bootstrap
 from optid.errors import RankError, StructureError
 from optid.intervals import LocalEstimate, project
 from optid.uncertainty import aligned, uncertainty
@@ -97,6 +96,8 @@ def test_errors_equal_the_fisher_matrix_of_another_parametrisation(plain):
     half = student.ppf(0.975, len(y) - other.size) * expected[:2]
     np.testing.assert_allclose(u.a.upper - m.a, half, rtol=1e-5)
     np.testing.assert_allclose(m.a - u.a.lower, half, rtol=1e-5)
+    wider = u.at_level(0.99).a.upper - m.a
+    np.testing.assert_allclose(wider, half * student.ppf(0.995, len(y) - 8) / student.ppf(0.975, len(y) - 8), rtol=1e-6)
 
 
 def test_the_gauge_does_not_touch_what_is_free_of_it(plain):
@@ -315,7 +316,7 @@ def test_static_gain_fixed_in_the_exact_programme():
 
 
 def test_bootstrap_agrees_with_the_linearisation(plain):
-    refits = bootstrap(plain, 100)
+    refits = optid.bootstrap(plain, 100)
     assert refits.failed == 0 and len(refits.models) == 100
     for kind in (refits.percentile, refits.basic):
         np.testing.assert_allclose(kind.a.error, plain.uncertainty.a.error, rtol=0.3)
@@ -323,7 +324,7 @@ def test_bootstrap_agrees_with_the_linearisation(plain):
     low, high, value = refits.percentile.a.lower, refits.percentile.a.upper, plain.model.a
     np.testing.assert_allclose(refits.basic.a.lower, 2 * value - high)
     np.testing.assert_allclose(refits.basic.a.upper, 2 * value - low)
-    assert bootstrap(plain, 40, seed=3).models[7].a[0] == bootstrap(plain, 40, seed=3).models[7].a[0]
+    assert optid.bootstrap(plain, 40, seed=3).models[7].a[0] == optid.bootstrap(plain, 40, seed=3).models[7].a[0]
 
 
 def test_bootstrap_keeps_holes_constraints_and_several_outputs():
@@ -331,18 +332,18 @@ def test_bootstrap_keeps_holes_constraints_and_several_outputs():
     u, y = data.u.copy(), data.y.copy()
     u[50:53], y[120, 1], y[0, 0] = np.nan, np.nan, np.nan
     fit = optid.fit(optid.Data(u=u, y=y), "arx", na=1, nb=2, constraints=[lambda v: {"cap": v["a"][0, 0] >= -0.55}])
-    refits = bootstrap(fit, 40)
+    refits = optid.bootstrap(fit, 40)
     assert min(model.a[0, 0, 0] for model in refits.models) > -0.55 - 1e-6
     assert refits.basic.a.value.shape == (1, 2, 2)
     linear = optid.fit(optid.Data(u=u, y=y), "arx", na=1, nb=2)
-    np.testing.assert_allclose(bootstrap(linear, 60).basic.b[0].error, linear.uncertainty.b[0].error, rtol=0.4)
+    np.testing.assert_allclose(optid.bootstrap(linear, 60).basic.b[0].error, linear.uncertainty.b[0].error, rtol=0.4)
 
 
 def test_bootstrap_serves_robust_losses():
     fit = optid.fit(simulated(150), "arx", na=2, nb=2, loss="huber")
     with pytest.raises(StructureError, match="huber.*bootstrap"):
         _ = fit.uncertainty
-    assert np.all(bootstrap(fit, 40).percentile.a.error > 0)
+    assert np.all(optid.bootstrap(fit, 40).percentile.a.error > 0)
 
 
 # -- refusals --------------------------------------------------------------------------------------------------------
@@ -356,7 +357,7 @@ def test_refusals_name_the_reason_and_the_remedy(plain):
     with pytest.raises(StructureError, match="nuclear norm shrinks"):
         _ = shrunk.uncertainty
     with pytest.raises(StructureError, match="runs=3"):
-        bootstrap(plain, 3)
+        optid.bootstrap(plain, 3)
     with pytest.raises(StructureError, match="complex"):
         plain.uncertainty.of(lambda m: m.poles)
 
