@@ -90,8 +90,8 @@ def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
 
 
 def value_error(case: Case, solution: Solution) -> float:
-    """Return the error of the objective relative to its size (or to the programme's scale where it vanishes)."""
-    return abs(solution.objective - case.value) / max(abs(case.value), solution.scale)
+    """Return the error of the objective relative to its size (a vanishing one: to a millionth of its scale)."""
+    return abs(solution.objective - case.value) / max(abs(case.value), 1e-6 * solution.scale)
 
 
 def _complaints(back_end: BackEnd, case: Case, program: Program, solution: Solution):
