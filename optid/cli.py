@@ -282,8 +282,9 @@ def fit(
             waiting.step("writing the report")
             write(found, report, held_out, command=shlex.join(["optid", *sys.argv[1:]]))
     say(coloured(text))
+    said = " ".join(text.split())
     for sentence in heard:
-        if sentence not in found.findings:
+        if " ".join(sentence.split()) not in said:
             note(sentence)
     for path, what in ((model, "model"), (report, "report")):
         if path is not None:
@@ -331,7 +332,8 @@ def validate(
         text = describe_validation(loaded, record)
     say(f"{loaded}\n\n{text}")
     for sentence in heard:
-        note(sentence)
+        if sentence not in text:
+            note(sentence)
 
 
 @app.command(cls=Command)

@@ -1,5 +1,7 @@
 """The printed result of a fit: 80 columns of plain text that can be pasted into a paper."""
 
+from itertools import zip_longest
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from optid import estimates, summary
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
     from optid.fitting import Fit
     from optid.models import HammersteinARX
 
-WIDTH = 80
+WIDTH, LEFT = 80, 36
 
 
 def describe(fit: "Fit") -> str:
@@ -76,8 +78,6 @@ def _rule(sign: str) -> str:
 
 
 def _wrapped(text: str, indent: str = "  ") -> list[str]:
-    from textwrap import wrap
-
     return wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
 
 
@@ -106,15 +106,14 @@ def _facts(facts: Facts) -> list[str]:
 
 def _columns(left: Facts, right: Facts) -> list[str]:
     """Set two lists of facts side by side; what is too wide for its half gets a line of its own below."""
-    half = (WIDTH - 2) // 2
-    fits = [
-        [f"{name:<12} {value}" for name, value in facts if len(f"{name:<12} {value}") <= half]
-        for facts in (left, right)
-    ]
-    wide = [fact for facts in (left, right) for fact in facts if len(f"{fact[0]:<12} {fact[1]}") > half]
-    count = max(map(len, fits))
-    fits = [column + [""] * (count - len(column)) for column in fits]
-    return [f"{a:<{half}}  {b}".rstrip() for a, b in zip(*fits)] + _facts(wide)
+    widths = (LEFT, WIDTH - 2 - LEFT)
+    fits: list[list[str]] = []
+    wide: Facts = []
+    for facts, width in zip((left, right), widths):
+        lines = [(f"{name:<12} {value}", (name, value)) for name, value in facts]
+        fits.append([line for line, _ in lines if len(line) <= width])
+        wide += [fact for line, fact in lines if len(line) > width]
+    return [f"{a:<{LEFT}}  {b}".rstrip() for a, b in zip_longest(*fits, fillvalue="")] + _facts(wide)
 
 
 def _table(table: Table) -> list[str]:

@@ -1,6 +1,7 @@
 """The report: one HTML page that carries its figures and its style with it."""
 
 import platform
+import re
 import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -72,7 +73,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "sentence": sentence,
         "findings": fit.findings,
         "cards": _cards(fit, test),
-        "equation": fit.model.equation().splitlines(),
+        "equation": [_breakable(line) for line in fit.model.equation().splitlines()],
         "model_notes": [f"{name}: {value}" for name, value in summary.model_facts(fit)],
         "model_tables": tables,
         "coefficients": estimates.coefficient_table(fit),
@@ -117,6 +118,11 @@ def _checked(fit: "Fit", record: Data) -> Validation:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # they stand in the notes
         return validate(fit.model, record)
+
+
+def _breakable(equation: str) -> str:
+    """Leave line breaks to the places before a sign."""
+    return re.sub(r" (?![+-] )", "\N{NO-BREAK SPACE}", equation)
 
 
 def _length(fit: "Fit") -> str:

@@ -69,26 +69,30 @@ def spread(args: Sequence[str], several: dict[str, bool]) -> list[str]:
     Args:
         args: words of the command line.
         several: options that take several values, and whether the values are files.
+
+    Raises:
+        typer.BadParameter: an option without a value.
     """
     result: list[str] = []
-    option, count = "", 0
-    for position, word in enumerate(args):
-        if word == "--":
-            return result + [option] * (bool(option) and not count) + list(args[position:])
+    option, waiting = "", False
+    for position, word in enumerate([*args, "--"]):
         if word.startswith("-") and len(word) > 1 and not _NUMBER.fullmatch(word):
-            if option and not count:
-                result.append(option)
+            if waiting:
+                raise typer.BadParameter(f"{option} needs a value")
+            if word == "--":
+                return result + list(args[position:])
             name, equals, _ = word.partition("=")
-            option, count = (name if name in several else ""), int(bool(equals))
-            if equals or not option:
+            option = name if name in several else ""
+            waiting = bool(option) and not equals
+            if not waiting:
                 result.append(word)
-        elif option and (several[option] or not _FILE.fullmatch(word)):
+        elif option and (several[option] or waiting or not _FILE.fullmatch(word)):
             result += [option, word]
-            count += 1
+            waiting = False
         else:
             result.append(word)
             option = ""
-    return result + [option] * (bool(option) and not count)
+    return result
 
 
 def exit_code(error: BaseException) -> int:

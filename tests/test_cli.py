@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -70,12 +71,16 @@ def test_spreading_repeats_the_option_before_each_value(options, before):
         ("--in=a b", "--in=a --in b"),
         ("--in a -- b", "--in a -- b"),
         ("--in -1.5 -2", "--in -1.5 --in -2"),
-        ("--in", "--in"),
-        ("--in --out a", "--in --out a"),
     ],
 )
 def test_spreading_stops_where_the_list_ends(words, expected):
     assert spread(words.split(), {"--in": False, "--out": False, "--files": True}) == expected.split()
+
+
+@pytest.mark.parametrize("words", ["--in", "--in --out a", "--in --", "--in --dt 1"])
+def test_an_option_without_a_value_is_refused(words):
+    with pytest.raises(typer.BadParameter, match="--in needs a value"):
+        spread(words.split(), {"--in": False, "--out": False})
 
 
 def test_several_values_by_spaces_commas_and_repetition_are_the_same(csv, tmp_path):
