@@ -101,13 +101,16 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
     Least-distance programming by nonnegative least squares (Lawson and Hanson, Solving Least Squares Problems, 1974,
     chapter 23).
     """
+    size = max(float(np.max(np.linalg.norm(points, axis=1), initial=0.0)), np.finfo(float).tiny)
+    lengths = np.linalg.norm(rows, axis=1)
+    rows, slack = rows[lengths > 0] / lengths[lengths > 0, None], slack[lengths > 0] / lengths[lengths > 0]
     projected = points.copy()
-    need = -(points @ rows.T + slack)
+    need = -(points @ rows.T + slack) / size
     for k in np.flatnonzero(np.any(need > 0, axis=1)):
         system = np.vstack([rows.T, need[k]])
         target = np.zeros(len(system))
         target[-1] = 1.0
         multipliers, _ = nnls(system, target, maxiter=30 * rows.shape[0])
         residual = target - system @ multipliers
-        projected[k] -= residual[:-1] / residual[-1]
+        projected[k] -= size * residual[:-1] / residual[-1]
     return projected

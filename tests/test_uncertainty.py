@@ -251,12 +251,12 @@ def test_errors_describe_the_scatter():
 # -- inequalities ----------------------------------------------------------------------------------------------------
 
 
-@given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 8))
-def test_projection_is_the_nearest_feasible_point(seed, n, r):
+@given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 8), st.sampled_from([1e-9, 1.0, 1e9]))
+def test_projection_is_the_nearest_feasible_point(seed, n, r, unit):
     rng = np.random.default_rng(seed)
     rows, slack, points = rng.standard_normal((r, n)), rng.exponential(size=r), 3 * rng.standard_normal((4, n))
     slack[rng.random(r) < 0.5] = 0.0
-    found = project(points, rows, slack)
+    found = project(unit * points, 1e3 * rows, 1e3 * unit * slack) / unit
     assert np.min(found @ rows.T + slack) > -1e-9
     for candidate in [np.zeros(n), *(0.5 * project(5 * rng.standard_normal((3, n)), rows, slack))]:
         assert np.all(np.sum((points - found) * (candidate - found), axis=1) < 1e-8)
