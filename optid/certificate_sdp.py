@@ -7,6 +7,7 @@ is the Lagrangian dual written around a point z; its own dual is the moment rela
 where a better point may be. CVXPY poses it and Clarabel solves it; both are imported on first use.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -115,7 +116,9 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     lifted = cp.bmat([[corner, column.T], [column, objective.gram + cp.reshape(extra, (k, k), order="C")]]) >> 0
     problem = cp.Problem(cp.Maximize(level), [lifted, *constraints])
     try:
-        problem.solve(solver=cp.CLARABEL)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "may be inaccurate": whatever comes back is checked and repaired
+            problem.solve(solver=cp.CLARABEL)
     except cp.SolverError:
         return None
     if weights.value is None or lifted.dual_value is None:
