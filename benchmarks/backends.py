@@ -3,8 +3,9 @@
     python benchmarks/backends.py [--cases qp] [--solvers clarabel ipopt] [--repeat 3] [--isolate]
 
 Printed per run: what the solver claimed, what our residuals made of it, the objective relative to the best that any
-back end reached (and to the known value), the residuals and the time of compiling and solving (best of the repeats;
-with --isolate every run has a process of its own, whose start is in the time). At the end: the largest error behind an "optimal", and every disagreement with how it was caught.
+back end reached and to the known value, the residuals, and the time of compiling and solving (best of the repeats;
+with --isolate every run has a process of its own, whose start is in the time). At the end: the largest error behind
+an "optimal", and every disagreement with how it was caught.
 """
 
 import argparse

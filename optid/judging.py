@@ -64,6 +64,11 @@ def _flat(expression: cp.Expression) -> np.ndarray:
     return np.ravel(np.asarray(expression.value, dtype=float), order="F")
 
 
+def value_size(program: Program, objective: float) -> float:
+    """Yardstick of errors in the objective: its magnitude, or a hundredth of the zero model's where it vanishes."""
+    return max(abs(objective), 1e-2 * program.scale)
+
+
 def measure_violation(program: Program) -> tuple[float, str]:
     """Return the largest relative violation over all constraints at the assigned point, and its name.
 
@@ -201,7 +206,7 @@ def _first_order(program: Program, duals: Values, objective: float) -> tuple[flo
                     complementarity += abs(sum(map(np.sum, products))) if whole else float(np.sum(np.abs(products[0])))
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
         return unknown
-    return gradient.residual(yardstick), float(complementarity / yardstick)
+    return gradient.residual(yardstick), float(complementarity / value_size(program, objective))
 
 
 _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",

@@ -1,4 +1,4 @@
-"""What a solve returns: why it stopped, whether there is a point, whether it is proved, and what we measured ourselves."""
+"""What a solve returns: why it stopped, whether there is a point, whether it is proved, what we measured ourselves."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -55,7 +55,8 @@ class Residuals:
             the objective per size of the variable (so that units do not matter); multipliers of the wrong sign count
             as missing. ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound
             judges there).
-        complementarity: sum of the products of multiplier and slack, relative to the objective (or to its scale).
+        complementarity: sum of the products of multiplier and slack, relative to the objective (where it vanishes, to a
+            hundredth of its scale).
     """
 
     violation: float

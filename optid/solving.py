@@ -10,7 +10,7 @@ import numpy as np
 from optid.backends import Answer, BackEnd, Settings, choose, find
 from optid.errors import StructureError
 from optid.isolated import run_isolated
-from optid.judging import judge, measure_violation
+from optid.judging import judge, measure_violation, value_size
 from optid.program import Program, Values
 from optid.solution import Bound, Residuals, Solution, Status, Times, relative_gap
 
@@ -196,7 +196,7 @@ def _convex_proof(program: Program, point: _Judged) -> Bound | None:
     if not program.problem.is_dcp() or not np.isfinite(residuals.stationarity):
         return None
     error = max(residuals.violation, residuals.stationarity, residuals.complementarity)
-    return Bound(point.objective - residuals.complementarity * max(abs(point.objective), program.scale), error < 1e-6,
+    return Bound(point.objective - residuals.complementarity * value_size(program, point.objective), error < 1e-6,
                  "convex optimality conditions", f"convex programme; optimality conditions hold to {error:.0e}")
 
 
