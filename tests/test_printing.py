@@ -129,3 +129,40 @@ def test_validation_text_has_the_fit_that_the_formula_gives():
     fit = linear_fit()
     text = describe_validation(fit.model, fit.data)
     assert re.search(r"y +one step +100\.00", text)
+
+
+@pytest.mark.parametrize(
+    "basis",
+    ["triangular:25", "trigonometric:4", "polynomial:5", "bspline:6", "piecewiseconstant:8",
+     optid.UserFunctions((np.sin, np.tanh), ("sine", "tanh"))],
+)  # fmt: skip
+def test_every_basis_is_listed_by_its_values(basis):
+    data = example_fit("dead_zone").data
+    fit = optid.fit(data, na=2, nb=2, basis=basis)
+    text = describe(fit)
+    table = rows(text, "Nonlinearity f,")
+    points = np.array([float(u) for u in table])
+    assert len(points) == 11 and max(map(len, text.splitlines())) <= 80
+    exact = np.linspace(*fit.model.f.basis.interval, 11)  # the table rounds the points to four digits
+    assert np.allclose(points, exact, rtol=1e-3, atol=1e-3)
+    for cells, value in zip(table.values(), fit.model.f(exact)):
+        assert abs(float(cells[0]) - value) <= 0.051 * float(cells[1])
+
+
+@pytest.mark.parametrize("gauge", ["norm", "gain", "b0"])
+def test_the_gauge_is_stated_and_true(gauge):
+    fit = optid.fit(example_fit("dead_zone").data, na=2, nb=2, basis="triangular:4", gauge=gauge)
+    text, b = " ".join(describe(fit).split()), fit.model.b[0]
+    said = {
+        "norm": ("norm of b is one, its first coefficient positive", np.linalg.norm(b)),
+        "gain": ("static gain of the linear part is one", b.sum() / (1 + fit.model.a.sum())),
+        "b0": ("first coefficient of b is one", b[0]),
+    }
+    sentence, one = said[gauge]
+    assert f"Gauge: {sentence}" in text and one == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_channel_whose_sign_the_constraint_fixes_says_so():
+    fit = example_fit("two_inputs")
+    assert fit.model.b[0][0] < 0
+    assert "its sign follows from the constraints" in describe(fit)
