@@ -260,8 +260,8 @@ def test_nonconvex_path_is_compiled_once(name, monkeypatch):
     engine = dnlp.Derivatives
     monkeypatch.setattr(dnlp, "Derivatives", lambda form: (made.append("engine"), engine(form))[1])
     x, level = cp.Variable(2, name="x"), cp.Parameter(name="level", value=1.0, pos=True)
-    program = pose("path", cp.sum(x), {"product": x[0] * x[1] >= level, "sign": x >= 0}, [x], start={"x": np.array([3.0, 1.0])},
-                   parameters={"level": level})
+    program = pose("path", cp.sum(x), {"product": x[0] * x[1] >= level, "sign": x >= 0}, [x],
+                   start={"x": np.array([3.0, 1.0])}, parameters={"level": level})
     for value in (1.0, 4.0, 9.0):
         level.value = value
         found = solve(program, name)
