@@ -76,10 +76,11 @@ def measure_violation(program: Program) -> tuple[float, str]:
     """
     worst, name = 0.0, ""
     for key, group in program.constraints.items():
+        if key in program.derived:
+            continue  # recomputed, hence exact
         for member in group:
-            size = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
             with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
-                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / size
+                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / term_size(member)
             if not amount <= worst:  # also true for nan
                 worst, name = amount, key
     for key, variable in program.variables.items():
@@ -94,6 +95,28 @@ def measure_violation(program: Program) -> tuple[float, str]:
         if not amount <= worst:
             worst, name = amount, key
     return (worst if np.isfinite(worst) else float("inf")), name
+
+
+def term_size(member: Constraint) -> float:
+    """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
+
+    For affine constraints every variable counts with its largest entry, so that the measure does not depend on units;
+    where that vanishes, and for other constraints, it is one more than the largest argument.
+    """
+    largest = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
+    if not isinstance(member, Equality | Zero | Inequality | NonPos) or not member.expr.is_affine():
+        return largest
+    total = np.zeros(member.size)
+    inner = -_flat(member.expr)
+    for variable, jacobian in member.expr.grad.items():
+        if jacobian is None:
+            return largest
+        jacobian = np.atleast_2d(jacobian.toarray() if hasattr(jacobian, "toarray") else jacobian)
+        jacobian = np.reshape(jacobian, (variable.size, member.size))
+        total += np.sum(np.abs(jacobian), axis=0) * float(np.max(np.abs(_flat(variable)), initial=0.0))
+        inner += jacobian.T @ _flat(variable)
+    size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of the constraint
+    return size if size > ZERO**2 else largest
 
 
 def has_bounds(variable: cp.Variable) -> bool:

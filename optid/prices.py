@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cvxpy as cp
 import numpy as np
 
+from optid.judging import term_size
 from optid.program import Program
 from optid.solution import Solution
 
@@ -55,7 +56,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
         active = rows = 0
         slack = np.inf
         for member in group:
-            size = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
+            size = term_size(member)
             gaps = _slacks(member)
             rows += gaps.size
             active += int(np.count_nonzero(gaps <= ACTIVE * size))

@@ -81,7 +81,9 @@ class _Constrained:
         self.program, self.form, self.problem = program, form, form.problem
         self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-11), warm=False)
         self.at = Coordinates(program, form)
-        self.half, self.full = StepQP(self.at, pinned=True), StepQP(self.at, pinned=False)
+        point = minimise(form.problem, start_point(form, program.start)).point
+        sizes = self.at.sizes(self.at.pack(to_values(program, form, point)))
+        self.half, self.full = StepQP(self.at, sizes, pinned=True), StepQP(self.at, sizes, pinned=False)
 
     def solve(self, count: int, seed: int) -> Answer:
         points = self._candidates(count, seed)

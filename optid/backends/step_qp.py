@@ -70,6 +70,20 @@ class Coordinates:
             position += p + q
         return Point(x[: self.form.problem.linear], tuple(mus), tuple(bs))
 
+    def sizes(self, x: np.ndarray) -> dict[str, float]:
+        """Natural size of every variable around x: how much of it would account for the whole record.
+
+        Solvers stop at absolute tolerances, so the QPs are written in these units and not in those of the data.
+        """
+        problem = self.form.problem
+        energy = np.linalg.norm(problem.root @ self.slope_of_lift(x), axis=0)
+        reach, found, position = float(np.sqrt(problem.scale)), {}, 0
+        for name, variable in zip(self.names, self.variables):
+            largest = float(np.max(energy[position : position + variable.size]))
+            found[name] = reach / largest if largest > 0 and reach > 0 else 1.0
+            position += variable.size
+        return found
+
     def slope_of_lift(self, x: np.ndarray) -> np.ndarray:
         """Jacobian (n, size) of the lifted vector z(x)."""
         point, linear = self.point(x), self.form.problem.linear
@@ -125,39 +139,56 @@ class StepQP:
 
     Args:
         at: the programme and its coordinates.
+        sizes: natural size of every variable; the QP is written in these units, and its constraints without units.
         pinned: hold every b at a parameter and drop the gauge; what is left is convex.
     """
 
-    def __init__(self, at: Coordinates, *, pinned: bool) -> None:
-        self.at, self.tangents = at, []
+    def __init__(self, at: Coordinates, sizes: Mapping[str, float], *, pinned: bool) -> None:
+        self.at, self.tangents, self.sizes = at, [], dict(sizes)
+        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
+        self._swap = {id(v): sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
+        self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
+        self._units: dict[str, np.ndarray] = {}
         self.matrix = cp.Parameter((at.size, at.size), value=np.eye(at.size))
         self.target = cp.Parameter(at.size, value=np.zeros(at.size))
         self.pins: dict[str, cp.Parameter] = {}
         self.unit = 1.0
-        self._x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in at.variables])
+        self._x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in stand_ins.values()])
         r = cp.Variable(at.size)
         constraints: dict[str, tuple] = {"model": (r == self.matrix @ self._x - self.target,)}
         for _, name in at.form.blocks if pinned else ():
             variable = at.program.variables[name]
             self.pins[name] = cp.Parameter(variable.shape, value=np.zeros(variable.shape))
-            constraints[f"pinned {name}"] = (variable == self.pins[name],)
+            constraints[f"pinned {name}"] = (stand_ins[name] == self.pins[name] / sizes[name],)
         where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
             if name == "residual" or (pinned and name == "gauge"):
                 continue
             spans = _spans(group)
+            self._units[name] = np.ones(spans[-1].stop)
             constraints[name] = tuple(
-                member if member.is_dcp() else self._tangent(name, member, span, where.rows(member))
-                for member, span in zip(group, spans))
-        self.program = Program("step", cp.Minimize(cp.sum_squares(r)), constraints,
-                               {**dict(zip(at.names, at.variables)), "_r": r}, {}, dict, at.program.view)
+                self._convex(name, member, span) if member.is_dcp()
+                else self._tangent(name, member, span, where.rows(member)) for member, span in zip(group, spans))
+        self.program = Program("step", cp.Minimize(cp.sum_squares(r)), constraints, {**stand_ins, "_r": r}, {}, dict,
+                               at.program.view)
+
+    def _convex(self, name: str, member: cp.Constraint, span: slice) -> cp.Constraint:
+        """Write a convex constraint in the units of the QP; an affine one also with rows of size one."""
+        if not isinstance(member, EQUALITIES | INEQUALITIES) or not member.expr.is_affine():
+            return member.tree_copy(self._swap)
+        slope = np.abs(self._slope(member.expr)) @ self._scale
+        level = np.abs(np.ravel(member.expr.value, order="F"))
+        unit = float(np.max(slope + level, initial=0.0)) or 1.0
+        self._units[name][span] = unit
+        expression = member.expr.tree_copy(self._swap) / unit
+        return expression == 0 if isinstance(member, EQUALITIES) else expression <= 0
 
     def _tangent(self, name: str, member: cp.Constraint, span: slice, rows: tuple[np.ndarray, np.ndarray] | None
                  ) -> cp.Constraint:
         slope = cp.Parameter((member.size, self.at.size), value=np.zeros((member.size, self.at.size)))
         level = cp.Parameter(member.size, value=np.zeros(member.size))
         self.tangents.append(Tangent(name, span, member.expr, slope, level, rows))
-        expression = slope @ self._x + level
+        expression = slope @ cp.multiply(self._scale, self._x) + level
         return expression == 0 if isinstance(member, EQUALITIES) else expression <= 0
 
     def set_model(self, x: np.ndarray, duals: Values, *, second_order: bool = True, damping: float = 0.0) -> None:
@@ -186,10 +217,10 @@ class StepQP:
         factor = _cholesky(scaled, shift)
         if factor is None:
             factor = _definite(scaled, self._active(duals, x) / scale, shift)
-        upper = factor.T * scale
+        upper = factor.T * (scale * self._scale)
         self.unit = max(float(np.max(np.abs(upper))), 1e-300)
         self.matrix.value = upper / self.unit
-        self.target.value = (upper @ x - np.linalg.solve(factor, jacobian.T @ residual / scale)) / self.unit
+        self.target.value = (upper @ (x / self._scale) - np.linalg.solve(factor, jacobian.T @ residual / scale)) / self.unit
         self.at.assign(x)
         for tangent in self.tangents:
             if tangent.rows is not None:
@@ -202,10 +233,11 @@ class StepQP:
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
         answer = back_end.run(self.program, settings)
-        known = self.at.program.constraints
-        duals = {name: self.unit**2 * dual for name, dual in answer.duals.items() if name in known}
+        duals = {name: self.unit**2 * answer.duals[name] / units
+                 for name, units in self._units.items() if name in answer.duals}
+        values = {name: self.sizes[name] * answer.values[name] for name in self.sizes if name in answer.values}
         usable = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
-        return Answer(answer.status, answer.word, answer.values if usable else {}, duals)
+        return Answer(answer.status, answer.word, values if usable else {}, duals)
 
     def _active(self, duals: Values, x: np.ndarray) -> np.ndarray:
         """Gradients (r, size) of the equalities and of the inequalities with a multiplier, at x."""
