@@ -1,11 +1,13 @@
 """Do 95 % intervals contain the truth in 95 % of the records, also where constraints are active?
 
-    python benchmarks/interval_coverage.py [--runs 1000] [--samples 200 1000] [--truths ...] [--workers 2]
+    python benchmarks/interval_coverage.py [--runs 1000] [--free-runs 4000] [--samples 200 1000] [--truths ...]
 
 Every record of the simulation example is fitted without and with the constraint that f increases. Counted are a, b,
 and f (its offset included, gauge norm of b one) at 41 points, nodes and cell interiors. The truths: strictly
 increasing; with a flat piece inside (dead zone); on the boundary of the cone at both ends (saturation). Width is the
-mean width of the band under the constraint relative to the one without, averaged over the points.
+mean width of the band under the constraint relative to the one without, averaged over the points. The extremes over 41
+points scatter: the standard error of one share is 0.7 % for 1000 runs, 0.35 % for 4000; the fits without constraint are
+cheap, so there are more of them.
 """
 
 import argparse
@@ -38,23 +40,25 @@ def run(job: tuple[str, int, int, bool]) -> tuple[np.ndarray, np.ndarray]:
 def main(argv=None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=1000)
+    parser.add_argument("--free-runs", type=int, default=4000, help="runs without the constraint")
     parser.add_argument("--samples", type=int, nargs="+", default=[200, 1000])
     parser.add_argument("--truths", nargs="+", default=list(CASES), choices=CASES)
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(argv)
     figures = {}
-    print(f"{'truth':>18} {'N':>5}  {'constraint':>10}   a1    a2    b0    b1    f mean   f points       width")
+    print(f"{'truth':>18} {'N':>5}  {'constraint':>10}  runs   a1    a2    b0    b1    f mean   f points       width")
     for name in options.truths:
         for n in options.samples:
             free = None
             for monotone in (False, True):
-                jobs = [(name, n, seed, monotone) for seed in range(options.runs)]
+                count = options.runs if monotone else options.free_runs
+                jobs = [(name, n, seed, monotone) for seed in range(count)]
                 hits, widths = map(np.array, zip(*mapped(run, jobs, options.workers)))
                 share, width = 100 * hits.mean(axis=0), widths.mean(axis=0)
                 free = width if free is None else free
                 relative = float(np.mean(width[4:] / free[4:]))
                 figures[name, n, monotone] = {"parameters": share[:4], "points": share[4:], "width": relative}
-                print(f"{name:>18} {n:5d}  {'increasing' if monotone else '-':>10}  "
+                print(f"{name:>18} {n:5d}  {'increasing' if monotone else '-':>10} {count:5d}  "
                       + " ".join(f"{s:5.1f}" for s in share[:4])
                       + f"   {share[4:].mean():5.1f}   {share[4:].min():5.1f}-{share[4:].max():5.1f}   {relative:.3f}",
                       flush=True)
