@@ -14,6 +14,7 @@ from optid.bilinear import minimise, starts
 from optid.errors import StructureError
 from optid.gauges import gauge_factor
 from optid.infeasibility import satisfiable
+from optid.judging import measure_violation
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
 from optid.solution import Status
@@ -86,7 +87,11 @@ class _Constrained:
         self.half, self.full = StepQP(self.at, sizes, pinned=True), StepQP(self.at, sizes, pinned=False)
 
     def solve(self, count: int, seed: int) -> Answer:
-        points = self._candidates(count, seed)
+        free = minimise(self.problem, count=count, seed=seed).point
+        idle = self._idle(free)
+        if idle is not None:
+            return idle
+        points = self._candidates(free, seed)
         tried = [t for t in map(self._settle, points) if t is not None]
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
@@ -98,24 +103,34 @@ class _Constrained:
         ends = [self._iterate(x) for x in [first, *other[:1]]]
         return min(ends, key=lambda end: end[0])[1]
 
-    def _candidates(self, count: int, seed: int) -> list[Point]:
+    def _candidates(self, free: Point, seed: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
         core = reduce(self.problem)
         points = [start_point(self.form, self.program.start)] if self.program.start else []
-        points += [minimise(self.problem, count=count, seed=seed).point,
-                   *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed))]
+        points += [free, *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed))]
         distinct: list[Point] = []
         for point in points:
             directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
             if not any(all(abs(float(d @ e)) > 0.999 for d, e in zip(directions, kept.bs)) for kept in distinct):
                 distinct.append(Point(point.w, point.mus, tuple(directions)))
-        signed = []
-        for point in distinct[:CANDIDATES]:
-            for pattern in range(2 ** min(len(point.bs), 3)):
-                signs = [-1.0 if pattern >> i & 1 else 1.0 for i in range(len(point.bs))]
-                signed.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
-                                    tuple(s * b for s, b in zip(signs, point.bs))))
-        return signed
+        return [signed for point in distinct[:CANDIDATES] for signed in _signed(point)]
+
+    def _idle(self, free: Point) -> Answer | None:
+        """The unconstrained solution, where it happens to satisfy every constraint with one of its signs."""
+        for point in _signed(free):
+            x = self._in_gauge(point)
+            if x is None:
+                continue
+            self.program.assign(self.at.unpack(x))
+            if measure_violation(self.program)[0] <= 1e-14:
+                duals = {name: np.zeros(sum(d.size for c in group for d in c.dual_variables))
+                         for name, group in self.program.constraints.items()}
+                return Answer(Status.LOCAL, "stationary; no constraint is active", self.at.unpack(x),
+                              {**duals, "residual": -2.0 * self._residual(x)}, 0)
+        return None
+
+    def _residual(self, x: np.ndarray) -> np.ndarray:
+        return self.problem.root @ self._lift(x) - self.problem.target
 
     def _allowed(self, points: list[Point]) -> list[Point]:
         """Move every b to the nearest one that the convex constraints admit."""
@@ -162,7 +177,7 @@ class _Constrained:
         return self.at.point(x).lift()
 
     def _merit(self, x: np.ndarray, weight: float) -> float:
-        value = float(np.sum((self.problem.root @ self._lift(x) - self.problem.target) ** 2))
+        value = float(np.sum(self._residual(x) ** 2))
         if weight:
             self.at.assign(x)
             value += weight * sum(float(np.sum(np.abs(np.asarray(member.violation()))))
@@ -190,7 +205,9 @@ class _Constrained:
                 if after > before + 1e-11 * (before + floor) and size > 1e-7:
                     # the tangents may mislead along a curved constraint: return to it by solving for all but b
                     settled = self._settle(self.at.point(new))
-                    after, new = (self._merit(settled[1], weight), settled[1]) if settled else (after, new)
+                    if settled is not None:
+                        after, new = self._merit(settled[1], weight), settled[1]
+                        size = _distance(self._lift(x), self._lift(new))
             if new is None or (after > before + 1e-11 * (before + floor) and size > 1e-7):
                 damping = max(10.0 * damping, 1e-4)
                 if damping > 1e8:
@@ -199,13 +216,23 @@ class _Constrained:
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-        duals = {**multipliers, "residual": -2.0 * (self.problem.root @ self._lift(x) - self.problem.target)}
+        duals = {**multipliers, "residual": -2.0 * self._residual(x)}
         return self._merit(x, weight), Answer(status, word, self.at.unpack(x), duals, count)
 
     def _no_start(self) -> Answer:
         if not satisfiable(self.program, list(self.program.user_constraints)):
             return Answer(Status.INFEASIBLE, "the constraints contradict each other")
         return Answer(Status.FAILED, "no start satisfies the constraints, although they do not contradict each other")
+
+
+def _signed(point: Point) -> list[Point]:
+    """The same model with every pattern of signs of (mu_i, b_i)."""
+    found = []
+    for pattern in range(2 ** min(len(point.bs), 3)):
+        signs = [-1.0 if pattern >> i & 1 else 1.0 for i in range(len(point.bs))]
+        found.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
+                           tuple(s * b for s, b in zip(signs, point.bs))))
+    return found
 
 
 def _distance(z: np.ndarray, reached: np.ndarray) -> float:

@@ -149,6 +149,7 @@ class StepQP:
         self._swap = {id(v): sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
         self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
         self._units: dict[str, np.ndarray] = {}
+        self._slopes: dict[int, np.ndarray] = {}
         self.matrix = cp.Parameter((at.size, at.size), value=np.eye(at.size))
         self.target = cp.Parameter(at.size, value=np.zeros(at.size))
         self.pins: dict[str, cp.Parameter] = {}
@@ -253,7 +254,14 @@ class StepQP:
         return np.vstack(found)
 
     def _slope(self, expression: cp.Expression) -> np.ndarray:
-        """Jacobian (r, size) of an expression at the assigned point."""
+        """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
+        if expression.is_affine():
+            if expression.id not in self._slopes:
+                self._slopes[expression.id] = self._jacobian(expression)
+            return self._slopes[expression.id]
+        return self._jacobian(expression)
+
+    def _jacobian(self, expression: cp.Expression) -> np.ndarray:
         gradients: Mapping = expression.grad
         parts = []
         for variable in self.at.variables:
