@@ -221,7 +221,8 @@ class StepQP:
         upper = factor.T * (scale * self._scale)
         self.unit = max(float(np.max(np.abs(upper))), 1e-300)
         self.matrix.value = upper / self.unit
-        self.target.value = (upper @ (x / self._scale) - np.linalg.solve(factor, jacobian.T @ residual / scale)) / self.unit
+        descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
+        self.target.value = (upper @ (x / self._scale) - descent) / self.unit
         self.at.assign(x)
         for tangent in self.tangents:
             if tangent.rows is not None:
