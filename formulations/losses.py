@@ -103,7 +103,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
 
 def _steady(sizes: list[np.ndarray], weights: list[np.ndarray]) -> bool:
     """Whether no residual has outgrown by much the weight it was given."""
-    return all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.1 for w, r in zip(weights, sizes))
+    return all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.03 for w, r in zip(weights, sizes))
 
 
 def _row_sizes(data: Data, problem: EquationError, solution: Solution) -> list[np.ndarray]:

@@ -14,10 +14,13 @@ class Rule:
     Attributes:
         name: name under which it is reported.
         build: view -> CVXPY constraint or list of them.
+        verify: model -> what is wrong with it, "" where it obeys; for statements that the constraint itself only
+            approximates.
     """
 
     name: str
     build: Callable[[View], Any]
+    verify: Callable[[Any], str] | None = None
 
     def __call__(self, view: View) -> dict[str, Any]:
         """Build the constraint in the variables of a formulation."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from formulations.rule import Rule
 from formulations.stability import stable
+from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.program import View
 
@@ -55,12 +56,16 @@ def concave(channel: str | None = None) -> Rule:
 
 
 def odd(channel: str | None = None) -> Rule:
-    """f(u) - f(0) is odd where the interval is symmetric about zero; the offset of the model stays free."""
+    """f(u) - f(0) is odd; the offset of the model stays free.
+
+    Exact where the interval of the basis is symmetric about zero; elsewhere it holds at as many points as the basis
+    has functions of the other parity.
+    """
     return _linear("odd", channel, lambda basis: _mirror(basis, +1.0))
 
 
 def even(channel: str | None = None) -> Rule:
-    """The nonlinearity is even where the interval is symmetric about zero."""
+    """The nonlinearity is even, in the sense of `odd`."""
     return _linear("even", channel, lambda basis: _mirror(basis, -1.0))
 
 
@@ -101,8 +106,11 @@ def slope(low: float | None = None, high: float | None = None, channel: str | No
 
 
 def value_range(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
-    """The static characteristic lies in [low, high] over the interval of the basis (units of the output)."""
-    return _static("range", low, high, channel, lambda basis: basis.values(basis.grid()), offset=True)
+    """The static characteristic lies in [low, high] over the interval of the basis (units of the output).
+
+    Exact for `Triangular`, on a dense grid for the other bases.
+    """
+    return _static("range", low, high, channel, _everywhere, offset=True)
 
 
 def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None) -> Rule:
@@ -299,6 +307,11 @@ def _static_theta(view: View, channel: str | None) -> cp.Expression:
 
 def _denominator(view: View) -> Any:
     return 1 + cp.sum(view["a"]) if "a" in view else 1.0
+
+
+def _everywhere(basis: Any) -> np.ndarray:
+    """Values of f at the nodes of a piecewise linear basis, which are enough, or on a dense grid."""
+    return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
 
 
 def _settles(view: View) -> list[Any]:

@@ -174,6 +174,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     if raises:
         _raise_failure(outcome)
     model = outcome.model
+    findings = findings + _disobeyed(model, arguments.get("constraints", ()))
     transform = getattr(data, "transform", None)
     if model is not None and transform is not None and not transform.is_identity:
         model = model.with_transform(transform)
@@ -191,6 +192,15 @@ def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
     if isinstance(data, Stream):
         return []
     return examine(data, fitted_bases(data, arguments.get("basis", Linear())))
+
+
+def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:
+    """What the constraints that can verify a model say of it; every sentence is also a `DataWarning`."""
+    checks = [rule.verify for rule in constraints if getattr(rule, "verify", None) is not None]
+    found = [sentence for check in checks if model is not None and (sentence := check(model))]
+    for sentence in found:
+        warnings.warn(sentence, DataWarning, stacklevel=4)
+    return found
 
 
 def _raise_failure(outcome: Outcome) -> None:

@@ -47,6 +47,9 @@ class View(Mapping[str, cp.Expression]):
                 f"a constraint asks for {name!r}, which this formulation does not have. {nearest(name, self)}"
             ) from None
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._expressions
+
     def __iter__(self):
         return iter(self._expressions)
 

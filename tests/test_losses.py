@@ -1,0 +1,128 @@
+"""Robust losses: equal to the raw-sample problems, bounded from below where they are convex."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from problems import BASIS, dense, plant, raw_problem, record
+from systems import by_hand
+
+import optid
+from formulations import losses
+from optid.bases import Linear
+from optid.errors import StructureError
+
+
+def soiled():
+    """A record with gross errors in some outputs."""
+    data = record(noise=0.3, count=200, seed=1)
+    y = data.y.copy()
+    y[::17] += 4
+    return optid.Data(u=data.u, y=y)
+
+
+def threshold(fit, kind, number):
+    """The width in units of the output, from the residuals of the pass in which the scale settled."""
+    theta = fit.program.compressed.regression(fit.steps[2][1].values)
+    layout = fit.program.compressed.layout
+    phi, y = dense(soiled(), layout.na, layout.nb, layout.nk, layout.bases)
+    return number * np.median(np.abs(y - phi @ theta)) / 0.6745
+
+
+def sizes(kind, width):
+    if kind == "l1":
+        return lambda r: cp.norm1(r)
+    return lambda r: cp.sum(cp.huber(r, width))
+
+
+CASES = [("huber", losses.HUBER), ("huber:0.7", 0.7), ("l1", 0.0)]
+
+
+@pytest.mark.parametrize("loss, number", CASES)
+def test_linear_arx_equals_the_raw_sample_problem(loss, number):
+    fit = optid.fit(soiled(), "arx", na=2, nb=2, loss=loss)
+    phi, y = dense(soiled(), 2, (2,), (0,), [Linear().fitted(-1, 1)])
+    value, _ = raw_problem(phi, y, 2, [(1, 2)], sizes(loss[:2], threshold(fit, loss, number)))
+    assert fit.solution.objective == pytest.approx(value, rel=1e-7)
+    assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-9)
+    assert fit.solution.proof
+
+
+@pytest.mark.parametrize("loss, number", CASES[:2])
+def test_nuclear_equals_the_raw_sample_problem(loss, number):
+    fit = optid.fit(soiled(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=3.0, loss=loss)
+    phi, y = dense(soiled(), 2, (2,), (0,), [BASIS])
+    value, (theta,) = raw_problem(phi, y, 2, [(6, 2)], sizes(loss[:2], threshold(fit, loss, number)), 3.0)
+    assert fit.solution.objective == pytest.approx(value, rel=1e-6)
+    assert np.allclose(fit.solution.values["Theta"], theta, atol=1e-3)
+    assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-8)
+
+
+def test_l1_with_a_penalty_and_a_constraint_is_bounded_honestly(monkeypatch):
+    monkeypatch.setattr(losses, "PASSES", 50)  # stopped early, the bound must hold all the same
+    fit = optid.fit(soiled(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=1.0, loss="l1",
+                    constraints=[lambda v: {"pole": v["a"][0] >= -1.1}])
+    phi, y = dense(soiled(), 2, (2,), (0,), [BASIS])
+    value, _ = raw_problem(phi, y, 2, [(6, 2)], cp.norm1, 1.0, lambda a, t, d: [a[0] >= -1.1])
+    assert value * (1 - 1e-9) <= fit.solution.objective <= value * (1 + 2e-3)
+    assert value * (1 - 2e-2) <= fit.solution.bound.value <= value * (1 + 1e-8)
+    assert fit.solution.proof == (fit.solution.gap < 1e-6)
+
+
+@pytest.mark.parametrize("loss", ["huber", "l1"])
+def test_the_exact_form_says_that_it_has_no_proof(loss, monkeypatch):
+    monkeypatch.setattr(losses, "PASSES", 40)
+    fit = optid.fit(soiled(), na=2, nb=2, basis=BASIS, loss=loss)
+    assert not fit.solution.proof and "no proof" in fit.solution.bound.reason
+    assert fit.solution.status is optid.solution.Status.LOCAL
+
+
+def test_the_exact_robust_objective_is_a_local_minimum_of_its_loss():
+    fit = optid.fit(soiled(), na=2, nb=2, basis=BASIS, loss="huber")
+    width = threshold(fit, "huber", losses.HUBER)
+    phi, y = dense(soiled(), 2, (2,), (0,), [BASIS])
+
+    def value(x):
+        z = np.concatenate([x[:2], np.kron(x[8:10], x[2:8]), x[10:]])
+        r = np.abs(y[:, 0] - phi @ z)
+        return np.sum(np.where(r <= width, r**2, 2 * width * r - width**2))
+
+    v = fit.solution.values
+    x = np.concatenate([v["a"], v["mu"], v["b"], v["offset"]])
+    assert value(x) == pytest.approx(fit.solution.objective, rel=1e-9)
+    slope = [(value(x + h) - value(x - h)) / 2e-6 for h in 1e-6 * np.eye(x.size)]
+    assert np.max(np.abs(slope)) < 1e-4 * value(x)
+
+
+def test_outliers_hurt_squares_more_than_robust_losses(monkeypatch):
+    monkeypatch.setattr(losses, "PASSES", 40)
+    rng, true = np.random.default_rng(1), plant()
+    noise = 0.1 * rng.normal(size=(400, 1))
+    noise[rng.choice(400, 20, replace=False)] += 6
+    u = rng.uniform(-1, 1, (400, 1))
+    soiled = optid.Data(u=u, y=by_hand(true, u, noise=noise))
+    errors = {loss: np.abs(optid.fit(soiled, na=2, nb=2, basis=BASIS, loss=loss).model.a - true.a).max()
+              for loss in ("squares", "huber", "l1")}
+    assert errors["huber"] < errors["squares"] / 2
+    assert errors["l1"] < errors["squares"] / 2
+
+
+def test_one_step_fit_is_that_of_the_record_not_of_the_weights():
+    data = soiled()
+    fit = optid.fit(data, na=2, nb=2, basis=BASIS, loss="huber")
+    p = fit.model.predict(data)[2:]
+    y = data.y[2:]
+    assert fit.one_step_fit[0] == pytest.approx(100 * (1 - np.linalg.norm(y - p) / np.linalg.norm(y - y.mean())))
+
+
+def test_without_outliers_a_wide_huber_is_least_squares():
+    data = record()
+    plain = optid.fit(data, na=2, nb=2, basis=BASIS)
+    wide = optid.fit(data, na=2, nb=2, basis=BASIS, loss="huber:50")
+    assert wide.solution.objective == pytest.approx(plain.solution.objective, rel=1e-10)
+
+
+@pytest.mark.parametrize("loss, words", [("hubr", "Did you mean 'huber'"), ("huber:x", "positive number"),
+                                         ("huber:-1", "positive number"), ("l1:2", "only huber"), (3, "'3'|3")])
+def test_unknown_losses(loss, words):
+    with pytest.raises(StructureError, match=words):
+        losses.parse_loss(loss)
