@@ -20,6 +20,9 @@ from optid.layout import Layout
 FORMED = 2048
 """Rows that are formed at once where a dense product is the cheapest way."""
 
+NARROW = 16
+"""Products of dense signals at one lag up to which starting the threads of a matrix product does not pay."""
+
 SAFE = 1e3
 """Energy subtracted from a column over energy left: beyond it more than three digits would be lost."""
 
@@ -134,7 +137,8 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     valid = np.zeros(len(u) + reach, dtype=bool)
     valid[reach : len(u)] = rows_present(u, y, layout)
     outputs = np.zeros((len(y) + 2 * reach, layout.l))
-    np.copyto(outputs[inner], y, where=~np.isnan(y))
+    outputs[inner] = y
+    outputs[np.isnan(outputs)] = 0.0
     always = np.zeros(len(outputs), dtype=np.int32)
     groups = [Signals(always, outputs, layout.l, layout.group_lags[0], layout.complete_columns[0])]
     for c, basis in enumerate(layout.bases):
@@ -205,12 +209,16 @@ def lagged_products(g: Signals, h: Signals, lags: range, reach: int) -> Array:
     if h.local and not g.local:
         return lagged_products(h, g, range(-lags[-1], 1 - lags[0]), reach)[:, ::-1].transpose(2, 1, 0)
     sums = np.zeros((g.size, len(lags), h.size))
-    if not g.local:
+    if not g.local and g.size * h.size > NARROW:
         for d, lag in enumerate(lags):
             sums[:, d] = g.weights[start:stop].T @ h.weights[start - lag : stop - lag]
     elif not h.local:  # the values of h at all these lags are neighbours in memory, the oldest first
         windows = h.weights.reshape(-1)[(start - lags[-1]) * h.size :]
-        kernels.local_by_dense(g.first[start:stop], g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
+        if g.local:
+            first = g.first[start:stop]
+            kernels.local_by_dense(first, g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
+        else:
+            kernels.dense_by_dense(g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
         sums = sums[:, ::-1]
     else:
         kernels.local_by_local(g.first, g.weights, h.first, h.weights, start, stop, lags[0], sums)
@@ -237,17 +245,30 @@ class Sums:
 
     def add(self, block: Block) -> None:
         """Add the valid rows of a block."""
-        used = np.flatnonzero(block.valid)
-        self.rows += used.size
+        count = int(np.count_nonzero(block.valid))
+        self.rows += count
         self.candidates += block.candidates
         if block.weights is not None:
+            used = np.flatnonzero(block.valid)
             self._add_rows(block, used, block.weights[used])
-        elif self.direct or self._direct_is_cheaper(block, used.size):
-            self._add_rows(block, used, np.ones(used.size))
+        elif self.direct or self._direct_is_cheaper(block, count):
+            self._add_rows(block, np.flatnonzero(block.valid), np.ones(count))
         else:
             self._add_by_difference(block)
             others = np.flatnonzero(~block.valid)
             self._add_rows(block, others, np.full(others.size, -1.0))
+
+    def merge(self, other: "Sums") -> None:
+        """Add the sums of other blocks, of the same layout."""
+        self.rows += other.rows
+        self.candidates += other.candidates
+        self._gram += other._gram
+        self._removed += other._removed
+        for pair, products in other._products.items():
+            self._products[pair] = self._products.get(pair, 0.0) + products
+        for total, part in zip(self._totals, other._totals):
+            total += part
+        self._stretched += other._stretched
 
     def cancelled(self, complete: Array) -> bool:
         """Say whether the subtraction of rows cost digits; the sums should then be taken again with direct=True."""

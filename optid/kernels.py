@@ -15,6 +15,33 @@ ONE = unsigned(1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def hats(u: Array, lo: float, scale: float, cells: int) -> tuple[Indices, Array]:
+    """Evaluate the two hats of the cell of each sample.
+
+    Args:
+        u: (T,) samples, brought inside where that is wanted; NaN = missing.
+        lo: lower end of the first cell.
+        scale: cells per unit of u.
+        cells: number of cells.
+
+    Returns:
+        first (T,), weights (T, 2): zeros where a sample is missing.
+    """
+    first, weights = np.empty(u.size, dtype=np.int32), np.empty((u.size, 2))
+    for t in range(unsigned(u.size)):
+        x = (u[t] - lo) * scale
+        if np.isnan(x):
+            first[t] = 0
+            weights[t, 0] = weights[t, 1] = 0.0
+        else:
+            cell = int(min(max(x, 0.0), cells - 1.0))
+            first[t] = cell
+            weights[t, 1] = x - cell
+            weights[t, 0] = 1.0 - weights[t, 1]
+    return first, weights
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def local_by_local(
     first: Indices, weights: Array, other: Indices, others: Array, start: int, stop: int, lag: int, out: Array
 ) -> None:
@@ -64,12 +91,38 @@ def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: 
         step: number of dense signals.
         out: (functions, width).
     """
+    if weights.shape[1] == 2:
+        for t in range(unsigned(first.size)):
+            start, left, right, row = t * unsigned(step), weights[t, 0], weights[t, 1], unsigned(first[t])
+            for d in range(unsigned(out.shape[1])):
+                value = flat[start + d]
+                out[row, d] += left * value
+                out[row + ONE, d] += right * value
+        return
     for t in range(unsigned(first.size)):
         start = t * unsigned(step)
         for i in range(unsigned(weights.shape[1])):
             weight, row = weights[t, i], unsigned(first[t]) + i
             for d in range(unsigned(out.shape[1])):
                 out[row, d] += weight * flat[start + d]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def dense_by_dense(signals: Array, flat: Array, step: int, out: Array) -> None:
+    """Add sum_t g(t) * flat[t * step : t * step + width]^T to out: a few dense signals g, in one thread.
+
+    Args:
+        signals: (T, s) values of g.
+        flat: samples of the other signals, one after the other.
+        step: number of the other signals.
+        out: (s, width).
+    """
+    for i in range(unsigned(signals.shape[1])):
+        for d in range(unsigned(out.shape[1])):
+            total = 0.0
+            for t in range(unsigned(signals.shape[0])):
+                total += signals[t, i] * flat[t * unsigned(step) + d]
+            out[i, d] += total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -92,6 +145,12 @@ def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> Non
 @njit(cache=True, nogil=True, error_model="numpy")
 def local_total(first: Indices, weights: Array, out: Array) -> None:
     """Add the sum of a local family over time, first (T,) and weights (T, s), to out (functions,)."""
+    if weights.shape[1] == 2:
+        for t in range(unsigned(first.size)):
+            row = unsigned(first[t])
+            out[row] += weights[t, 0]
+            out[row + ONE] += weights[t, 1]
+        return
     for t in range(unsigned(first.size)):
         for i in range(unsigned(weights.shape[1])):
             out[unsigned(first[t]) + i] += weights[t, i]

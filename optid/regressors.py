@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from optid.basis import Array, Basis
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.factors import add_to_root, conditioning, dependent_column, root_of_gram
 from optid.layout import Layout
+from optid.workers import available_threads, mapped
 
 if TYPE_CHECKING:
     from optid.data import Data
@@ -27,6 +29,13 @@ CHUNK = 32768
 
 CONDITION_LIMIT = 1e7
 """Condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left."""
+
+BLOCKS = 4
+"""Chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record."""
+
+RETAINED = 1 << 23
+"""Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
+long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
 
 ROWS_PER_COLUMN = 1.1
 KEPT = 0.5
@@ -130,6 +139,7 @@ def collect(
     weights: Sequence[Array] | None = None,
     method: Literal["auto", "gram", "qr"] = "auto",
     chunk: int = CHUNK,
+    threads: int | None = None,
 ) -> Statistics:
     """Take the statistics of a record that determines the parameters.
 
@@ -143,6 +153,8 @@ def collect(
             with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7.
             `Statistics.method` says which it was.
         chunk: samples evaluated at a time.
+        threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
+            same to the last digit whatever their number, and a short record takes one.
 
     Raises:
         RankError: an experiment shorter than the lags, too few rows, a silent basis function, dependent columns.
@@ -158,7 +170,7 @@ def collect(
         statistics = factorise(data, layout, weights, chunk)
         statistics.check()
         return statistics
-    statistics = accumulate(data, layout, weights, chunk)
+    statistics = accumulate(data, layout, weights, chunk, threads)
     statistics.check()
     if method == "auto" and statistics.condition > CONDITION_LIMIT:
         statistics = factorise(data, layout, weights, chunk)
@@ -167,16 +179,21 @@ def collect(
 
 
 def accumulate(
-    data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
+    data: "Data | Stream",
+    layout: Layout,
+    weights: Sequence[Array] | None = None,
+    chunk: int = CHUNK,
+    threads: int | None = None,
 ) -> Statistics:
     """Take the Gram matrix in one pass, without asking whether the record determines the parameters.
 
     This is for parts of a record that are to be added; arguments and errors as `collect`.
     """
-    sums = _sum(data, layout, weights, chunk, direct=False)
+    threads = available_threads(threads)
+    sums = _sum(data, layout, weights, chunk, threads, direct=False)
     complete = sums.complete()
     if sums.cancelled(complete):
-        sums = _sum(data, layout, weights, chunk, direct=True)
+        sums = _sum(data, layout, weights, chunk, threads, direct=True)
         complete = sums.complete()
     gram = layout.contrasted(layout.contrasted(complete).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
@@ -191,7 +208,7 @@ def factorise(
     """
     n = layout.n_columns + layout.l
     root, rows, candidates = np.zeros((n, n)), 0, 0
-    for block in _blocks(data, layout, weights, chunk):
+    for block in chain.from_iterable(_blocks(part, layout, chunk) for part in _parts(data, layout, weights, chunk)):
         used = np.flatnonzero(block.valid)
         rows, candidates = rows + used.size, candidates + block.candidates
         for start in range(0, used.size, FORMED):
@@ -247,21 +264,49 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
     return result
 
 
-def _sum(data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, direct: bool) -> Sums:
-    sums = Sums(layout, direct)
-    for block in _blocks(data, layout, weights, chunk):
-        sums.add(block)
-    return sums
+@dataclass(frozen=True)
+class _Part:
+    """Part of a record: [u, y] or [u, y, weights] with the samples before its rows, and where it begins."""
+
+    arrays: list[Array]
+    record: str
+    position: int
 
 
-def _blocks(data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int) -> Iterator[Block]:
-    size = max(chunk, 32 * layout.first_row)
+def _sum(
+    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, direct: bool
+) -> Sums:
+    def sum_part(part: _Part) -> Sums:
+        sums = Sums(layout, direct)
+        for block in _blocks(part, layout, chunk):
+            sums.add(block)
+        return sums
+
+    np.empty(RETAINED, dtype=np.uint8)  # freed at once
+    total = Sums(layout, direct)
+    for sums in mapped(sum_part, _parts(data, layout, weights, chunk), threads):
+        total.merge(sums)
+    return total
+
+
+def _parts(data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int) -> Iterator[_Part]:
+    size = _block_size(layout, chunk)
+    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
     for name, chunks in _records(data, layout, weights):
-        position = 0
-        for u, y, *row_weights in stretches(chunks, layout.first_row, size):
-            _check_inside(u, layout, name, position)
-            yield make_block(u, y, row_weights[0] if row_weights else None, layout)
-            position += size
+        for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
+            yield _Part(arrays, name, i * length)
+
+
+def _blocks(part: _Part, layout: Layout, chunk: int) -> Iterator[Block]:
+    size = _block_size(layout, chunk)
+    for i, (u, y, *weights) in enumerate(stretches([part.arrays], layout.first_row, size)):
+        _check_inside(u, layout, part.record, part.position + i * size)
+        yield make_block(u, y, weights[0] if weights else None, layout)
+
+
+def _block_size(layout: Layout, chunk: int) -> int:
+    """New samples of a block; with those before them they are a chunk, so that chunks of a file are cut evenly."""
+    return max(chunk - layout.first_row, 32 * layout.first_row, 1)
 
 
 def _records(

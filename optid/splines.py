@@ -24,6 +24,9 @@ from optid.basis import (
     span,
 )
 
+COMPILED = 16384
+"""Samples from which on loading the compiled loops pays."""
+
 
 def _nearest_reference(points: Array, interval: tuple[float, float]) -> int:
     """Index of the point nearest 0, or nearest the middle when 0 is outside the interval."""
@@ -86,6 +89,12 @@ class Triangular(Basis):
 
     def local(self, u: ArrayLike) -> tuple[NDArray[np.int32], Array]:
         """Evaluate the two hats of the cell of each sample."""
+        u = samples(u)
+        if u.size >= COMPILED:
+            from optid import kernels
+
+            lo, hi = span(self)
+            return kernels.hats(brought_inside(u, (lo, hi), self.outside), lo, self.p / (hi - lo), self.p)
         cell, x, missing = _split_cells(u, span(self), self.p, self.outside)
         weights = np.empty((x.size, 2))
         np.subtract(x, cell, out=weights[:, 1])

@@ -1,5 +1,6 @@
 """Statistics in one pass against the regressor formed row by row."""
 
+import threading
 import tracemalloc
 import warnings
 
@@ -14,7 +15,7 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.regressors import Layout, accumulate, collect, factorise, residuals
 
-BASES = (Triangular(1), Triangular(5), Triangular(3, outside="extrapolate"), Trigonometric(2), Polynomial(3),
+BASES = (Triangular(1), Triangular(5), Triangular(3, outside="extrapolate"), Trigonometric(3), Polynomial(3),
          BSpline(4), PiecewiseConstant(3), Linear())
 
 
@@ -136,6 +137,57 @@ def test_stream_equals_record(case, lengths):
     stream = Chunks(one, lengths)
     rows, ones, _ = formed(one, layout)
     assert_gram(accumulate(stream, layout, chunk=chunk).gram, rows, ones)
+
+
+@given(cases(), st.integers(2, 4))
+def test_threads_do_not_change_a_digit(case, threads):
+    rng, data, layout, chunk = case
+    weights = [rng.random(len(e.y)) for e in data.experiments]
+    stream = Chunks(Data(u=data.experiments[0].u, y=data.experiments[0].y), [7, 20])
+    for source, scales in ((data, None), (data, weights), (stream, None)):
+        one, several = (accumulate(source, layout, scales, chunk, threads=count) for count in (1, threads))
+        assert (one.rows, one.candidates) == (several.rows, several.candidates)
+        np.testing.assert_array_equal(one.gram, several.gram)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_failing_reader_is_heard_and_leaves_no_thread(threads):
+    class Failing(Chunks):
+        def __iter__(self):
+            for i, chunk in enumerate(super().__iter__()):
+                if i == 20:
+                    raise DataError("column 'u': sample 1000 is inf")
+                yield chunk
+
+    data = random_data(np.random.default_rng(19), [2000], 1, 1)
+    before = threading.active_count()
+    with pytest.raises(DataError, match="sample 1000 is inf"):
+        collect(Failing(data, [50] * 39), layout_of(data, (Triangular(3),), 1, [1], [0]), chunk=30, threads=threads)
+    assert threading.active_count() == before
+
+
+def test_short_record_starts_no_thread(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a pool was started")
+
+    monkeypatch.setattr("optid.workers.ThreadPoolExecutor", refuse)
+    data = random_data(np.random.default_rng(20), [3000], 1, 1)
+    layout = layout_of(data, (Triangular(3),), 1, [1], [0])
+    collect(data, layout, threads=2)
+    with pytest.raises(AssertionError, match="a pool"):
+        collect(data, layout, chunk=100, threads=2)
+
+
+@pytest.mark.parametrize("outside", ["clamp", "extrapolate"])
+def test_compiled_hats_equal_the_others(outside):
+    u = np.random.default_rng(21).uniform(-1.3, 1.3, 20_000)
+    u[::7], u[:8] = np.nan, (-1, 1, 0, 0.25, np.nextafter(1, 0), np.nextafter(-1, 0), 1e30, -50)
+    basis = Triangular(8, outside=outside).fitted(-1, 1)
+    first, weights = basis.local(u)
+    pieces = [basis.local(piece) for piece in np.split(u, 20)]
+    assert first.dtype == pieces[0][0].dtype
+    np.testing.assert_array_equal(first, np.concatenate([piece[0] for piece in pieces]))
+    np.testing.assert_allclose(weights, np.concatenate([piece[1] for piece in pieces]), rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("bases", [(Triangular(4),), (Polynomial(3),), (Triangular(4), Trigonometric(2))])
@@ -304,13 +356,14 @@ def test_weights_that_do_not_fit():
         collect(Chunks(Data(u=data.u[0], y=data.y[0]), []), layout, [np.ones(50)])
 
 
-def test_sample_outside_is_named():
+@pytest.mark.parametrize("threads", [1, 2])
+def test_sample_outside_is_named(threads):
     u = np.random.default_rng(15).uniform(-1, 1, 300)
     u[217] = 1.5
     data = Data(u=u, y=u, inputs=["current"])
     layout = layout_of(data, (Triangular(3, outside="error"),), 1, [1], [0])
     with pytest.raises(DataError, match="'current', sample 217: 1.5"):
-        collect(data, layout, chunk=50)
+        collect(data, layout, chunk=10, threads=threads)
 
 
 def test_arguments_are_refused():
@@ -327,6 +380,9 @@ def test_arguments_are_refused():
         collect(Data(u=data.u[:, 0], y=data.y), layout)
     with pytest.raises(StructureError, match="method"):
         collect(data, layout, method="fast")
+    for threads in (0, True, 1.5):
+        with pytest.raises(StructureError, match="threads"):
+            collect(data, layout, threads=threads)
     with pytest.raises(StructureError, match="theta has shape"):
         residuals(data, layout, np.zeros(layout.n_columns))
     with pytest.raises(StructureError, match="same layout"):
