@@ -40,14 +40,17 @@ def increments_matrix(size):
     return np.delete(np.diff(np.eye(size + 1), axis=0), size // 2, axis=1)
 
 
-def draw(seed, channels=1, truth="any"):
+def draw(seed, channels=1, truth="any", scarce=False):
     """A random problem and the cell of the grid it comes from; None where a basis function was never excited."""
     rng = np.random.default_rng([seed, channels, len(truth)])
     nb, size = int(rng.integers(2, 7)), int(rng.integers(4, 13))
     cell = {"nb": nb, "size": size, "snr": float(rng.choice([0.3, 1, 10])), "ratio": int(rng.choice([5, 10, 50])),
             "white": bool(rng.random() < 0.5), "rank": 1 if truth != "any" else int(rng.integers(1, 3)),
             "basis": "triangular" if truth != "any" else str(rng.choice(["triangular", "legendre"]))}
-    rows = cell["ratio"] * (3 + channels * nb * size)
+    columns = 3 + channels * nb * size
+    rows = cell["ratio"] * columns
+    if scarce:
+        rows = max(cell["ratio"] * (3 + channels * (nb + size - 1)), int(1.3 * columns))
     lagged, signal = [], np.zeros(rows)
     common = rng.standard_normal(rows + nb + 100)
     for _ in range(channels):
@@ -109,9 +112,9 @@ def row(problem, cell, bound, value, reference, stage, seconds):
         "missed": value > reference * (1 + 1e-7)}
 
 
-def run_free(seed, channels, max_size):
+def run_free(seed, channels, max_size, scarce=False):
     """Solve and certify one unconstrained problem; the reference never sees the certificate."""
-    drawn = draw(seed, channels)
+    drawn = draw(seed, channels, scarce=scarce)
     if drawn is None:
         return None
     problem, cell = drawn
@@ -179,7 +182,7 @@ def summarise(title, rows, white=True):
           f"{sum(r['proved'] for r in within) / max(len(within), 1):.4f}")
     easy = [r for r in rows if r["white"] and r["ratio"] == 50]
     if white and easy:
-        print(f"  white input, N = 50 x columns: before the SDP "
+        print(f"  white input, largest N: before the SDP "
               f"{sum(r in cheap for r in easy)} of {len(easy)}; all white inputs "
               f"{sum(r['white'] for r in cheap) / max(sum(r['white'] for r in rows), 1):.4f}")
     for rank in (1, 2):
@@ -212,12 +215,16 @@ def main():
     parser.add_argument("--monotone", type=int, default=2_000)
     parser.add_argument("--channels", type=int, default=2_000, help="problems with two channels")
     parser.add_argument("--violated", type=int, default=0, help="problems whose truth breaks the monotone constraint")
+    parser.add_argument("--scarce", type=int, default=0,
+                        help="problems with N = 5/10/50 x the parameters of the rank-one model, at least 1.3 x columns")
     parser.add_argument("--max-size", type=int, default=450, help="multipliers in the SDP (0: no SDP)")
     parser.add_argument("--max-cut-size", type=int, default=1400, help="the same with product cuts")
     parser.add_argument("--workers", type=int, default=2)
     args = parser.parse_args()
     tasks = [("One channel", partial(run_free, channels=1, max_size=args.max_size), args.problems, True),
              ("Two channels", partial(run_free, channels=2, max_size=args.max_size), args.channels, True),
+             ("One channel, scarce data",
+              partial(run_free, channels=1, max_size=args.max_size, scarce=True), args.scarce, True),
              ("Monotone constraint active, monotone truth",
               partial(run_monotone, truth="monotone", max_size=args.max_cut_size), args.monotone, False),
              ("Monotone constraint active, truth not monotone",
