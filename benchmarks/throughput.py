@@ -1,8 +1,10 @@
 """Statistics of a record larger than memory, from npy and Parquet files: samples per second and resident memory.
 
 The record is written to a temporary folder first: 100,000,000 samples of two float32 channels take 0.8 GB as npy and
-about as much as Parquet. Every measurement runs in a process of its own, pinned to one core, once with the file in the
-page cache and once from the disk.
+about as much as Parquet. Every measurement runs in a process of its own, with the file on the disk and in the page
+cache, pinned to one core and with a thread for every core. Just reading is measured in the same way: the same columns
+in chunks of float64, checked, and as the library of the format hands them out. CPU time counts all threads, and is the
+figure to trust on a machine that others use too.
 """
 
 import argparse
@@ -20,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 NA = 2
-ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "ARROW")}
+READ = 131_072
+LIBRARIES = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL", "NUMBA")}
 PIECE = 1_000_000
 
 
@@ -55,9 +58,26 @@ def write(folder: Path, samples: int) -> tuple[Path, Path]:
     return npy, parquet
 
 
-def measure(path: Path, work: str, cells: int, lags: int) -> dict[str, float]:
-    """Read the record, or take its statistics, in this process and on one core."""
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+def read_stored(path: Path) -> int:
+    """Read the file with the library of its format alone, in the stored type; return the number of samples."""
+    samples = 0
+    if path.suffix == ".npy":
+        with open(path, "rb", buffering=0) as file:
+            while (count := np.fromfile(file, np.float32, 2 * READ).size) > 0:
+                samples += count // 2
+        return samples
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as file:
+        for batch in file.iter_batches(READ, columns=["u", "y"]):
+            samples += len(batch)
+    return samples
+
+
+def measure(path: Path, work: str, threads: int, repeats: int, cells: int, lags: int) -> dict[str, float]:
+    """Read the record, or take its statistics, in this process; the shortest of some repetitions."""
+    if threads == 1:
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import optid
     from optid.regressors import Layout, collect
 
@@ -66,42 +86,49 @@ def measure(path: Path, work: str, cells: int, lags: int) -> dict[str, float]:
     basis = optid.Triangular(cells).fitted(-1, 1)
     layout = Layout(na=NA, nb=(lags,), nk=(0,), bases=(basis,), outputs=stream.outputs, inputs=stream.inputs)
     rng = np.random.default_rng(0)
-    collect(optid.Data(u=rng.uniform(-1, 1, 5000), y=rng.standard_normal(5000)), layout)  # compiles
-    start, samples, error = time.perf_counter(), 0, float("nan")
-    if work == "read":
-        for u, _ in stream:
-            samples += len(u)
-    else:
-        statistics = collect(stream, layout)
-        samples, n = statistics.rows + layout.first_row, layout.n_columns
-        theta = np.linalg.solve(statistics.root[:n, :n], statistics.root[:n, n])
-        error = float(np.max(np.abs(theta[:NA] - [-1.5, 0.7])))
-    seconds = time.perf_counter() - start
+    collect(optid.Data(u=rng.uniform(-1, 1, 50_000), y=rng.standard_normal(50_000)), layout)  # compiles
+    wall, cpu, error = [], [], float("nan")
+    for _ in range(repeats):
+        start = time.perf_counter(), time.process_time()
+        if work == "stored":
+            read_stored(path)
+        elif work == "stream":
+            for _chunk in stream:
+                pass
+        else:
+            root, n = collect(stream, layout, threads=threads).root, layout.n_columns
+            error = float(np.max(np.abs(np.linalg.solve(root[:n, :n], root[:n, n])[:NA] - [-1.5, 0.7])))
+        wall.append(time.perf_counter() - start[0])
+        cpu.append(time.process_time() - start[1])
     resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    return {"samples": samples, "seconds": seconds, "MB": resident, "error": error}
+    return {"seconds": min(wall), "cpu": min(cpu), "MB": resident, "error": error}
 
 
-def compare(path: Path, place: str, cells: int, lags: int) -> None:
+def compare(path: Path, place: str, threads: int, arguments: argparse.Namespace) -> None:
     """Print how long the statistics take, and how long just reading takes."""
     found = {}
-    for work in ("read", "statistics"):
+    for work in ("stored", "stream", "statistics"):
         with open(path, "rb") as file:
             os.fsync(file)
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
             while place == "cache" and file.read(1 << 24):
                 pass
-        sizes = ["--cells", str(cells), "--lags", str(lags)]
-        command = [sys.executable, __file__, *sizes, "--measure", str(path), work]
-        run = subprocess.run(command, env=os.environ | ONE_THREAD, check=True, stdout=subprocess.PIPE, text=True)
+        repeats = arguments.repeats if place == "cache" else 1
+        sizes = ["--cells", str(arguments.cells), "--lags", str(arguments.lags), "--repeats", str(repeats)]
+        command = [sys.executable, __file__, *sizes, "--measure", str(path), work, str(threads)]
+        limits = LIBRARIES | {"OMP_NUM_THREADS": str(threads)}  # the latter also counts for pyarrow
+        run = subprocess.run(command, env=os.environ | limits, check=True, stdout=subprocess.PIPE, text=True)
         found[work] = json.loads(run.stdout)
-    reading, passed = found["read"], found["statistics"]
+    passed, scale = found["statistics"], 1e9 / arguments.samples
     print(
-        f"{path.suffix[1:]:7} from {place:5} {passed['samples'] / passed['seconds'] / 1e6:5.1f} million samples/s, "
-        f"{passed['seconds']:5.2f} s, just reading {reading['seconds']:5.2f} s "
-        f"({passed['seconds'] / reading['seconds']:.1f} times), {passed['MB']:.0f} MB resident, "
-        f"error of a {passed['error']:.0e}",
-        flush=True,
+        f"{path.suffix[1:]:7} {place:5} {threads} thread{'s' if threads > 1 else ' '} "
+        f"{arguments.samples / passed['seconds'] / 1e6:5.1f} million samples/s, {passed['MB']:.0f} MB resident, "
+        f"error of a {passed['error']:.0e}"
     )
+    for work, words in (("statistics", "statistics"), ("stream", "just reading chunks"), ("stored", "as stored")):
+        wall, cpu = (scale * found[work][clock] for clock in ("seconds", "cpu"))
+        ratio = f", ratio {passed['seconds'] / found[work]['seconds']:.1f}" if work != "statistics" else ""
+        print(f"    {words:20} {wall:6.1f} ns a sample, {cpu:6.1f} ns of CPU{ratio}", flush=True)
 
 
 def main() -> None:
@@ -110,11 +137,13 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=20)
     parser.add_argument("--lags", type=int, default=10)
     parser.add_argument("--folder", type=Path, help="where the temporary folder is made")
-    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--repeats", type=int, default=3, help="passes over a cached file; the fastest counts")
+    parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.measure:
-        path, work = arguments.measure
-        print(json.dumps(measure(Path(path), work, arguments.cells, arguments.lags)))
+        path, work, threads = arguments.measure
+        sizes = arguments.repeats, arguments.cells, arguments.lags
+        print(json.dumps(measure(Path(path), work, int(threads), *sizes)))
         return
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         needed = 20 * arguments.samples
@@ -124,7 +153,8 @@ def main() -> None:
         print(f"{arguments.samples:,} samples, {sizes}, one core", flush=True)
         for path in write(Path(folder), arguments.samples):
             for place in ("disk", "cache"):
-                compare(path, place, arguments.cells, arguments.lags)
+                for threads in sorted({1, len(os.sched_getaffinity(0))}):
+                    compare(path, place, threads, arguments)
 
 
 if __name__ == "__main__":
