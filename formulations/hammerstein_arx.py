@@ -74,7 +74,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
 
 def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Program:
     linear = problem.linear_variables()
-    variables, expressions = dict(linear), dict(linear)
+    variables: dict[str, cp.Variable] = dict(linear)
+    expressions: dict[str, cp.Expression] = dict(linear)
     thetas, gauges, blocks, start = [], [], [], {}
     core = reduce(problem.problem)
     point = core.point(*starts(core, count=1)[0])
@@ -87,8 +88,8 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         gauges.append(_gauge(gauge, b, linear.get("a"), problem))
         blocks.append(names)
         thetas.append(theta)
-        variables.update({names[0]: mu, names[1]: b})
-        expressions.update({names[0]: mu, names[1]: b, problem.key("Theta", c): theta})
+        variables[names[0]], variables[names[1]] = mu, b
+        expressions[names[0]], expressions[names[1]], expressions[problem.key("Theta", c)] = mu, b, theta
         values = _in_gauge(gauge, point.mus[c], point.bs[c].reshape(b.shape, order="F"), start.get("a"),
                            problem.channels[c])
         start.update(dict(zip(names, values)))

@@ -295,7 +295,7 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
     return Rule(_label(word, channel), build)
 
 
-def _static_theta(view: View, channel: str | None) -> cp.Expression:
+def _static_theta(view: View, channel: str | None) -> Any:
     """Theta summed over the lags: coefficients of the static curve, times ``1 + sum(a)``."""
     _basis(view, channel)
     if view["offset"].size > 1:

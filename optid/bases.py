@@ -86,8 +86,8 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
         raise StructureError(f"{len(several)} bases for {len(inputs)} inputs ({', '.join(inputs)}): give one each")
     fitted = []
     for channel, one, lo, hi in zip(inputs, several, *data.ranges()):
-        one = parse(one) if isinstance(one, str) else one
-        if not hasattr(one, "fitted"):
+        family: Any = parse(one) if isinstance(one, str) else one
+        if not hasattr(family, "fitted"):
             raise StructureError(f"the basis of input {channel!r} is {one!r}: give one such as Triangular(10) or "
                                  "its name, 'triangular:10'")
         if lo != lo:
@@ -95,7 +95,7 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
         if lo == hi:
             raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
                             "excite the input or drop the channel")
-        fitted.append(one.fitted(float(lo), float(hi)))
+        fitted.append(family.fitted(float(lo), float(hi)))
     return tuple(fitted)
 
 

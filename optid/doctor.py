@@ -76,8 +76,8 @@ def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:
     if not outside or basis.interval is None:
         return []
     low, high = basis.interval
-    return [f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval [{low:g}, {high:g}] of its basis; "
-            f"there the basis is set to {basis.outside!r}"]
+    return [f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval [{low:g}, {high:g}] of its "
+            f"basis; there the basis is set to {basis.outside!r}"]
 
 
 def _outliers(role: str, name: str, x: np.ndarray) -> list[str]:
@@ -92,7 +92,8 @@ def _outliers(role: str, name: str, x: np.ndarray) -> list[str]:
     if not 0 < count <= 0.01 * x.size:
         return []  # heavy tails are the signal itself, not outliers
     advice = "consider loss='huber'" if role == "output" else "check the record"
-    return [f"{count} samples of {role} {name!r} lie more than {OUTLIER:g} robust standard deviations from the median; {advice}"]
+    return [f"{count} samples of {role} {name!r} lie more than {OUTLIER:g} robust standard deviations from the median; "
+            f"{advice}"]
 
 
 def _units(name: str, y: np.ndarray) -> list[str]:

@@ -137,17 +137,18 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     return _finished(data, name, arguments, findings, problem, solver, settings, raises, started)
 
 
-def resolve(fit: Fit, *, solver: Any = "auto", raises: bool = True, accuracy: float = 1e-8, **parameters: float) -> Fit:
+def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
+            raises: bool = True) -> Fit:
     """Solve the programme of a fit again with other parameter values, starting from its solution.
 
     Nothing is compressed or compiled again.
 
     Args:
         fit: an earlier fit.
-        solver: as in `fit`.
-        raises: as in `fit`.
-        accuracy: as in `fit`.
         parameters: new values of the programme's parameters, such as ``weight`` of the nuclear norm.
+        solver: as in `fit`.
+        accuracy: as in `fit`.
+        raises: as in `fit`.
 
     Raises:
         StructureError: the programme has no such parameter; names the nearest.

@@ -1,12 +1,13 @@
 """Explain an infeasible set of constraints by a smallest conflicting subset, in the user's names."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from optid.lifting import lift_exact, places
-from optid.program import Program
+from optid.program import EQUALITIES, Program
 
 
 def explain(program: Program) -> str:
@@ -75,12 +76,12 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
-def _linearised(member: cp.Constraint) -> cp.Constraint:
+def _linearised(member: Any) -> Any:
     expression = member.expr
-    linear = np.ravel(expression.value, order="F")
+    linear: Any = np.ravel(expression.value, order="F")
     for variable, gradient in expression.grad.items():
         slope = gradient.toarray() if hasattr(gradient, "toarray") else np.asarray(gradient)
         flat = variable if variable.ndim <= 1 else cp.vec(variable, order="F")
         linear = linear + np.reshape(slope, (variable.size, -1)).T @ (flat - np.ravel(variable.value, order="F"))
-    equal = isinstance(member, cp.constraints.Equality | cp.constraints.Zero)
+    equal = isinstance(member, EQUALITIES)
     return linear == 0 if equal else linear <= 0

@@ -12,12 +12,9 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate import certify
-from optid.program import Program, RankOneForm, Values
+from optid.program import EQUALITIES, INEQUALITIES, Program, RankOneForm, Values
 from optid.rank_one import Point, RankOne
 from optid.solution import Bound
-
-EQUALITIES = cp.constraints.Equality | cp.constraints.Zero
-INEQUALITIES = cp.constraints.Inequality | cp.constraints.NonPos
 
 
 @dataclass
@@ -59,7 +56,7 @@ class Lifted:
             start, (p, q) = _block_starts(problem)[i], problem.blocks[i]
             cone = self.cones.pop(i)
             products = np.zeros((len(rows) * len(cone), self.size))
-            products[:, start : start + p * q] = -np.kron(rows, cone)
+            products[:, start : start + p * q] = np.kron(-rows, cone)
             self.add(products, np.zeros(len(products)), False)
         return alone
 
@@ -270,7 +267,7 @@ def certify_nuclear(problem: RankOne, program: Program, values: Values, duals: V
     For any nu with ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
     """
-    tau = float(program.parameters["weight"].value)
+    tau = float(np.asarray(program.parameters["weight"].value))
     lifted = Lifted(len(problem.target))
     columns, position = {}, 0
     names = [name for name in program.variables if name != "residual"]

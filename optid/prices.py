@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.psd import PSD
+from cvxpy.constraints.second_order import SOC
 
-from optid.judging import term_size
-from optid.program import Program
+from optid.judging import term_size, usual_sizes
+from optid.program import EQUALITIES, INEQUALITIES, Program
 from optid.solution import Solution
 
 ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below which it counts as active
@@ -51,12 +53,12 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     program.assign(solution.values)
     energy = float(np.sum(getattr(program.compressed, "energy", solution.scale)))
     worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
-    found = []
+    found, usual = [], usual_sizes(program)
     for name, group in program.user_constraints.items():
         active = rows = 0
         slack = np.inf
         for member in group:
-            size = term_size(member)
+            size = term_size(member, usual)
             gaps = _slacks(member)
             rows += gaps.size
             active += int(np.count_nonzero(gaps <= ACTIVE * size))
@@ -67,14 +69,14 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     return tuple(found)
 
 
-def _slacks(member: cp.Constraint) -> np.ndarray:
+def _slacks(member: Constraint) -> np.ndarray:
     """Distance of every row from its bound; zero for equalities."""
-    if isinstance(member, cp.constraints.Equality | cp.constraints.Zero):
+    if isinstance(member, EQUALITIES):
         return np.zeros(member.size)
-    if isinstance(member, cp.constraints.Inequality | cp.constraints.NonPos):
+    if isinstance(member, INEQUALITIES):
         return -np.ravel(member.expr.value)
-    if isinstance(member, cp.constraints.PSD):
+    if isinstance(member, PSD):
         return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
-    if isinstance(member, cp.SOC):
+    if isinstance(member, SOC):
         return np.atleast_1d(member.args[0].value) - np.linalg.norm(np.atleast_1d(member.args[1].value))
     return np.ravel(member.args[0].value)

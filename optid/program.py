@@ -15,6 +15,8 @@ from optid.errors import StructureError, nearest
 from optid.solution import Bound
 
 Values = Mapping[str, np.ndarray]
+EQUALITIES = Equality | Zero
+INEQUALITIES = Inequality | NonPos
 Builder = Callable[["View"], Any]
 
 
@@ -279,9 +281,9 @@ class Program:
             raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
         penalty: Any = 0.0
         for member in self.constraints[name]:
-            if isinstance(member, Zero | Equality):
+            if isinstance(member, EQUALITIES):
                 penalty = penalty + cp.sum_squares(member.expr)
-            elif isinstance(member, NonPos | Inequality):
+            elif isinstance(member, INEQUALITIES):
                 penalty = penalty + cp.sum_squares(cp.pos(member.expr))
             else:
                 raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "

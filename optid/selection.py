@@ -72,7 +72,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
     fits, scores = [], []
     for weight in grid:
         if fits and penalty in fits[-1].program.parameters:
-            one = resolve(fits[-1], solver=arguments.get("solver", "auto"), **{penalty: float(weight)})
+            one = resolve(fits[-1], {penalty: float(weight)}, solver=arguments.get("solver", "auto"))
         else:
             one = fit(train, formulation, **{**arguments, penalty: float(weight)})
         fits.append(one)

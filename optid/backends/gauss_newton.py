@@ -69,7 +69,7 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
     for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
         size = float(np.linalg.norm(b)) or 1.0  # the sign stays: constraints may depend on it
         if form.gauge != "norm":
-            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), b, mu_name)
+            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), np.asarray(b), mu_name)
         values[mu_name] = mu * size
         values[b_name] = np.reshape(b / size, program.variables[b_name].shape, order="F")
     return values
@@ -195,23 +195,23 @@ class _Constrained:
             self.full.set_model(x, multipliers, damping=damping)
             answer = self.full.run(self.inner, self.settings)
             new = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
-            size, before, after = np.inf, 0.0, np.inf
+            size, before, after, rises = np.inf, 0.0, np.inf, True
             if new is not None:
                 multipliers = answer.duals
                 weight = max(weight, 2.0 * max(float(np.max(np.abs(d), initial=0.0)) for d in multipliers.values()))
                 before, after = self._merit(x, weight), self._merit(new, weight)
+                slack = 1e-11 * (before + floor)
                 # measured on the lifted vector: b means nothing where mu is zero
                 size = _distance(self._lift(x), self._lift(new))
-                if after > before + 1e-11 * (before + floor) and size > 1e-7:
-                    # the tangents may mislead along a curved constraint: return to it by solving for all but b
-                    settled = self._settle(self.at.point(new))
-                    if settled is not None:
-                        after, new = self._merit(settled[1], weight), settled[1]
-                        size = _distance(self._lift(x), self._lift(new))
-            if new is None or (after > before + 1e-11 * (before + floor) and size > 1e-7):
+                rises = after > before + slack and size > 1e-7
+                # the tangents may mislead along a curved constraint: return to it by solving for all but b
+                settled = self._settle(self.at.point(new)) if rises else None
+                if settled is not None and self._merit(settled[1], weight) < before - slack:
+                    after, new, rises = self._merit(settled[1], weight), settled[1], False
+            if new is None or rises:
                 damping = max(10.0 * damping, 1e-4)
                 if damping > 1e8:
-                    status, word = Status.INACCURATE, "no descent"
+                    status, word = Status.LOCAL, "no step descends"
                 continue
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):

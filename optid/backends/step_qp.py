@@ -8,13 +8,14 @@ matrices and right-hand sides are parameters.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.lifting import EQUALITIES, INEQUALITIES, places
-from optid.program import Program, RankOneForm, Values
+from optid.lifting import places
+from optid.program import EQUALITIES, INEQUALITIES, Program, RankOneForm, Values
 from optid.rank_one import Point
 from optid.solution import Status
 
@@ -254,7 +255,7 @@ class StepQP:
                     found.append(self._slope(member.expr)[duals[name][span] > least])
         return np.vstack(found)
 
-    def _slope(self, expression: cp.Expression) -> np.ndarray:
+    def _slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
         if expression.is_affine():
             if expression.id not in self._slopes:
