@@ -17,13 +17,18 @@ if TYPE_CHECKING:
 GAUGES = ("norm", "gain", "b0", "none")
 
 
-def regauged(model: "HammersteinARX", gauge: str) -> "HammersteinARX":
-    """Move the scale between f and B of every input; the documentation is at `HammersteinARX.regauge`."""
+def regauged(model: "HammersteinARX", gauge: str, signs: bool = True) -> "HammersteinARX":
+    """Move the scale between f and B of every input; the documentation is at `HammersteinARX.regauge`.
+
+    With ``signs=False`` the gauge "norm" leaves the signs of B as they are.
+    """
     if gauge not in GAUGES:
         raise StructureError(f"Unknown gauge {gauge!r}. {nearest(gauge, GAUGES)}")
     if gauge == "gain" and model.l > 1:
         raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'.")
     scales = [_scale(model, c, gauge) for c in range(model.m)]
+    if gauge == "norm" and not signs:
+        scales = [abs(scale) for scale in scales]
     return replace(
         model,
         b=tuple(b / s for b, s in zip(model.b, scales)),
@@ -51,7 +56,8 @@ def in_raw_units(model: "HammersteinARX", transform: Transform) -> "HammersteinA
         nonlinearities.append(Nonlinearity(basis, matrix @ f.mu))
         offset = offset + float(constant @ f.mu) * rows.sum(axis=0)
     raw = replace(model, a=a, b=b, nonlinearities=tuple(nonlinearities), offset=offset)
-    return regauged(raw, model.gauge)
+    # units do not turn signs: what a constraint decided about them stays
+    return regauged(raw, model.gauge, signs=False)
 
 
 def _scale(model: "HammersteinARX", c: int, gauge: str) -> float:

@@ -1,5 +1,7 @@
 """Our own residuals at a solver's point: a solver's status is a claim, these numbers decide."""
 
+from collections.abc import Mapping
+
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
@@ -74,13 +76,13 @@ def measure_violation(program: Program) -> tuple[float, str]:
 
     Bounds that variables carry as attributes count as well, under the name of the variable.
     """
-    worst, name = 0.0, ""
+    worst, name, usual = 0.0, "", usual_sizes(program)
     for key, group in program.constraints.items():
         if key in program.derived:
             continue  # recomputed, hence exact
         for member in group:
             with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
-                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / term_size(member)
+                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / term_size(member, usual)
             if not amount <= worst:  # also true for nan
                 worst, name = amount, key
     for key, variable in program.variables.items():
@@ -97,11 +99,21 @@ def measure_violation(program: Program) -> tuple[float, str]:
     return (worst if np.isfinite(worst) else float("inf")), name
 
 
-def term_size(member: Constraint) -> float:
+def usual_sizes(program: Program) -> dict[int, float]:
+    """Largest entry of every variable at the programme's start, by id of the variable."""
+    return {program.variables[name].id: float(np.max(np.abs(value), initial=0.0))
+            for name, value in program.start.items() if name in program.variables}
+
+
+def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
     """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
 
     For affine constraints every variable counts with its largest entry, so that the measure does not depend on units;
     where that vanishes, and for other constraints, it is one more than the largest argument.
+
+    Args:
+        member: the constraint.
+        usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
     """
     largest = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
     if not isinstance(member, Equality | Zero | Inequality | NonPos) or not member.expr.is_affine():
@@ -113,7 +125,8 @@ def term_size(member: Constraint) -> float:
             return largest
         jacobian = np.atleast_2d(jacobian.toarray() if hasattr(jacobian, "toarray") else jacobian)
         jacobian = np.reshape(jacobian, (variable.size, member.size))
-        total += np.sum(np.abs(jacobian), axis=0) * float(np.max(np.abs(_flat(variable)), initial=0.0))
+        size = max(float(np.max(np.abs(_flat(variable)), initial=0.0)), (usual or {}).get(variable.id, 0.0))
+        total += np.sum(np.abs(jacobian), axis=0) * size
         inner += jacobian.T @ _flat(variable)
     size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of the constraint
     return size if size > ZERO**2 else largest

@@ -1,5 +1,7 @@
 """Records, raw-sample routes and searches that the tests of the formulations share."""
 
+import warnings
+
 import cvxpy as cp
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -43,7 +45,7 @@ def dense(data, na, nb, nk, bases):
 
 
 def raw_problem(phi, y, na, shapes, loss, weight=0.0, constrain=lambda a, thetas, d: []):
-    """Solve a one-output problem in (a, Theta, d) on the raw samples with CVXPY; returns the optimal value and Thetas."""
+    """Solve a one-output problem in (a, Theta, d) on the raw samples; return its value and the Thetas."""
     a, d = cp.Variable(na), cp.Variable()
     thetas = [cp.Variable(shape) for shape in shapes]
     z = cp.hstack([a, *(cp.vec(t, order="F") for t in thetas), d])
@@ -60,14 +62,19 @@ def search(program, points=72):
 
     def value(angle):
         b.value = np.array([np.cos(angle), np.sin(angle)])
-        problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
-        return float(problem.value) if problem.status == cp.OPTIMAL else np.inf
+        with warnings.catch_warnings():  # on a direction that a constraint all but forbids the solver may give up
+            warnings.simplefilter("ignore")
+            try:
+                problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+            except cp.SolverError:
+                return 1e300
+        return float(problem.value) if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else 1e300
 
     angles = np.linspace(0, 2 * np.pi, points, endpoint=False)
     values = np.array([value(angle) for angle in angles])
     step, best = angles[1], float(np.min(values))
     for i in np.argsort(values)[:2]:
-        if np.isfinite(values[i]):
+        if values[i] < 1e300:
             found = minimize_scalar(value, bounds=(angles[i] - step, angles[i] + step), method="bounded",
                                     options={"xatol": 1e-6})
             best = min(best, float(found.fun))

@@ -202,11 +202,11 @@ def test_the_exact_objective_is_never_above_that_of_the_splits():
 
 def test_resolve_along_a_path_of_weights():
     fit = optid.fit(record(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=1.0)
-    again = optid.resolve(fit, weight=20.0)
+    again = optid.resolve(fit, {"weight": 20.0})
     direct = optid.fit(record(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=20.0)
     assert again.solution.objective == pytest.approx(direct.solution.objective, rel=1e-7)
     with pytest.raises(StructureError, match="no parameter 'wieght'.*weight"):
-        optid.resolve(fit, wieght=1.0)
+        optid.resolve(fit, {"wieght": 1.0})
 
 
 @pytest.mark.parametrize("change, error, words", [

@@ -1,0 +1,193 @@
+"""fit: settings, failures as values and as errors, solvers of one's own."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+from problems import BASIS, record
+
+import optid
+from formulations import hammerstein_arx
+from optid.backends import Answer, BackEnd
+from optid.errors import DataError, DataWarning, LookupFailed, RankError, SolverFailed, StructureError
+from optid.solution import Status
+
+STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
+
+
+def mine(run):
+    return BackEnd("mine", frozenset({"NLP", "QP", "SDP", "rank-one"}), run)
+
+
+def truth(program, settings):
+    """The answer of the own Gauss-Newton, to be spoiled."""
+    from optid.backends import find
+
+    return find("gauss_newton").run(program, settings)
+
+
+def liar(program, settings):
+    return Answer(Status.OPTIMAL, "all well", {name: 3.0 * np.ones(v.shape) for name, v in program.variables.items()})
+
+
+def lazy(program, settings):
+    values = dict(program.start) | {"residual": np.zeros(program.variables["residual"].shape)}
+    return Answer(Status.LOCAL, "all well", values,
+                  {name: np.zeros(sum(c.size for c in group)) for name, group in program.constraints.items()})
+
+
+def crashing(program, settings):
+    raise RuntimeError("segment lost")
+
+
+def dying(program, settings):
+    os._exit(3)
+
+
+def slow(program, settings):
+    time.sleep(60)
+
+
+def empty(program, settings):
+    return Answer(Status.OPTIMAL, "done")
+
+
+def infinite(program, settings):
+    return Answer(Status.OPTIMAL, "done", {name: np.full(v.shape, np.nan) for name, v in program.variables.items()})
+
+
+@pytest.mark.parametrize("run, words", [
+    (liar, "claims success, but constraint 'gauge' is violated"),
+    (crashing, "RuntimeError: segment lost"),
+    (empty, "gave no usable answer"),
+    (infinite, "non-finite"),
+])
+def test_a_bad_solver_is_an_error_for_people_and_a_value_for_studies(run, words):
+    with pytest.raises(SolverFailed, match=words):
+        optid.fit(record(), solver=mine(run), **STRUCTURE)
+    fit = optid.fit(record(), solver=mine(run), raises=False, **STRUCTURE)
+    assert fit.solution.status is Status.FAILED and not fit.solution.proof
+
+
+def test_a_plain_function_is_a_solver():
+    with pytest.raises(SolverFailed, match="crashing gave no usable answer"):
+        optid.fit(record(), solver=crashing, **STRUCTURE)
+
+
+def test_a_solver_that_dies_is_an_outcome():
+    fit = optid.fit(record(), solver=mine(dying), isolate=True, raises=False, **STRUCTURE)
+    assert fit.solution.status is Status.FAILED
+
+
+def test_the_time_limit_is_kept():
+    started = time.perf_counter()
+    fit = optid.fit(record(), solver=mine(slow), time_limit=1.0, raises=False, **STRUCTURE)
+    assert time.perf_counter() - started < 15
+    assert fit.solution.status is Status.LIMIT and fit.model is None
+    with pytest.raises(SolverFailed, match="mine gave no usable answer"):
+        optid.fit(record(), solver=mine(slow), time_limit=1.0, **STRUCTURE)
+
+
+def test_a_point_that_is_not_stationary_is_not_called_a_solution():
+    with pytest.warns(DataWarning, match="not stationary"):
+        fit = optid.fit(record(noise=2.0, count=60), solver=mine(lazy), **STRUCTURE)
+    assert fit.solution.status is Status.INACCURATE
+
+
+def test_the_verdict_does_not_depend_on_who_solves():
+    own = optid.fit(record(), **STRUCTURE)
+    other = optid.fit(record(), solver=mine(truth), **STRUCTURE)
+    assert other.solution.status is Status.OPTIMAL and other.solution.solver == "mine"
+    assert other.solution.objective == pytest.approx(own.solution.objective, rel=1e-12)
+
+
+def test_a_callable_formulation_and_its_name_are_the_same():
+    one = optid.fit(record(), hammerstein_arx.exact, **STRUCTURE)
+    other = optid.fit(record(), "hammerstein_arx.exact", **STRUCTURE)
+    assert one.solution.objective == other.solution.objective
+    assert (one.formulation, other.formulation) == ("exact", "hammerstein_arx.exact")
+
+
+def test_proofs_can_be_left_out():
+    fit = optid.fit(record(), prove=False, **STRUCTURE)
+    assert fit.solution.bound is None and fit.solution.status is Status.LOCAL and not fit.solution.proof
+
+
+def test_the_fit_carries_its_evidence():
+    data = record()
+    fit = optid.fit(data, **STRUCTURE)
+    assert fit.figures["rows"] == fit.figures["candidates"] == 148
+    assert fit.figures["condition"] >= 1 and fit.figures["method"] in ("gram", "qr")
+    assert fit.solution.status is Status.OPTIMAL and fit.solution.gap < 1e-8
+    assert fit.data is data and fit.arguments["na"] == 2
+    assert fit.seconds >= fit.solution.times.solve > 0
+    assert [name for name, _ in fit.steps] == ["hammerstein_arx.exact"]
+    simulated = fit.model.simulate(data, x0="fit")
+    expected = 100 * (1 - np.linalg.norm(data.y - simulated) / np.linalg.norm(data.y - data.y.mean()))
+    assert fit.simulation_fit[0] == pytest.approx(expected)
+
+
+def test_missing_rows_are_counted():
+    data = record(count=300)
+    y = data.y.copy()
+    y[50] = np.nan
+    fit = optid.fit(optid.Data(u=data.u, y=y), **STRUCTURE)
+    assert fit.figures["candidates"] - fit.figures["rows"] == 3  # the sample and the two rows that look back at it
+
+
+def test_the_caller_s_arrays_are_not_touched():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 200), rng.normal(size=200)
+    kept = u.copy(), y.copy()
+    optid.fit(optid.Data(u=u, y=y), constraints=["monotone:increasing"], **STRUCTURE)
+    assert np.array_equal(u, kept[0]) and np.array_equal(y, kept[1])
+
+
+def test_fits_are_deterministic():
+    one, other = (optid.fit(record(noise=1.0), constraints=["monotone:increasing"], **STRUCTURE) for _ in range(2))
+    assert np.array_equal(one.model.a, other.model.a) and one.solution.objective == other.solution.objective
+
+
+def test_the_model_of_a_flipped_sign_keeps_its_units():
+    """On scaled data the sign that a constraint gave to b survives the way back to raw units."""
+    data = record(-1.0, noise=0.2)
+    raw = optid.Data(u=5 * data.u, y=0.1 * data.y)
+    rules = ["monotone:increasing", "sign:b,negative"]
+    fit = optid.fit(raw.scale(), na=2, nb=2, basis="triangular:6", constraints=rules)
+    assert np.all(fit.model.b[0] < 0)
+
+
+@pytest.mark.parametrize("change, error, words", [
+    ({"nbb": 2}, StructureError, "takes no argument 'nbb'. Did you mean 'nb'"),
+    ({"constraints": ["monoton"]}, LookupFailed, "Did you mean 'monotone'"),
+    ({"solver": "clarabell"}, LookupFailed, "Did you mean 'clarabel'"),
+    ({"solver": "clarabel"}, StructureError, "not convex in constraint 'residual'.*Use an NLP back end"),
+])
+def test_requests_that_cannot_be_met(change, error, words):
+    with pytest.raises(error, match=words):
+        optid.fit(record(), **(STRUCTURE | change))
+
+
+def test_unknown_formulation():
+    with pytest.raises(LookupFailed, match="Did you mean 'hammerstein_arx.exact'"):
+        optid.fit(record(), "hammerstein_arx.exat", **STRUCTURE)
+    with pytest.raises(StructureError, match="needs na, nb, basis"):
+        optid.fit(record())
+
+
+def test_nonconvex_constraints_are_refused_by_convex_formulations():
+    import cvxpy as cp
+
+    with pytest.raises(StructureError, match="constraint 'ring' is not convex.*exact formulation"):
+        optid.fit(record(), "hammerstein_arx.nuclear", **STRUCTURE,
+                  constraints=[lambda v: {"ring": cp.sum_squares(v["a"]) >= 1}])
+
+
+@pytest.mark.parametrize("data, error, words", [
+    (np.ones(9), DataError, r"fit takes optid.Data .*not ndarray"),
+    (record(count=24), RankError, "21 rows for 27 parameters.*longer record"),
+])
+def test_records_that_will_not_do(data, error, words):
+    with pytest.raises(error, match=words):
+        optid.fit(data, **(STRUCTURE | {"nb": 4}))

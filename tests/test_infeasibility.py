@@ -1,0 +1,82 @@
+"""An infeasible set is explained by an irreducible subset, in the user's names."""
+
+from itertools import combinations
+
+import cvxpy as cp
+import pytest
+from problems import BASIS, record
+
+import optid
+from formulations import shape
+from optid.errors import InfeasibleError, UnboundedError
+from optid.infeasibility import conflicting_subset, explain, satisfiable
+
+SETS = {
+    "slope and gain": ([shape.slope(low=2, high=3), shape.gain(1.0, at=0.1), shape.coefficients("a", high=3)],
+                       {"slope", "gain"}),
+    "stability": ([shape.coefficients("a", low=1.5, index=1), shape.stable(), shape.monotone()],
+                  {"coefficients:a", "stable:1"}),
+    "a point outside the range": ([shape.through(0.0, 1.0), shape.value_range(high=0.5), shape.monotone()],
+                                  {"through", "range"}),
+    "a sign of b": ([shape.sign("b"), lambda v: {"first": v["b"][0] <= -0.1}, lambda v: {"idle": v["a"][0] <= 5}],
+                    {"sign:b:positive", "first"}),
+    "three": ([shape.sign("b"), shape.monotone(), shape.gain(-2.0, at=0.1), shape.stable()],
+              {"sign:b:positive", "monotone:increasing", "gain"}),
+    "one alone": ([lambda v: {"itself": [v["a"][0] >= 1, v["a"][0] <= 0]}, shape.monotone()], {"itself"}),
+    "three halves": ([lambda v: {"p": v["a"][0] >= 0}, lambda v: {"q": v["a"][1] >= 0},
+                      lambda v: {"r": cp.sum(v["a"]) <= -1}], {"p", "q", "r"}),
+}
+
+
+def program_of(rules, form="hammerstein_arx.exact"):
+    from optid.registry import formulation
+
+    return formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_subset_is_named_and_irreducible(name):
+    rules, expected = SETS[name]
+    program = program_of(rules)
+    found = conflicting_subset(program)
+    assert set(found) == expected
+    assert not satisfiable(program, found)
+    for size in range(len(found)):  # by brute force: no smaller subset of it conflicts
+        assert all(satisfiable(program, list(part)) for part in combinations(found, size))
+    with pytest.raises(InfeasibleError) as caught:
+        optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=rules)
+    assert all(repr(one) in str(caught.value) for one in expected)
+    assert all(repr(one) not in str(caught.value) for one in set(program.user_constraints) - expected)
+
+
+@pytest.mark.parametrize("name", ["slope and gain", "stability", "a point outside the range", "three halves"])
+def test_convex_formulations_explain_themselves_too(name):
+    rules, expected = SETS[name]
+    assert set(conflicting_subset(program_of(rules, "hammerstein_arx.overparametrised"))) == expected
+    with pytest.raises(InfeasibleError):
+        optid.fit(record(), "hammerstein_arx.overparametrised", na=2, nb=2, basis=BASIS, constraints=rules)
+
+
+def test_what_can_be_satisfied_is_not_blamed():
+    program = program_of([shape.monotone(), shape.gain(1.0, at=0.1)])
+    assert conflicting_subset(program) is None
+    assert "can be satisfied together" in explain(program)
+
+
+def test_failures_are_values_on_request():
+    rules, _ = SETS["slope and gain"]
+    fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=rules, raises=False)
+    assert fit.solution.status is optid.solution.Status.INFEASIBLE
+    assert fit.model is None and not fit.solution.has_point
+
+
+def test_an_unbounded_programme_says_so():
+    from optid.program import Program, View
+
+    def falling(data):
+        x = cp.Variable(1, name="x")
+        return Program("falling", cp.Minimize(cp.sum(x)), {"cap": (x <= 1,)}, {"x": x}, {}, dict,
+                       View({"x": x}, kind="linear"))
+
+    with pytest.raises(UnboundedError, match="'falling' has no minimum"):
+        optid.fit(record(), falling)

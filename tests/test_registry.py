@@ -1,0 +1,74 @@
+"""Formulations and constraints by name."""
+
+import pytest
+from problems import BASIS, record
+
+import optid
+from formulations import shape
+from optid.errors import LookupFailed, StructureError
+from optid.registry import CONSTRAINTS, FORMULATIONS, check_arguments, formulation, named_constraint, registered
+
+
+def test_every_entry_point_loads_and_is_callable():
+    for group in (FORMULATIONS, CONSTRAINTS):
+        assert registered(group)
+        for point in registered(group).values():
+            assert callable(point.load())
+    assert set(registered(FORMULATIONS)) >= {"arx", "hammerstein_arx.exact", "hammerstein_arx.nuclear"}
+
+
+def test_every_rule_of_the_catalogue_has_a_word():
+    words = {point.value.split(":")[1] for point in registered(CONSTRAINTS).values()}
+    assert words == set(shape.__all__) - {"fixed"}  # a known parameter is an array, which no word can carry
+
+
+@pytest.mark.parametrize("text, name", [
+    ("monotone", "monotone:increasing"),
+    ("monotone:decreasing", "monotone:decreasing"),
+    ("monotone:increasing,channel=valve", "monotone:increasing[valve]"),
+    ("stable:0.9", "stable:0.9"),
+    ("gain:2.5", "gain"),
+    ("gain:low=1,high=2", "gain"),
+    ("dead_zone:-0.1,0.1", "dead_zone:-0.1,0.1"),
+    ("sign:b,negative", "sign:b:negative"),
+    ("range:high=3", "range"),
+    ("coefficients:a,low=-1,index=0", "coefficients:a"),
+])
+def test_words_become_rules(text, name):
+    assert named_constraint(text).name == name
+
+
+def test_a_word_means_what_the_function_means():
+    one, other = (optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[rule]).solution.objective
+                  for rule in ("gain:low=1,high=2,at=0.1", shape.gain(low=1, high=2, at=0.1)))
+    assert one == pytest.approx(other, rel=1e-12)
+
+
+@pytest.mark.parametrize("text, error, words", [
+    ("monoton:increasing", LookupFailed, "Did you mean 'monotone'"),
+    ("monotone:sideways", StructureError, "'increasing' or 'decreasing'"),
+    ("gain:1,2,3,4,5,6", StructureError, "used as gain"),
+    ("gain:hight=2", StructureError, "hight"),
+])
+def test_words_that_are_wrong(text, error, words):
+    with pytest.raises(error, match=words):
+        named_constraint(text)
+
+
+@pytest.mark.parametrize("name", ["hammerstein_arx.exat", 3, None])
+def test_unknown_formulations(name):
+    with pytest.raises(LookupFailed, match="no formulation is called"):
+        formulation(name)
+
+
+def test_a_callable_is_its_own_formulation():
+    def mine(data, *, order):
+        return data, order
+
+    assert formulation(mine) == ("mine", mine)
+    check_arguments("mine", mine, {"order": 2})
+    with pytest.raises(StructureError, match="'mine' needs order"):
+        check_arguments("mine", mine, {})
+    with pytest.raises(StructureError, match="no argument 'oder'. Did you mean 'order'"):
+        check_arguments("mine", mine, {"oder": 2})
+    check_arguments("open", lambda data, **anything: None, {"whatever": 1})
