@@ -54,7 +54,7 @@ class Lifted:
                 alone.append(i)
                 continue
             start, (p, q) = _block_starts(problem)[i], problem.blocks[i]
-            cone = self.cones.pop(i)
+            cone = self.cones[i]  # it stays: the products alone also hold where b has no component along them
             products = np.zeros((len(rows) * len(cone), self.size))
             products[:, start : start + p * q] = np.kron(-rows, cone)
             self.add(products, np.zeros(len(products)), False)
