@@ -69,7 +69,7 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
     for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
         size = float(np.linalg.norm(b)) or 1.0  # the sign stays: constraints may depend on it
         if form.gauge != "norm":
-            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), np.asarray(b), mu_name)
+            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), np.asarray(b, dtype=float), mu_name)
         values[mu_name] = mu * size
         values[b_name] = np.reshape(b / size, program.variables[b_name].shape, order="F")
     return values
