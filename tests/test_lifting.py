@@ -88,7 +88,7 @@ def test_products_of_two_cones():
                                                       constraints=[shape.monotone(), shape.sign("b")])
     lifted = lift_exact(program, program.rank_one)
     assert set(lifted.cones) == set(lifted.directions) == {0}
-    assert lifted.add_products(program.rank_one.problem) == [] and not lifted.cones
+    assert lifted.add_products(program.rank_one.problem) == [] and set(lifted.cones) == {0}
     rows, right, equal = lifted.linear()
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
