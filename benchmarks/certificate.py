@@ -19,10 +19,10 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.special import ndtr
 
-from optid.bilinear import best_of
-from optid.bilinear_cone import minimise_in_cones
 from optid.certificate import certify, solve_certified
 from optid.rank_one import RankOne, reduce
+from optid.rank_one.bilinear import best_of
+from optid.rank_one.cones import minimise_in_cones
 
 TOLERANCE = 1e-8
 

@@ -17,8 +17,8 @@ from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataWarning
-from optid.layout import Layout
 from optid.regressors import collect
+from optid.regressors.layout import Layout
 from optid.uncertainty import uncertainty
 
 VALUES = TRUTHS["dead zone"]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.bases import fitted_bases
-from optid.basis import Basis
+from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity

@@ -22,15 +22,15 @@ import numpy as np
 
 from formulations.equation_error import EquationError, compress, residual_programme
 from formulations.losses import with_loss
-from optid.basis import Basis
-from optid.bilinear import starts
+from optid.bases.basis import Basis
+from optid.certificate.lifting import certify_nuclear, certify_rank_one
 from optid.data import Data
 from optid.errors import StructureError
-from optid.gauges import gauge_factor
-from optid.lifting import certify_nuclear, certify_rank_one
 from optid.models import HammersteinARX
+from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Core, reduce
+from optid.rank_one.bilinear import starts
 from optid.solving import Procedure
 from optid.streams import Stream
 

@@ -1,5 +1,5 @@
 """``python -m optid`` is the command line."""
 
-from optid.cli import app
+from optid.cli.app import app
 
 app(prog_name="optid")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from optid import preprocessing
-from optid.arrays import as_samples, is_scalar_list
 from optid.channels import (
     Channel,
     Transform,
@@ -19,6 +18,7 @@ from optid.channels import (
     sampling_time,
 )
 from optid.errors import DataError, nearest
+from optid.reading.arrays import as_samples, is_scalar_list
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optid.basis import Basis
+from optid.bases.basis import Basis
 from optid.channels import count_levels
 from optid.data import Data
 from optid.errors import DataError, DataWarning

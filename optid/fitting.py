@@ -84,7 +84,7 @@ class Fit:
         return uncertainty(self)
 
     def __str__(self) -> str:
-        from optid.printing import describe
+        from optid.showing.printing import describe
 
         return describe(self)
 

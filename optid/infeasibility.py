@@ -6,7 +6,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.lifting import lift_exact, places
+from optid.certificate.lifting import lift_exact, places
 from optid.program import EQUALITIES, Program
 
 

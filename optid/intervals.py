@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import stdtrit
 
-from optid.basis import Array
+from optid.bases.basis import Array
 from optid.errors import StructureError
 
 REACH = 8.0

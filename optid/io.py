@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from optid.bases import from_dict
 from optid.errors import LookupFailed, ModelFileError, StructureError
-from optid.nonlinearity import Nonlinearity
+from optid.models.nonlinearity import Nonlinearity
 
 if TYPE_CHECKING:
     from optid.models import HammersteinARX

@@ -12,12 +12,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from optid import panels
-from optid.basis import Array
+from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, DataWarning
-from optid.estimates import uncertainty
-from optid.panels import BLUE, INK, MUTED, ORANGE, STYLE, shorten, with_unit
+from optid.showing import panels
+from optid.showing.estimates import uncertainty
+from optid.showing.panels import BLUE, INK, MUTED, ORANGE, STYLE, shorten, with_unit
 from optid.validation import validate
 
 if TYPE_CHECKING:

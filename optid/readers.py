@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_samples
 from optid.channels import sampling_time
-from optid.columns import (
+from optid.data import Data
+from optid.errors import DataError
+from optid.reading.arrays import as_samples
+from optid.reading.columns import (
     TIME_TOLERANCE,
     Wanted,
     agreed_step,
@@ -20,10 +22,8 @@ from optid.columns import (
     time_column,
     uniform_step,
 )
-from optid.data import Data
-from optid.errors import DataError
+from optid.reading.tables import Table, open_table
 from optid.streams import Stream, open_stream
-from optid.tables import Table, open_table
 
 __all__ = ["Stream", "open_stream", "read"]
 

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from optid import __version__, estimates, plots, summary, wording
+from optid import __version__, plots
 from optid.data import Data
 from optid.errors import DataError, DataWarning
-from optid.printing import describe
-from optid.svg import inline
+from optid.showing import estimates, summary, wording
+from optid.showing.printing import describe
+from optid.showing.svg import inline
 from optid.validation import Validation, validate
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from optid import simulation
-from optid.basis import Array
+from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import simulation
 from optid.streams import Stream
 from optid.uncertainty import Quantity, Uncertainty, aligned
 

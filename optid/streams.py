@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import check_finite, check_integers
 from optid.channels import Transform, channel_names, channel_units, check_distinct, sampling_time
-from optid.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
-from optid.csvfile import open_csv
 from optid.errors import DataError
-from optid.npyfile import NpyFile, open_npy
-from optid.tables import TABLES, existing, position_names
+from optid.reading.arrays import check_finite, check_integers
+from optid.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
+from optid.reading.csvfile import open_csv
+from optid.reading.npyfile import NpyFile, open_npy
+from optid.reading.tables import TABLES, existing, position_names
 
 CHUNK = 131072
 """Samples read at a time: two channels of float64 fit into the second-level cache of a common processor."""

@@ -17,7 +17,7 @@ from cvxpy.constraints.second_order import SOC
 from cvxpy.constraints.zero import Equality, Zero
 from cvxpy.expressions.expression import Expression
 
-from optid.basis import Array
+from optid.bases.basis import Array
 from optid.errors import RankError, StructureError
 from optid.intervals import LocalEstimate
 from optid.program import Program

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.basis import Array
+from optid.bases.basis import Array
+from optid.bases.expansions import Linear
 from optid.errors import StructureError
-from optid.expansions import Linear
 from optid.tangent import Tangent, linearise
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import optid
-from optid.cli import app
+from optid.cli.app import app
+from optid.cli.terminal import spread
 from optid.examples import EXAMPLES, example
-from optid.terminal import spread
 
 
 def run(*words: object):
@@ -355,7 +355,7 @@ def test_the_module_runs_and_says_its_version():
 
 def test_help_needs_nothing_heavy():
     code = (
-        "import sys; from typer.testing import CliRunner; from optid.cli import app;"
+        "import sys; from typer.testing import CliRunner; from optid.cli.app import app;"
         "assert CliRunner().invoke(app, ['fit', '--help']).exit_code == 0;"
         "print([m for m in ('numpy', 'scipy', 'cvxpy', 'casadi', 'numba', 'matplotlib', 'pandas') if m in sys.modules])"
     )
@@ -371,7 +371,7 @@ def test_an_error_goes_to_the_error_stream(tmp_path):
 
 def test_a_fit_without_a_report_needs_no_figures(csv, tmp_path):
     code = (
-        "import sys; from typer.testing import CliRunner; from optid.cli import app;"
+        "import sys; from typer.testing import CliRunner; from optid.cli.app import app;"
         f"r = CliRunner().invoke(app, ['fit', {str(csv)!r}, '--na', '1', '--nb', '1', '--basis', 'polynomial:3']);"
         "assert r.exit_code == 0, r.output; print([m for m in ('matplotlib', 'pandas') if m in sys.modules])"
     )

@@ -7,7 +7,7 @@ from problems import BASIS, record, search
 
 import optid
 from formulations import shape
-from optid.lifting import lift_exact, places
+from optid.certificate.lifting import lift_exact, places
 from optid.registry import formulation
 
 SETS = {

@@ -5,7 +5,7 @@ import pytest
 from sample_fits import example_fit, linear_fit, mimo_fit
 
 import optid
-from optid.printing import describe, describe_validation
+from optid.showing.printing import describe, describe_validation
 
 
 def rows(text: str, title: str) -> dict[str, list[str]]:

@@ -11,12 +11,12 @@ from systems import by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
 from optid.bases import Linear, Triangular
-from optid.correlations import autocorrelation, cross_correlation
 from optid.data import Data
 from optid.errors import DataError, DataWarning
 from optid.regressors import collect
-from optid.structure import structure_test, weighted_problem
 from optid.validation import Measures, fit_percent, validate
+from optid.validation.correlations import autocorrelation, cross_correlation
+from optid.validation.structure import structure_test, weighted_problem
 
 
 def record(model, count=800, seed=1, noise=0.1):

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import optid
-from optid.panels import STYLE
+from optid.showing.panels import STYLE
 
 BETA = 0.75
 """Gauge of the dissertation: b = v_1 / beta, so that b has norm 4/3."""

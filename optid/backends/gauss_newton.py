@@ -10,13 +10,13 @@ import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
-from optid.bilinear import minimise, starts
 from optid.errors import StructureError
-from optid.gauges import gauge_factor
 from optid.infeasibility import satisfiable
 from optid.judging import measure_violation
+from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
+from optid.rank_one.bilinear import minimise, starts
 from optid.solution import Status
 
 STEPS = 100

@@ -14,7 +14,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.lifting import places
+from optid.certificate.lifting import places
 from optid.program import EQUALITIES, INEQUALITIES, Program, RankOneForm, Values
 from optid.rank_one import Point
 from optid.solution import Status

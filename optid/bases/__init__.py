@@ -1,0 +1,126 @@
+"""The bases by name: what a user imports, writes on a command line and finds in a model file."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from optid.bases.basis import Basis
+from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions, restore
+from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+
+if TYPE_CHECKING:
+    from optid.data import Data
+    from optid.streams import Stream
+
+__all__ = [
+    "BSpline",
+    "Basis",
+    "Linear",
+    "PiecewiseConstant",
+    "Polynomial",
+    "Triangular",
+    "Trigonometric",
+    "UserFunctions",
+    "fitted_bases",
+    "from_dict",
+    "parse",
+]
+
+_CLASSES: dict[str, Callable[..., Basis]] = {
+    "triangular": Triangular,
+    "trigonometric": Trigonometric,
+    "polynomial": Polynomial,
+    "bspline": BSpline,
+    "piecewiseconstant": PiecewiseConstant,
+    "linear": Linear,
+}
+_ALIASES = {"legendre": "polynomial", "hat": "triangular"}
+_OPTIONS: dict[str, Callable[[str], Any]] = {"degree": int, "half_range": float, "outside": str}
+
+
+def parse(text: str) -> Basis:
+    """Read a basis as the command line writes it.
+
+    Args:
+        text: the class name in lower case and its size, then options: "triangular:10", "legendre:4",
+            "bspline:8:degree=2", "trigonometric:5:half_range=1.25:outside=extrapolate", "linear".
+
+    Raises:
+        LookupFailed: no basis has this name.
+        StructureError: the size or an option cannot be read.
+    """
+    name, *parts = text.strip().lower().split(":")
+    name = _ALIASES.get(name, name)
+    if name not in _CLASSES:
+        raise LookupFailed(f"No basis {name!r}. {nearest(name, [*_CLASSES, *_ALIASES])}")
+    sizes = [part for part in parts if "=" not in part]
+    if len(sizes) != (name != "linear"):
+        raise StructureError(
+            f"Basis {text!r}: write {'linear' if name == 'linear' else name + ':10'}, options as key=value."
+        )
+    try:
+        options = {key: _OPTIONS[key](value) for key, value in (part.split("=", 1) for part in parts if "=" in part)}
+        return _CLASSES[name](*map(int, sizes), **options)
+    except StructureError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise StructureError(
+            f"Basis {text!r} cannot be read ({error}): write {name}:10, then options such as outside=extrapolate."
+        ) from error
+
+
+def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | str]") -> tuple[Basis, ...]:
+    """Return one basis per input; a basis without an interval takes the range of its input.
+
+    Args:
+        data: the record.
+        basis: one basis (or its name, as for `parse`) for all inputs, or one per input.
+
+    Raises:
+        StructureError: a wrong number of bases.
+        DataError: an input that is constant or without any sample.
+    """
+    inputs = data.inputs
+    several = list(basis) if isinstance(basis, list | tuple) else [basis] * len(inputs)
+    if len(several) != len(inputs):
+        raise StructureError(f"{len(several)} bases for {len(inputs)} inputs ({', '.join(inputs)}): give one each")
+    fitted = []
+    for channel, one, lo, hi in zip(inputs, several, *data.ranges()):
+        family: Any = parse(one) if isinstance(one, str) else one
+        if not hasattr(family, "fitted"):
+            raise StructureError(f"the basis of input {channel!r} is {one!r}: give one such as Triangular(10) or "
+                                 "its name, 'triangular:10'")
+        if lo != lo:
+            raise DataError(f"input {channel!r} has no sample at all; choose another column or drop the input")
+        if lo == hi:
+            raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
+                            "excite the input or drop the channel")
+        fitted.append(family.fitted(float(lo), float(hi)))
+    return tuple(fitted)
+
+
+def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:
+    """Build the basis that `Basis.to_dict` described.
+
+    Args:
+        description: {"type": name, ...}.
+        functions: the functions of a UserFunctions basis by name, each a callable or (callable, slope).
+
+    Raises:
+        LookupFailed: unknown type.
+        StructureError: arguments that do not fit the type, or functions that are not supplied.
+    """
+    arguments = dict(description)
+    name = str(arguments.pop("type", ""))
+    if arguments.get("interval") is not None:
+        arguments["interval"] = tuple(float(end) for end in arguments["interval"])
+    if name == "userfunctions":
+        names = [str(word) for word in arguments.pop("names", [])]
+        callables, slopes = restore(names, functions or {})
+        return UserFunctions(callables, tuple(names), slopes, **arguments)
+    if name not in _CLASSES:
+        raise LookupFailed(f"No basis {name!r}. {nearest(name, [*_CLASSES, 'userfunctions'])}")
+    try:
+        return _CLASSES[name](**arguments)
+    except TypeError as error:
+        raise StructureError(f"Basis {name!r} cannot be built from {sorted(arguments)}: {error}.") from error

@@ -1,0 +1,382 @@
+"""Proofs of global optimality for least squares in rank-one blocks.
+
+A ladder, cheapest first. *Instant*: the combination of 2 x 2 minors that the gradient at the point dictates, and one
+Cholesky factorisation. *Ascent*: alternating projections over the remaining minors. *SDP*: all minors (and, with shape
+constraints, products of constraints), whose moment matrix proposes a better point when the proof fails. Every bound is
+recomputed in closed form from its multipliers after a Cholesky check; nothing is copied from a solver.
+"""
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from optid.certificate.ascent import ascend, rotation
+from optid.certificate.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
+from optid.certificate.sdp import relax, relaxation_size
+from optid.certificate.shape_duals import (
+    ACTIVE,
+    Linear,
+    Multipliers,
+    align_cuts,
+    as_cones,
+    as_linear,
+    kkt_multipliers,
+    sign_free_cut,
+)
+from optid.errors import StructureError
+from optid.rank_one import Array, Core, Point, RankOne, matrices, reduce
+from optid.rank_one.bilinear import LocalSolution, best_of, descend, starts
+from optid.solution import Bound
+
+TOLERANCE = 1e-8
+PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
+SHRINKS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
+EFFORTS = ("instant", "ascent", "sdp")
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Multipliers of a bound, in the whitened coordinates of ``core``.
+
+    Attributes:
+        core: coordinates; ``core.whitening.matrix()`` is the change K.
+        minors: (k, k) combination of minors.
+        cuts: by block, weights (r, r, nb, nb): ``cuts[j, k]`` is the matrix W >= 0 of the product of rows j and k.
+        linear: (r,) multipliers of the constraints on the lifted vector.
+    """
+
+    core: Core
+    minors: Array
+    cuts: dict[int, Array]
+    linear: Array
+
+    def forms(self) -> Array:
+        """The quadratic form of the minors in the original coordinates of the core (k, k)."""
+        change = self.core.whitening.matrix()
+        return change.T @ self.minors @ change
+
+
+@dataclass(frozen=True, eq=False)
+class Certification:
+    """Outcome of an attempt to prove a point.
+
+    Attributes:
+        bound: lower bound on the global optimum.
+        gap: (F - D) / max(F, 1e-9 Y^T Y).
+        better: candidates for a better point, to restart a local method from; only from the SDP.
+    """
+
+    bound: Bound
+    gap: float
+    better: tuple[Point, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What the stages share, in whitened coordinates; block indices are those of the core.
+
+    Attributes:
+        problem: the problem.
+        core: its reduction.
+        mus: (P_i,) each, oriented so that C mu >= 0.
+        bs: (nb_i,) each, of unit length.
+        objective: the objective around the point.
+        cones: constraint matrices by block.
+        multipliers: KKT multipliers.
+        linear: constraints on the lifted vector.
+        began: clock at the start.
+    """
+
+    problem: RankOne
+    core: Core
+    mus: list[Array]
+    bs: list[Array]
+    objective: Lagrangian
+    cones: dict[int, Array]
+    multipliers: Multipliers
+    linear: Linear | None
+    began: float
+
+    @property
+    def blocks(self) -> list[Block]:
+        """Position and shape of every block of the core."""
+        edges = np.cumsum([self.core.linear, *(p * nb for p, nb in self.core.shapes)])
+        return [(slice(int(a), int(b)), shape) for a, b, shape in zip(edges[:-1], edges[1:], self.core.shapes)]
+
+    @property
+    def vanishing(self) -> list[bool]:
+        """Whether a block is zero: its minors are then all free, and its gradient must vanish by itself."""
+        size = float(np.linalg.norm(self.objective.z))
+        return [bool(np.linalg.norm(mu) <= 1e-10 * size) for mu in self.mus]
+
+    @property
+    def masks(self) -> list[np.ndarray]:
+        """Entries of the minors that do not touch the gradient at the point, in rotated coordinates, by block."""
+        return [np.ones((p * nb, p * nb), bool) if vanishes else free_mask((p, nb))
+                for vanishes, (p, nb) in zip(self.vanishing, self.core.shapes)]
+
+    def violation(self) -> float:
+        """Largest violation of the constraints at the point, relative to the size of their terms."""
+        found = [np.zeros(1)]
+        for i, cone in self.cones.items():
+            terms = np.abs(cone) @ np.abs(self.mus[i])
+            found.append(-(cone @ self.mus[i]) / np.maximum(terms, np.finfo(float).tiny))
+        if self.linear is not None:
+            slack, terms = self.linear.slack(self.objective.z)
+            excess = np.where(self.linear.equality, np.abs(slack), -slack)
+            found.append(excess / np.maximum(terms, np.finfo(float).tiny))
+        return float(np.concatenate(found).max())
+
+    def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
+        """The objective with the linear terms, at the KKT multipliers or others."""
+        if self.linear is None:
+            return self.objective
+        chosen = self.multipliers.linear if multipliers is None else multipliers
+        return self.objective.with_linear(self.linear.rows, self.linear.slack(self.objective.z)[0], chosen)
+
+    def cut_form(self, cuts: dict[int, Array]) -> Array | None:
+        """The (k, k) form of the weights ``cuts[i]`` (r, r, nb, nb) of products of cone rows."""
+        if not cuts:
+            return None
+        form = np.zeros_like(self.objective.gram)
+        for i, weights in cuts.items():
+            cone, where = self.cones[i], self.blocks[i][0]
+            tensor = np.einsum("rsjl,rp,sq->jplq", weights, cone, cone, optimize=True)
+            part = tensor.reshape(form[where, where].shape)
+            form[where, where] = (part + part.T) / 2
+        return form
+
+
+def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = None, effort: str = "sdp",
+            steps: int = 100, max_size: int = 700, core: Core | None = None) -> Certification:
+    """Bound the global optimum from below and try to prove that a local solution attains it.
+
+    Args:
+        problem: the least-squares problem.
+        point: a local solution, of the constrained problem where there are constraints.
+        cones: by block, None or C_i (r_i, P_i): C_i mu_i >= 0 while the sign of b_i is free.
+        linear: (E, f, equality) on the lifted vector z = [w; vec Theta]: E z <= f, or = where the mask is set.
+        effort: last rung of the ladder: "instant", "ascent" or "sdp".
+        steps: of the ascent, one eigenvalue decomposition each.
+        max_size: number of multipliers above which the SDP is not attempted.
+        core: the reduced problem if at hand; used only without constraints.
+
+    Returns:
+        The bound, its gap and, after an SDP that did not prove the point, points to restart from.
+
+    Raises:
+        StructureError: constraints of a wrong shape, an unknown effort.
+    """
+    if effort not in EFFORTS:
+        raise StructureError(f"effort must be one of {EFFORTS}, not {effort!r}")
+    case = prepare(problem, point, as_cones(cones, problem), as_linear(linear, problem), core)
+    if not case.core.shapes and case.linear is None:
+        return conclude(case, "exact", "linear least squares", case.objective.gram, {})
+    cuts = instant_cuts(case)
+    minors = tangent(case, cuts)
+    found = conclude(case, "instant", "one Cholesky factorisation", minors, cuts)
+    if found.bound.proved or effort == "instant":
+        return found
+    risen, taken = rise(case, minors, cuts, steps)
+    if risen is None:
+        found = max((conclude(case, "ascent", "multipliers shrunk until positive definite", part * minors,
+                              {i: part * weights for i, weights in cuts.items()}, part * case.multipliers.linear)
+                     for part in PARTS), key=lambda attempt: attempt.bound.value)
+    else:
+        found = conclude(case, "ascent", f"{taken} projections", risen, cuts)
+    if found.bound.proved or effort == "ascent":
+        return found
+    size = relaxation_size(case.blocks, case.cones)
+    if size > max_size:
+        reason = f"{found.bound.reason}; the relaxation with {size} multipliers exceeds the limit {max_size}"
+        return replace(found, bound=replace(found.bound, reason=reason))
+    return relaxed(case, found, steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Certified:
+    """A fit and what is known about it.
+
+    Attributes:
+        solution: the best local solution found.
+        certification: bound, gap and proof.
+        starts: number of local descents.
+    """
+
+    solution: LocalSolution
+    certification: Certification
+    starts: int
+
+
+def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, count: int = 8, seed: int = 0,
+                    max_size: int = 700) -> Certified:
+    """Minimise without constraints and prove it: stop at the first proof, search on while there is none.
+
+    The order of work: whitened SVD start and instant proof; all starts, instant proof, ascent, SDP; restarts from its
+    moment matrix; four times as many random starts; the honest gap.
+
+    Args:
+        problem: the least-squares problem.
+        effort: last rung of the ladder of :func:`certify`.
+        steps: of the ascent.
+        count: number of starts.
+        seed: of the random ones.
+        max_size: largest SDP, in multipliers.
+    """
+    core = reduce(problem)
+    if not core.shapes:
+        best = descend(core, [], [])
+        return Certified(best, certify(problem, best.point, core=core), 1)
+    best = descend(core, *starts(core, 1, seed)[0])
+    proof = certify(problem, best.point, effort="instant", core=core)
+    if proof.bound.proved:
+        return Certified(best, proof, 1)
+    best = min(best, best_of(core, count, seed, first=1), key=lambda solution: solution.value)
+    proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+    tried = count
+    for round_ in range(2):
+        if proof.bound.proved or effort == "instant":
+            break
+        if proof.better:
+            again = [descend(core, *core.factors(point)[1:], alternations=1) for point in proof.better]
+        else:
+            again = [best_of(core, 4 * count, seed + 1 + round_, first=4)]
+        tried += len(proof.better) or 4 * (count - 1)
+        challenger = min(again, key=lambda solution: solution.value)
+        if challenger.value < best.value * (1 - 1e-10):
+            best = challenger
+            proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+        elif proof.better:
+            proof = replace(proof, better=())
+    return Certified(best, proof, tried)
+
+
+def prepare(problem: RankOne, point: Point, cones: dict[int, Array], linear: Linear | None,
+            core: Core | None = None) -> Case:
+    """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
+    began = perf_counter()
+    keep_linear = linear is not None and bool(linear.rows[:, :problem.linear].any())
+    if core is None or cones or linear is not None:
+        keep = tuple(cones) if linear is None else tuple(range(len(problem.blocks)))
+        core = reduce(problem, keep, keep_linear)
+    w, mus, bs = core.factors(point)
+    white = {core.kept.index(i): core.whitening.cone(core.kept.index(i), cone) for i, cone in cones.items()}
+    for i, cone in white.items():
+        if (cone @ mus[i]).sum() < 0:
+            mus[i], bs[i] = -mus[i], -bs[i]
+    z = np.concatenate([w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
+    residual = core.root @ z - core.target
+    slope = core.root.T @ residual
+    value = float(residual @ residual) + problem.remainder
+    if linear is not None:
+        rows = linear.rows if keep_linear else linear.rows[:, problem.linear:]
+        linear = Linear(core.whitening.columns(rows), linear.right, linear.equality)
+    multipliers = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
+    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, multipliers, linear, began)
+
+
+def instant_cuts(case: Case) -> dict[int, Array]:
+    """Sign-free cuts at the KKT multipliers: they cancel what the constraints leave of the gradient."""
+    return {i: np.multiply.outer(sign_free_cut(case.multipliers.cones[i], cone, case.mus[i]),
+                                 np.outer(case.bs[i], case.bs[i])) for i, cone in case.cones.items()}
+
+
+def tangent(case: Case, cuts: dict[int, Array]) -> Array:
+    """Minors that cancel the rest of the gradient at the point, block by block; none for a block that is zero."""
+    slope = case.lagrangian().slope
+    form = case.cut_form(cuts)
+    if form is not None:
+        slope = slope - form @ case.objective.z
+    minors = np.zeros_like(case.objective.gram)
+    gradients = matrices(slope[case.core.linear:], case.core.shapes)
+    for (where, _), mu, b, vanishes, gradient in zip(case.blocks, case.mus, case.bs, case.vanishing, gradients):
+        if not vanishes:
+            gradient = gradient - np.outer(gradient @ b, b)
+            gradient = gradient - np.outer(mu, mu @ gradient) / (mu @ mu)
+            minors[where, where] = tangent_minors(-gradient, mu, b)
+    return minors
+
+
+def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple[Array | None, int]:
+    """Ascent from given multipliers that cancel the gradient; improved minors, or None, and the steps taken."""
+    form = case.cut_form(cuts)
+    matrix = case.objective.gram + minors - (0.0 if form is None else form)
+    turn = rotation(case.core.linear, case.mus, case.bs)
+    free, taken = ascend(turn.T @ matrix @ turn, case.blocks, case.masks, steps)
+    return (None if free is None else minors + onto_minors(case, turn @ free @ turn.T)), taken
+
+
+def onto_minors(case: Case, matrix: Array) -> Array:
+    """Remove the roundoff of a change of coordinates: exactly a combination of minors again."""
+    clean = np.zeros_like(matrix)
+    for where, shape in case.blocks:
+        clean[where, where] = project_minors(matrix[where, where], shape)
+    return clean
+
+
+def relaxed(case: Case, found: Certification, steps: int) -> Certification:
+    """The SDP: its bound made valid by shrinking, then its multipliers aligned with the point for an exact proof."""
+    method = "product cuts" if case.cones else "sdp"
+    relaxation = relax(case.objective, case.blocks, case.cones, case.linear)
+    if relaxation is None:
+        return replace(found, bound=replace(found.bound, reason=f"{found.bound.reason}; the SDP solver failed"))
+    better = tuple(_candidate(case, moment) for moment in relaxation.moments.T)
+    minors = onto_minors(case, relaxation.minors)
+    for shrink in SHRINKS:
+        cuts = {i: (1 - shrink) * weights for i, weights in relaxation.cuts.items()}
+        bound = conclude(case, method, "relaxation", (1 - shrink) * minors, cuts, relaxation.linear, better)
+        if np.isfinite(bound.bound.value):
+            found = bound if bound.bound.value > found.bound.value else replace(found, better=better)
+            break
+    if found.bound.proved:
+        return found
+    cuts = {i: align_cuts(weights, case.cones[i], case.mus[i], case.bs[i], case.multipliers.cones[i])
+            for i, weights in relaxation.cuts.items()}
+    aligned = tangent(case, cuts) + free_part(case, minors)
+    risen, taken = rise(case, aligned, cuts, steps)
+    if risen is not None:
+        bound = conclude(case, method, f"relaxation aligned with the point, {taken} projections", risen, cuts)
+        if bound.bound.value > found.bound.value:
+            return replace(bound, better=() if bound.bound.proved else better)
+    return found
+
+
+def free_part(case: Case, minors: Array) -> Array:
+    """The part of a combination of minors that does not touch the gradient at the point."""
+    turn = rotation(case.core.linear, case.mus, case.bs)
+    turned = turn.T @ minors @ turn
+    for (where, _), mask in zip(case.blocks, case.masks):
+        turned[where, where] *= mask
+    return onto_minors(case, turn @ turned @ turn.T)
+
+
+def _candidate(case: Case, moment: Array) -> Point:
+    """Rank-one point nearest to a vector, in the coordinates of the problem; w follows by back substitution."""
+    linear = case.core.linear
+    svds = [np.linalg.svd(theta, full_matrices=False) for theta in matrices(moment[linear:], case.core.shapes)]
+    return case.core.point([u[:, 0] * d[0] for u, d, _ in svds], [vt[0] for _, _, vt in svds],
+                           moment[:linear] if linear else None)
+
+
+def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, Array],
+             linear: Array | None = None, better: tuple[Point, ...] = ()) -> Certification:
+    """Recompute the bound from its multipliers and say what it proves."""
+    value = case.objective.value
+    bound = float(case.lagrangian(linear).bound(minors, case.cut_form(cuts)))
+    gap = float(case.problem.gap(value, bound))
+    broken = case.violation()
+    undercut = case.problem.gap(bound, value) > TOLERANCE
+    proved = gap <= TOLERANCE and not undercut and broken <= ACTIVE
+    if broken > ACTIVE or undercut:
+        reason = f"not proved: the point violates its constraints (relative violation {broken:.1e})"
+    elif proved:
+        reason = f"globally optimal, relative gap {gap:.1e}: {how}"
+    elif np.isfinite(bound):
+        reason = f"not proved, relative gap {gap:.1e}: {how}"
+    else:
+        reason = f"not proved, no finite bound: {how}"
+    evidence = Evidence(case.core, minors, cuts, case.multipliers.linear if linear is None else linear)
+    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
+                         () if proved else better)

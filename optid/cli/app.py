@@ -1,0 +1,374 @@
+"""The command line: fit, validate, and what there is to choose from."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from optid.cli.terminal import FILES, Command, Group, Waiting, coloured, hearing, note, say
+from optid.errors import DataError
+
+app = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode="rich",
+)
+
+RECORD, MODEL, SOLVER, RESULT = "The record", "The model", "The solver", "The result"
+
+Files = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="DATA...", help="CSV, Parquet, MAT, NPZ or npy files, one experiment each.", show_default=False
+    ),
+]
+Inputs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inputs",
+        "-u",
+        metavar="NAME...",
+        rich_help_panel=RECORD,
+        help="Columns of the inputs. [dim]u, u1, u2, ...[/]",
+    ),
+]
+Outputs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--outputs",
+        "-y",
+        metavar="NAME...",
+        rich_help_panel=RECORD,
+        help="Columns of the outputs. [dim]y, y1, y2, ...[/]",
+    ),
+]
+Dt = Annotated[
+    float | None,
+    typer.Option("--dt", rich_help_panel=RECORD, help="Sampling time; from the time stamps where there are some."),
+]
+Time = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="NAME",
+        rich_help_panel=RECORD,
+        help="Column of time stamps; 'none' ignores them. [dim]t, time[/]",
+    ),
+]
+Runs = Annotated[
+    str | None,
+    typer.Option(
+        "--experiment", metavar="NAME", rich_help_panel=RECORD, help="Column that names the experiment of each row."
+    ),
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--columns", metavar="NAME...", rich_help_panel=RECORD, help="Names of the columns of a file without a header."
+    ),
+]
+Delimiter = Annotated[str, typer.Option("--delimiter", rich_help_panel=RECORD, help="Between the cells of a CSV file.")]
+Decimal = Annotated[str, typer.Option("--decimal", rich_help_panel=RECORD, help="Decimal mark of a CSV file.")]
+Report = Annotated[
+    Path | None,
+    typer.Option("--report", "-o", metavar="FILE", rich_help_panel=RESULT, help="Write a self-contained HTML report."),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from optid import __version__
+
+        say(f"optid {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Identify Hammerstein systems by optimisation with constraints, with a proof of global optimality."""
+
+
+@app.command(cls=Command)
+def fit(
+    data: Files = None,
+    example: Annotated[
+        str | None,
+        typer.Option(
+            "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
+        ),
+    ] = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    dt: Dt = None,
+    time: Time = None,
+    experiment: Runs = None,
+    columns: Columns = None,
+    delimiter: Delimiter = ",",
+    decimal: Decimal = ".",
+    stream: Annotated[
+        bool,
+        typer.Option("--stream", rich_help_panel=RECORD, help="Read chunk by chunk: for a file larger than memory."),
+    ] = False,
+    split: Annotated[
+        float | None,
+        typer.Option(
+            "--split",
+            metavar="SHARE",
+            rich_help_panel=RECORD,
+            help="Fit on this share, validate on the rest, e.g. 0.7.",
+        ),
+    ] = None,
+    test: Annotated[
+        list[str] | None, typer.Option("--test", metavar=FILES, rich_help_panel=RECORD, help="Validate on these files.")
+    ] = None,
+    formulation: Annotated[
+        str, typer.Option("--formulation", "-f", metavar="NAME", rich_help_panel=MODEL, help="See optid formulations.")
+    ] = "hammerstein_arx.exact",
+    na: Annotated[int | None, typer.Option("--na", rich_help_panel=MODEL, help="Number of past outputs in A.")] = None,
+    nb: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--nb", metavar="N...", rich_help_panel=MODEL, help="Coefficients of B, one number or one per input."
+        ),
+    ] = None,
+    nk: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--nk", metavar="N...", rich_help_panel=MODEL, help="Delay in samples, one number or one per input."
+        ),
+    ] = None,
+    basis: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--basis",
+            metavar="NAME:SIZE...",
+            rich_help_panel=MODEL,
+            help="Basis of the nonlinearity, one or one per input, "
+            "e.g. triangular:10, polynomial:4, trigonometric:5, bspline:8.",
+        ),
+    ] = None,
+    constraint: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--constraint",
+            "-c",
+            metavar="NAME:VALUE...",
+            rich_help_panel=MODEL,
+            help="e.g. monotone:increasing; see optid constraints. 'none' drops those an example suggests.",
+        ),
+    ] = None,
+    loss: Annotated[
+        str | None, typer.Option("--loss", rich_help_panel=MODEL, help="squares, huber, huber:1.5 or l1.")
+    ] = None,
+    ridge: Annotated[
+        float | None, typer.Option("--ridge", rich_help_panel=MODEL, help="Weight of the size of Theta.")
+    ] = None,
+    curvature: Annotated[
+        float | None, typer.Option("--curvature", rich_help_panel=MODEL, help="Weight of the curvature of f.")
+    ] = None,
+    gauge: Annotated[
+        str | None, typer.Option("--gauge", rich_help_panel=MODEL, help="Scale between f and B: norm, gain or b0.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE...", rich_help_panel=MODEL, help="Any other argument of the formulation."
+        ),
+    ] = None,
+    solver: Annotated[
+        str, typer.Option("--solver", "-s", metavar="NAME", rich_help_panel=SOLVER, help="See optid solvers.")
+    ] = "auto",
+    accuracy: Annotated[
+        float, typer.Option("--accuracy", rich_help_panel=SOLVER, help="Relative, for any solver.")
+    ] = 1e-8,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            "--time-limit", metavar="SECONDS", rich_help_panel=SOLVER, help="Stop the solver after this time."
+        ),
+    ] = None,
+    prove: Annotated[
+        bool, typer.Option("--prove/--no-prove", rich_help_panel=SOLVER, help="Ask for a proof of global optimality.")
+    ] = True,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="KEY=VALUE...", rich_help_panel=SOLVER, help="Native options of the solver."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", rich_help_panel=RECORD, help="Seed of the noise of an example.")] = 0,
+    report: Report = None,
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", "-m", metavar="FILE", rich_help_panel=RESULT, help="Write the model (JSON)."),
+    ] = None,
+) -> None:
+    """Fit a model to a record, prove it optimal, and report it.
+
+    Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
+    --constraint monotone:increasing --report report.html
+    """
+    from optid.cli import arguments as words
+    from optid.fitting import fit as fit_model
+    from optid.showing.printing import describe, describe_validation
+
+    how = {
+        "inputs": inputs,
+        "outputs": outputs,
+        "dt": dt,
+        "time": time,
+        "experiment": experiment,
+        "columns": columns,
+        "delimiter": delimiter,
+        "decimal": decimal,
+    }
+    words.check_folders(model, report)
+    with hearing() as heard, Waiting() as waiting:
+        waiting.step("reading")
+        arguments: dict[str, Any] = {}
+        if example is None:
+            record: Any = words.read_record(data, how, stream=stream)
+        elif data:
+            raise DataError("give data files or --example, not both")
+        else:
+            record, arguments = words.example_record(example, seed, formulation)
+        given = {
+            "na": na,
+            "nb": words.whole_numbers(nb, "--nb"),
+            "nk": words.whole_numbers(nk, "--nk"),
+            "basis": words.one_or_all(words.listed(basis)),
+            "constraints": constraint,
+            "loss": loss,
+            "ridge": ridge,
+            "curvature": curvature,
+            "gauge": gauge,
+        }
+        arguments |= {key: value for key, value in given.items() if value is not None} | words.pairs(settings, "--set")
+        if arguments.get("constraints") == ["none"]:
+            del arguments["constraints"]
+        held_out: Any = words.read_record(test, how) if test else None
+        if split is not None and held_out is None:
+            record, held_out = words.split_record(record, split)
+        waiting.step(f"fitting {formulation}")
+        found = fit_model(
+            record,
+            formulation,
+            solver=solver,
+            accuracy=accuracy,
+            time_limit=time_limit,
+            prove=prove,
+            solver_options=words.pairs(option, "--option"),
+            **arguments,
+        )
+        waiting.step("standard errors")
+        text = describe(found)
+        if held_out is not None:
+            waiting.step("validating")
+            checked = describe_validation(found.model, held_out)
+            text += f"\n\n{held_out.n_samples} samples held out of the fit\n{checked}"
+        if model is not None:
+            found.model.save(model)
+        if report is not None:
+            from optid.report import write
+
+            waiting.step("writing the report")
+            write(found, report, held_out, command=shlex.join(["optid", *sys.argv[1:]]))
+    say(coloured(text))
+    said = " ".join(text.split())
+    for sentence in heard:
+        if " ".join(sentence.split()) not in said:
+            note(sentence)
+    for path, what in ((model, "model"), (report, "report")):
+        if path is not None:
+            say(f"{what} written to {path}")
+
+
+@app.command(cls=Command)
+def validate(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file written by fit --model.")],
+    data: Annotated[list[Path], typer.Argument(metavar="DATA...", help="Files of the record.")],
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    dt: Dt = None,
+    time: Time = None,
+    experiment: Runs = None,
+    columns: Columns = None,
+    delimiter: Delimiter = ",",
+    decimal: Decimal = ".",
+) -> None:
+    """Validate a saved model on another record: fit, simulation, residual tests.
+
+    Inputs, outputs and sampling time are those of the model where they are not given.
+    """
+    from optid.cli.arguments import read_record
+    from optid.io import load
+    from optid.showing.printing import describe_validation
+
+    with hearing() as heard, Waiting() as waiting:
+        waiting.step("reading")
+        loaded = load(model)
+        record: Any = read_record(
+            data,
+            {
+                "inputs": inputs or list(loaded.inputs),
+                "outputs": outputs or list(loaded.outputs),
+                "dt": loaded.dt if dt is None else dt,
+                "time": time,
+                "experiment": experiment,
+                "columns": columns,
+                "delimiter": delimiter,
+                "decimal": decimal,
+            },
+        )
+        waiting.step("validating")
+        text = describe_validation(loaded, record)
+    say(f"{loaded}\n\n{text}")
+    for sentence in heard:
+        if sentence not in text:
+            note(sentence)
+
+
+@app.command(cls=Command)
+def solvers() -> None:
+    """List every back end: what it accepts and whether it is installed."""
+    from optid.cli.listings import solvers as table
+
+    with Waiting() as waiting:
+        waiting.step("asking the back ends")
+        listing = table()
+    listing()
+
+
+@app.command(cls=Command)
+def formulations() -> None:
+    """List the formulations, their arguments and the variables that constraints may use."""
+    from optid.cli.listings import formulations as table
+
+    with Waiting() as waiting:
+        waiting.step("loading the formulations")
+        listing = table()
+    listing()
+
+
+@app.command(cls=Command)
+def constraints() -> None:
+    """List the constraints by the words the command line takes."""
+    from optid.cli.listings import constraints as table
+
+    table()()
+
+
+@app.command(cls=Command)
+def examples() -> None:
+    """List the built-in records."""
+    from optid.cli.listings import examples as table
+
+    table()()

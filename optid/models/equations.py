@@ -1,0 +1,37 @@
+"""A model as text: one difference equation per output."""
+
+from typing import TYPE_CHECKING
+
+from optid.bases.expansions import Linear
+from optid.models import simulation
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_arx import HammersteinARX
+
+
+def written(model: "HammersteinARX", digits: int = 4) -> str:
+    """Write one difference equation per output, with coefficients of so many significant digits."""
+    return "\n".join(_equation(model, o, digits) for o in range(model.l))
+
+
+def _equation(model: "HammersteinARX", o: int, digits: int) -> str:
+    terms = []
+    for i, matrix in enumerate(simulation.matrices_of(model), start=1):
+        terms += [(-float(matrix[o, p]), f"{name}(k-{i})") for p, name in enumerate(model.outputs)]
+    for c, (name, f) in enumerate(zip(model.inputs, model.nonlinearities)):
+        linear = isinstance(f.basis, Linear)
+        function = "f" if model.m == 1 else f"f_{name}"
+        for lag, row in simulation.lagged(model, c):
+            sample = f"{name}(k-{lag})" if lag else f"{name}(k)"
+            gain = float(row[o]) * (float(f.mu[0]) if linear else 1.0)
+            terms.append((gain, sample if linear else f"{function}({sample})"))
+    if model.c0 is None:
+        terms.append((float(model.offset[o]), ""))
+    text = ""
+    for value, name in terms:
+        if value:
+            size = f"{abs(value):.{digits}g}" + (f" {name}" if name else "")
+            text += (" - " if value < 0 else " + ") + size
+    text = text.removeprefix(" + ")
+    text = "-" + text.removeprefix(" - ") if text.startswith(" - ") else text
+    return f"{model.outputs[o]}(k) = {text or '0'}"

@@ -1,0 +1,177 @@
+"""Models for other tools: SciPy, python-control, and CasADi for predictive control."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.basis import Array, Basis, span
+from optid.bases.expansions import Linear, Polynomial, Trigonometric
+from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
+from optid.errors import OptidError, StructureError, nearest
+from optid.models import simulation
+from optid.models.nonlinearity import Nonlinearity
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_arx import HammersteinARX
+
+
+def to_dlti(model: "HammersteinARX", output: int | str = 0, input: int | str = 0) -> Any:
+    """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
+
+    The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
+    state-space system.
+
+    Args:
+        model: the model.
+        output: name or index of the output.
+        input: name or index of the input.
+
+    Raises:
+        StructureError: unknown channel.
+    """
+    from scipy.signal import dlti
+
+    o, c = _position(output, model.outputs, "output"), _position(input, model.inputs, "input")
+    if model.l == 1:
+        return dlti(*_polynomials(model, c), dt=model.dt)
+    a, b, c_matrix, d = state_space(model)
+    return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
+
+
+def to_control(model: "HammersteinARX") -> Any:
+    """Return the linear part, from every f to every output, as a python-control system.
+
+    Its inputs are the values of the nonlinearities; the constant is not part of it. With one output it is a transfer
+    function, with several a state-space system.
+
+    Raises:
+        OptidError: python-control is not installed.
+    """
+    try:
+        import control
+    except ImportError as error:
+        raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
+    if model.l > 1:
+        return control.ss(*state_space(model), model.dt)
+    pairs = [_polynomials(model, c) for c in range(model.m)]
+    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt)
+
+
+def to_casadi(model: "HammersteinARX") -> Any:
+    """Return the model as a `casadi.Function` (x, u) -> (x_next, y) without noise.
+
+    x has n l entries, n = `model.memory`: the rows of the state (n, l) one after the other, row i being what the past
+    adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The
+    constant is part of y. Outside the interval of its basis f is clamped or extrapolated as chosen (outside="error"
+    clamps, since a symbolic function cannot raise). Iterating equals `model.simulate`.
+
+    Raises:
+        StructureError: a basis of UserFunctions, which has no symbolic form.
+    """
+    import casadi as ca
+
+    n, outputs = model.memory, model.l
+    x, u = ca.MX.sym("x", n * outputs), ca.MX.sym("u", model.m)
+    received = [ca.MX(model.offset if i == 0 else np.zeros(outputs)) for i in range(n + 1)]
+    for c, nonlinearity in enumerate(model.nonlinearities):
+        f = symbolic(nonlinearity, u[c])
+        for lag, row in simulation.lagged(model, c):
+            received[lag] += ca.DM(row) * f
+    rows = [x[i * outputs : (i + 1) * outputs] for i in range(n)] + [ca.MX.zeros(outputs)]
+    y = rows[0] + received[0]
+    following = [rows[i] + received[i] for i in range(1, n + 1)]
+    for i, a in enumerate(simulation.matrices_of(model)):
+        following[i] -= ca.DM(a) @ y
+    return ca.Function("hammerstein_arx", [x, u], [ca.vertcat(*following), y], ["x", "u"], ["x_next", "y"])
+
+
+def state_space(model: "HammersteinARX") -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C, D of the linear part in observer form, with n l states."""
+    n, outputs = model.memory, model.l
+    rows = np.zeros((n + 1, outputs, model.m))
+    for c in range(model.m):
+        for lag, row in simulation.lagged(model, c):
+            rows[lag, :, c] = row
+    a, b = np.eye(n * outputs, k=outputs), rows[1:].reshape(n * outputs, model.m)
+    for i, matrix in enumerate(simulation.matrices_of(model)):
+        at = slice(i * outputs, (i + 1) * outputs)
+        a[at, :outputs] -= matrix
+        b[at] -= matrix @ rows[0]
+    return a, b, np.eye(outputs, n * outputs), rows[0]
+
+
+def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
+    """Write f of a CasADi scalar as an expression, the constant included.
+
+    Raises:
+        StructureError: a basis without a symbolic form.
+    """
+    import casadi as ca
+
+    basis, mu = nonlinearity.basis, nonlinearity.mu
+    if basis.interval is not None and basis.outside != "extrapolate":
+        u = ca.fmin(ca.fmax(u, basis.interval[0]), basis.interval[1])
+    if isinstance(basis, Linear):
+        f = float(mu[0]) * u
+    elif isinstance(basis, (Triangular, PiecewiseConstant, BSpline)):
+        f = _piecewise(basis, mu, u)
+    elif isinstance(basis, Polynomial):
+        f = _legendre(basis, mu, u)
+    elif isinstance(basis, Trigonometric):
+        lo, hi = span(basis)
+        angle = np.pi * (u - (lo + hi) / 2) / (basis.half_range * (hi - lo) / 2)
+        f = sum(mu[2 * j] * ca.cos((j + 1) * angle) + mu[2 * j + 1] * ca.sin((j + 1) * angle) for j in range(basis.p))
+    else:
+        raise StructureError(
+            f"{type(basis).__name__} has no symbolic form for CasADi: fit the model again with BSpline or Triangular."
+        )
+    return f + (nonlinearity.offset or 0.0)
+
+
+def _piecewise(basis: Triangular | PiecewiseConstant | BSpline, mu: Array, u: Any) -> Any:
+    """One polynomial per cell in the position within the cell; the end cells reach outwards."""
+    import casadi as ca
+
+    lo, hi = span(basis)
+    degree = {Triangular: 1, PiecewiseConstant: 0}.get(type(basis), getattr(basis, "degree", 0))
+    x = (u - lo) * (basis.p / (hi - lo))
+    inside = (np.arange(degree + 1) + 0.5) / (degree + 1)
+    points = lo + (np.arange(basis.p)[:, None] + inside) * (hi - lo) / basis.p
+    values = (basis.values(points.ravel()) @ mu).reshape(points.shape)
+    pieces = np.linalg.solve(np.vander(inside), values.T).T
+    f = None
+    for cell, coefficients in enumerate(pieces):
+        piece = float(coefficients[0])
+        for coefficient in coefficients[1:]:
+            piece = piece * (x - cell) + float(coefficient)
+        f = piece if f is None else ca.if_else(x >= cell, piece, f)
+    return f
+
+
+def _legendre(basis: Basis, mu: Array, u: Any) -> Any:
+    lo, hi = span(basis)
+    v = (2 * u - lo - hi) / (hi - lo)
+    previous, current, f = 1.0, v, mu[0] * v
+    for k in range(1, len(mu)):
+        previous, current = current, ((2 * k + 1) * v * current - k * previous) / (k + 1)
+        f = f + mu[k] * current
+    return f
+
+
+def _polynomials(model: "HammersteinARX", c: int) -> tuple[Array, Array]:
+    """Numerator without leading zeros and denominator in powers of z, for one output."""
+    n = model.memory
+    numerator, denominator = np.zeros(n + 1), np.zeros(n + 1)
+    denominator[: model.na + 1] = np.concatenate([[1.0], model.a])
+    numerator[model.nk[c] : model.nk[c] + model.nb[c]] = model.b[c]
+    return np.trim_zeros(numerator, "f") if numerator.any() else np.zeros(1), denominator
+
+
+def _position(channel: int | str, names: tuple[str, ...], kind: str) -> int:
+    if isinstance(channel, str):
+        if channel not in names:
+            raise StructureError(f"No {kind} {channel!r}. {nearest(channel, names)}")
+        return names.index(channel)
+    if not 0 <= channel < len(names):
+        raise StructureError(f"{kind} {channel}: there are {len(names)}, counted from 0.")
+    return channel

@@ -1,0 +1,67 @@
+"""A static nonlinearity: a basis, its coefficients and, where the data determine it, an offset."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array, Basis
+from optid.errors import StructureError
+
+CHUNK = 65536
+"""Samples evaluated at a time, so that no table of samples x functions is formed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nonlinearity:
+    """f(u) = eta(u)^T mu + offset.
+
+    Attributes:
+        basis: a basis with its interval.
+        mu: (P,) coefficients.
+        offset: the constant of f; None where it cannot be told from the constant of the model, and counted as zero.
+
+    Raises:
+        StructureError: mu does not have one finite coefficient per basis function.
+    """
+
+    basis: Basis
+    mu: Array
+    offset: float | None = None
+
+    def __post_init__(self) -> None:
+        mu = np.array(self.mu, dtype=float)
+        if mu.shape != (self.basis.size,):
+            raise StructureError(
+                f"mu has shape {mu.shape}; a {type(self.basis).__name__} of this size needs ({self.basis.size},)."
+            )
+        if not np.all(np.isfinite(mu)):
+            raise StructureError(f"mu[{int(np.argmin(np.isfinite(mu)))}] is not finite.")
+        mu.flags.writeable = False
+        object.__setattr__(self, "mu", mu)
+
+    def __call__(self, u: ArrayLike) -> Any:
+        """Evaluate f at u, any shape; NaN where u is NaN.
+
+        Raises:
+            DataError: a sample outside the interval of a basis with outside="error".
+        """
+        u = np.asarray(u, dtype=float)
+        flat, table = u.ravel(), self.basis.contrast @ self.mu
+        f = np.empty(flat.size)
+        for start in range(0, flat.size, CHUNK):
+            part = flat[start : start + CHUNK]
+            first, weights = self.basis.local(part)
+            sums = np.full(part.size, self.offset or 0.0)
+            for i, weight in enumerate(weights.T):
+                sums += weight * table[first + i]
+            sums[np.isnan(part)] = np.nan
+            f[start : start + CHUNK] = sums
+        return float(f[0]) if u.ndim == 0 else f.reshape(u.shape)
+
+    def slope(self, u: ArrayLike) -> Any:
+        """Evaluate f'(u), any shape; to the right at kinks, zero where f is clamped."""
+        u = np.asarray(u, dtype=float)
+        slopes = self.basis.slopes(u.ravel()) @ self.mu
+        return float(slopes[0]) if u.ndim == 0 else slopes.reshape(u.shape)

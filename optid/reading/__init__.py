@@ -1,0 +1,1 @@
+"""Files and frames: CSV, tables, npy, columns and the checks of arrays."""

@@ -1,0 +1,260 @@
+"""What there is to say about a fit, in words and rows; the printed result and the HTML page both read it here."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.expansions import Linear
+from optid.data import Data
+from optid.showing.wording import Table, gap_text, number, percent, seconds
+from optid.solution import Status
+
+if TYPE_CHECKING:
+    from optid.fitting import Fit
+    from optid.validation import Validation
+
+Facts = list[tuple[str, str]]
+
+PRICE_NOTE = "Price: points of one-step fit (%) gained per unit by which the dearest row of the constraint is relaxed."
+
+
+def title(fit: "Fit") -> str:
+    """Say what was identified from what."""
+    model = fit.model
+    linear = all(isinstance(f.basis, Linear) for f in model.nonlinearities)
+    return f"{'Linear' if linear else 'Hammerstein'} ARX model of {_and(model.outputs)} from {_and(model.inputs)}"
+
+
+def verdict(fit: "Fit") -> tuple[str, str, str]:
+    """Return a tone ("good", "fair", "bad"), the status in words, and one sentence that says what it means."""
+    solution = fit.solution
+    bound, gap = solution.bound, solution.gap
+    if solution.proof and solution.status is Status.OPTIMAL and bound is not None:
+        which = "this structure that keeps the constraints" if fit.prices else "this structure"
+        proof = f"{bound.method}, relative gap {gap_text(gap)}"
+        sentence = f"No model of {which} has a smaller objective on this record: global optimality is proved ({proof})."
+        return "good", "optimal (proved)", sentence
+    word = f"{solution.status} (not proved)" if solution.has_point else str(solution.status)
+    reason = (solution.reason or (bound.reason if bound is not None else "") or fit.program.note).rstrip(".")
+    because = f": {reason}" if reason else ""
+    if solution.status not in (Status.LOCAL, Status.OPTIMAL):
+        return "bad", word, f"The solver stopped early{because}. Read the figures below with care."
+    if gap < 1:
+        most = f"{100 * gap:.2g} %"
+        return "fair", word, f"A local optimum; no model of this structure can lower the objective by more than {most}."
+    return "fair", word, f"A local optimum; whether a better one exists is not known{because}."
+
+
+def fit_table(fit: "Fit") -> Table:
+    """One-step and simulation fit of every output on the estimation record."""
+    rows = [
+        (name, percent(one), percent(free))
+        for name, one, free in zip(fit.model.outputs, np.atleast_1d(fit.one_step_fit), simulation_fit(fit))
+    ]
+    return Table("Fit on the estimation record", ("output", "one step", "simulation"), rows)
+
+
+def simulation_fit(fit: "Fit") -> np.ndarray:
+    """Simulation fit of every output in %; NaN where the model is unstable or an input is missing."""
+    whole = isinstance(fit.data, Data) and not any(np.isnan(e.u).any() for e in fit.data.experiments)
+    if not (whole and fit.model.is_stable):
+        return np.full(fit.model.l, np.nan)
+    return np.atleast_1d(fit.simulation_fit)
+
+
+def constraint_table(fit: "Fit") -> Table:
+    """Activity, slack and price of every user constraint."""
+    rows = []
+    for p in fit.prices:
+        state = f"active ({p.active} of {p.rows})" if p.binding else "not active"
+        priced = p.binding and not np.isnan(p.multiplier)
+        rows.append(
+            (
+                p.name,
+                state,
+                "-" if p.binding else number(p.slack, 3),
+                number(p.multiplier, 3) if priced else "-",
+                number(p.fit_points, 3) if priced else "-",
+            )
+        )
+    return Table("Constraints", ("constraint", "state", "slack", "multiplier", "price"), rows, PRICE_NOTE)
+
+
+def certificate_facts(fit: "Fit") -> Facts:
+    """Why the solver stopped, whether there is a point, whether it is proved, and our own measurements."""
+    s, r = fit.solution, fit.solution.residuals
+    facts = [("Why it stopped", f"{s.solver} said: {s.claimed}"), ("Is there a point", "yes" if s.has_point else "no")]
+    if s.bound is None:
+        facts.append(("Is it proved", "no: " + (fit.program.note or "this programme has no certificate")))
+    else:
+        facts.append(("Is it proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
+        facts.append(("Bound", f"{number(s.bound.value, 10)} ({s.bound.method})"))
+    facts.append(("Objective", number(s.objective, 10)))
+    facts.append(("Relative gap", gap_text(s.gap)))
+    if r is not None:
+        worst = f" in {r.worst!r}" if r.violation > 0 and r.worst else ""
+        facts.append(("Largest violation", f"{gap_text(r.violation)}{worst}"))
+        facts.append(("Stationarity", f"{r.stationarity:.1e}" if np.isfinite(r.stationarity) else "not measured"))
+        facts.append(
+            ("Complementarity", f"{r.complementarity:.1e}" if np.isfinite(r.complementarity) else "not measured")
+        )
+    return facts
+
+
+def record_facts(fit: "Fit") -> Facts:
+    """Name, length, experiments, missing samples and rows used."""
+    data, figures = fit.data, fit.figures
+    count = data.n_samples
+    facts = [
+        ("Record", data.name or "unnamed"),
+        ("Samples", (f"{count} every {data.dt:g}" if count else f"every {data.dt:g}")),
+    ]
+    if isinstance(data, Data):
+        facts.append(("Experiments", str(data.n_experiments)))
+        missing = [f"{name} {share:.2%}" for name, share in data.missing.items() if share]
+        facts.append(("Missing", ", ".join(missing) or "none"))
+        if not data.transform.is_identity:
+            facts.append(("Units", "detrended or scaled for the fit; everything here is in raw units"))
+    if figures:
+        facts.append(("Rows used", f"{figures['rows']} of {figures['candidates']}"))
+        facts.append(
+            (
+                "Condition",
+                f"{figures['condition']:.1e} ({'Gram matrix' if figures['method'] == 'gram' else 'streamed QR'})",
+            )
+        )
+    return facts
+
+
+def channel_table(fit: "Fit") -> Table | None:
+    """What every channel looks like; None for a stream."""
+    if not isinstance(fit.data, Data):
+        return None
+    rows = [
+        (
+            c.name,
+            c.role,
+            c.unit or "-",
+            number(c.low, 4),
+            number(c.high, 4),
+            number(c.mean, 4),
+            number(c.std, 4),
+            str(c.levels) if c.levels <= 1000 else "many",
+            f"{c.missing:.2%}",
+        )
+        for c in fit.data.raw().channels
+    ]
+    return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
+
+
+def solver_facts(fit: "Fit") -> Facts:
+    """Which solver, why, and how long each part took."""
+    s = fit.solution
+    facts = [("Solver", s.solver)]
+    if s.chosen:
+        facts.append(("Chosen because", s.chosen.partition(": ")[2] or s.chosen))
+    if s.iterations >= 0:
+        facts.append(("Iterations", str(s.iterations)))
+    if len(fit.steps) > 1:
+        facts.append(("Programmes solved", str(len(fit.steps))))
+    facts += [
+        (name, seconds(value))
+        for name, value in (
+            ("Posing", s.times.build),
+            ("Solving", s.times.solve),
+            ("Judging", s.times.judge),
+            ("Proving", s.times.prove),
+            ("In all", fit.seconds),
+        )
+    ]
+    return facts
+
+
+def call(fit: "Fit") -> str:
+    """Write the Python call behind the fit; constraints by their names."""
+    words = [f"{key}={_argument(value)}" for key, value in fit.arguments.items() if key != "constraints"]
+    if fit.arguments.get("constraints"):
+        names = [getattr(constraint, "name", None) or "a user function" for constraint in fit.arguments["constraints"]]
+        words.append(f"constraints=[{', '.join(names)}]")
+    return f"optid.fit(data, {fit.formulation!r}, {', '.join(words)})"
+
+
+def model_facts(fit: "Fit") -> Facts:
+    """Poles, gauge, what f does outside the range of the record, and why its offset is not identifiable."""
+    model = fit.model
+    facts = [("Poles", ", ".join(_complex(p) for p in model.poles) or "none")]
+    positive = all(b.flat[0] >= 0 for b in model.b)
+    gauge = {
+        "norm": "norm of b is one, "
+        + ("its first coefficient positive" if positive else "its sign follows from the constraints"),
+        "gain": "static gain of the linear part is one",
+        "b0": "first coefficient of b is one",
+    }.get(model.gauge)
+    if gauge:
+        facts.append(("Gauge", gauge))
+    outside = sorted({f"{f.basis.outside}" for f in model.nonlinearities if not isinstance(f.basis, Linear)})
+    if outside:
+        facts.append(("Outside the range", ", ".join(outside)))
+    if model.offset_note and not all(isinstance(f.basis, Linear) for f in model.nonlinearities):
+        facts.append(("Offset", model.offset_note))
+    return facts
+
+
+def validation_tables(checked: "Validation") -> list[Table]:
+    """Errors of prediction and simulation, residual tests, and the structure test."""
+    errors = [
+        (
+            name,
+            what,
+            number(q.fit, 4),
+            number(q.vaf, 4),
+            number(q.rmse, 4),
+            number(q.e_n, 4),
+            number(q.snr, 4),
+            number(q.snr_amplitude, 3),
+            str(q.samples),
+        )
+        for name in checked.one_step
+        for what, table in (("one step", checked.one_step), ("simulation", checked.simulation))
+        if name in table
+        for q in (table[name],)
+    ]
+    tests = [
+        (
+            f"residual of {t.output}: " + ("white" if t.input is None else f"independent of {t.input}"),
+            "passed" if t.passed else "failed",
+            number(t.p_value, 2),
+            str(t.outside),
+        )
+        for t in (*checked.autocorrelations.values(), *checked.cross_correlations.values())
+    ]
+    if checked.structure is not None:
+        tests.append(
+            (
+                "structure: rank one suffices (Hammerstein)",
+                "passed" if checked.structure.passed else "failed",
+                number(checked.structure.p_value, 2),
+                "-",
+            )
+        )
+    return [
+        Table(
+            "Errors", ("output", "prediction", "fit %", "VAF %", "RMSE", "E_N", "SNR", "root SNR", "samples"), errors
+        ),
+        Table("Tests", ("hypothesis", "verdict", "p value", "lags outside the 99 % band"), tests),
+    ]
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.4g}" if abs(value.imag) < 1e-12 else f"{value.real:.4g}{value.imag:+.4g}j"
+
+
+def _argument(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist())
+    return repr(value)
+
+
+def _and(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
