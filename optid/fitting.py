@@ -66,10 +66,13 @@ class Fit:
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
-        """Simulation fit in % of every output on the estimation record, initial conditions fitted."""
+        """Simulation fit in % of every output on the estimation record, initial conditions fitted.
+
+        NaN for a stream, and where an input has missing samples: a simulation needs every one of them.
+        """
         from optid.validation import fit_percent
 
-        if isinstance(self.data, Stream):
+        if isinstance(self.data, Stream) or any(self.data.missing[name] for name in self.data.inputs):
             return np.full(len(self.data.outputs), np.nan)
         raw = self.data.raw()
         simulated = self.model.simulate(raw, x0="fit")

@@ -287,3 +287,21 @@ def test_procedure_gets_its_solutions_and_returns_its_model():
     outcome = run(procedure(), "clarabel")
     assert outcome.model == pytest.approx(2.0 + 1 / 9, rel=1e-6)
     assert [name for name, _ in outcome.steps] == ["projection", "qp_equality"]
+
+
+def test_a_broken_plug_in_does_not_take_the_others_away(monkeypatch):
+    class Point:
+        name, value = "theirs", "their_package:back_end"
+
+        def load(self):
+            raise ImportError("no module named their_package")
+
+    shipped = list(backends.entry_points(group=backends.GROUP))
+    monkeypatch.setattr(backends, "entry_points", lambda group: [*shipped, Point()])
+    backends.back_ends.cache_clear()
+    try:
+        assert backends.find("clarabel").installed
+        with pytest.raises(SolverMissing, match="'theirs' cannot be loaded: their_package:back_end fails: ImportError"):
+            backends.find("theirs")
+    finally:
+        backends.back_ends.cache_clear()

@@ -71,6 +71,7 @@ class BackEnd:
         duals: whether it returns multipliers.
         warm: whether it can start from a given point.
         about: one line for the table of solvers.
+        broken: why its entry point cannot be loaded, "" where it can.
     """
 
     name: str
@@ -81,6 +82,7 @@ class BackEnd:
     duals: bool = True
     warm: bool = False
     about: str = ""
+    broken: str = ""
 
     def refuses(self, program: Program) -> str:
         """Return why this back end cannot take the programme, or an empty string."""
@@ -101,11 +103,21 @@ def back_ends() -> dict[str, BackEnd]:
     """Return every registered back end by name, installed or not."""
     found: dict[str, BackEnd] = {}
     for point in entry_points(group=GROUP):
-        target = point.load()
-        several: Iterable[BackEnd] = (target,) if isinstance(target, BackEnd) else target()
+        try:
+            target = point.load()
+            several: Iterable[BackEnd] = (target,) if isinstance(target, BackEnd) else tuple(target())
+        except Exception as error:  # one broken plug-in must not take the other solvers away
+            several = (_broken(point.name, f"{point.value} fails: {type(error).__name__}: {error}"),)
         for back_end in several:
             found[back_end.name] = back_end
     return found
+
+
+def _broken(name: str, reason: str) -> BackEnd:
+    def run(program: Program, settings: Settings) -> Answer:
+        return Answer(Status.FAILED, reason)
+
+    return BackEnd(name, frozenset(), run, installed=False, about="cannot be loaded", broken=reason)
 
 
 def find(name: str) -> BackEnd:
@@ -119,6 +131,8 @@ def find(name: str) -> BackEnd:
     back_end = known.get(name.lower())
     if back_end is None:
         raise LookupFailed(f"no solver is called {name!r}. {nearest(name.lower(), known)}")
+    if back_end.broken:
+        raise SolverMissing(f"solver {back_end.name!r} cannot be loaded: {back_end.broken}")
     if not back_end.installed:
         how = f"pip install {back_end.pip}" if back_end.pip else "it needs its vendor's package and licence"
         raise SolverMissing(f"solver {back_end.name!r} is not installed: {how}")
