@@ -26,6 +26,7 @@ from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
 from optid.data import Data
 from optid.errors import StructureError
+from optid.judging import measure_violation
 from optid.models import HammersteinARX
 from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
@@ -107,7 +108,25 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         return problem.model(values, [values[mu] for mu, _ in blocks], [values[b] for _, b in blocks],
                              gauge=gauge, flip=gauge == "norm" and not signed)
 
-    return replace(program, recover=recover)
+    turn = signed and gauge == "norm"
+    return replace(program, recover=recover, start=_signed_start(program, blocks) if turn else start)
+
+
+def _signed_start(program: Program, blocks: Sequence[tuple[str, str]]) -> dict[str, np.ndarray]:
+    """Turn the sign of every (mu, b) of the start to where the constraints are violated least.
+
+    Methods that follow one start would otherwise stay at ``mu = 0`` on a plant whose sign the constraints turn round.
+    """
+    start = dict(program.start)
+    for mu, b in blocks:
+        turned = {**start, mu: -start[mu], b: -start[b]}
+        sizes = []
+        for values in (start, turned):
+            program.assign(values)
+            sizes.append(measure_violation(program)[0])
+        if sizes[1] < sizes[0]:
+            start = turned
+    return start
 
 
 def _gauge(gauge: str, b: cp.Variable, a: cp.Variable | None, problem: EquationError) -> Any:

@@ -7,6 +7,7 @@ from problems import BASIS, dense, plant, raw_problem, record
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
+from formulations import shape
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.errors import RankError, StructureError
 from optid.models import HammersteinARX
@@ -233,3 +234,14 @@ def test_a_zero_input_channel_has_a_gauge():
     silent = plant(gain=0.0)
     fit = optid.fit(record(model=silent, noise=0.5), na=2, nb=2, basis=BASIS, gauge="norm")
     assert np.linalg.norm(fit.model.b[0]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "gauss_newton", "alternating"])
+def test_the_start_has_the_sign_that_the_constraints_ask_for(solver):
+    rising = record()
+    falling = optid.Data(u=rising.u, y=-rising.y)
+    limits = [shape.monotone("increasing")]
+    up = optid.fit(rising, na=2, nb=2, basis=BASIS, constraints=limits, solver=solver, prove=False)
+    down = optid.fit(falling, na=2, nb=2, basis=BASIS, constraints=limits, solver=solver, prove=False)
+    assert down.solution.objective == pytest.approx(up.solution.objective, rel=1e-7)
+    assert np.allclose(down.model.b[0], -up.model.b[0], atol=1e-5)
