@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -176,6 +177,15 @@ def fit(
     curvature: Annotated[
         float | None, typer.Option("--curvature", rich_help_panel=MODEL, help="Weight of the curvature of f.")
     ] = None,
+    holdout: Annotated[
+        str | None,
+        typer.Option(
+            "--holdout",
+            metavar="PENALTY",
+            rich_help_panel=MODEL,
+            help="Choose the weight of ridge, curvature or weight (nuclear norm) by hold-out.",
+        ),
+    ] = None,
     gauge: Annotated[
         str | None, typer.Option("--gauge", rich_help_panel=MODEL, help="Scale between f and B: norm, gain or b0.")
     ] = None,
@@ -218,6 +228,7 @@ def fit(
     """
     from optid.cli import arguments as words
     from optid.fitting import fit as fit_model
+    from optid.selection import fit_by_holdout
     from optid.showing.printing import describe, describe_validation
 
     how = {
@@ -258,7 +269,7 @@ def fit(
         if split is not None and held_out is None:
             record, held_out = words.split_record(record, split)
         waiting.step(f"fitting {formulation}")
-        found = fit_model(
+        found = (fit_model if holdout is None else partial(fit_by_holdout, penalty=holdout))(
             record,
             formulation,
             solver=solver,
