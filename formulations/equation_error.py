@@ -17,6 +17,7 @@ from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity
+from optid.models.gauges import leading_sign
 from optid.program import Program, View
 from optid.rank_one import RankOne
 from optid.regressors import Layout, Statistics, collect
@@ -142,7 +143,7 @@ class EquationError:
         a = np.asarray(values.get("a", np.zeros(0)))
         if ny > 1:
             a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
-        signs = [leading_sign(b) if flip else 1.0 for b in bs]
+        signs = [leading_sign(np.asarray(b)) if flip else 1.0 for b in bs]
         model = HammersteinARX(
             a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
@@ -154,13 +155,6 @@ class EquationError:
 def flat(expression: cp.Expression) -> cp.Expression:
     """Stack the columns of an expression."""
     return expression if expression.ndim == 1 else cp.vec(expression, order="F")
-
-
-def leading_sign(b: np.ndarray) -> float:
-    """Sign of the first entry that is not negligible."""
-    entries = np.ravel(b, order="F")
-    large = np.flatnonzero(np.abs(entries) > 1e-12 * max(float(np.max(np.abs(entries), initial=0.0)), 1e-300))
-    return float(np.sign(entries[large[0]])) if large.size else 1.0
 
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],

@@ -32,6 +32,7 @@ from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Core, reduce
 from optid.rank_one.bilinear import starts
+from optid.rank_one.whitening import leading_pair
 from optid.solving import Procedure
 from optid.streams import Stream
 
@@ -239,19 +240,18 @@ def _split_model(problem: EquationError, core: Core, keys: Sequence[str], gauge:
                  ) -> HammersteinARX:
     mus, bs = [], []
     for c, key in enumerate(keys):
-        mu, b = _leading_pair(core, c, np.reshape(values[key], problem.problem.blocks[c]), svd == "whitened")
+        mu, b = _pair(core, c, np.reshape(values[key], problem.problem.blocks[c]), svd == "whitened")
         mu, b = _in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.channels[c])
         mus.append(mu)
         bs.append(b)
     return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")
 
 
-def _leading_pair(core: Core, c: int, theta: np.ndarray, whitened: bool) -> tuple[np.ndarray, np.ndarray]:
+def _pair(core: Core, c: int, theta: np.ndarray, whitened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Leading singular pair of Theta, in the Kronecker metric of the Gram matrix where that is asked for."""
     if whitened and c in core.kept:
         position = core.kept.index(c)
         left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
     else:
         left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
-    u, d, vt = np.linalg.svd(left.T @ theta @ right, full_matrices=False)
-    return np.linalg.solve(left.T, u[:, 0] * d[0]), np.linalg.solve(right.T, vt[0])
+    return leading_pair(theta, left, right)

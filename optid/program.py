@@ -17,7 +17,6 @@ from optid.solution import Bound
 Values = Mapping[str, np.ndarray]
 EQUALITIES = Equality | Zero
 INEQUALITIES = Inequality | NonPos
-Builder = Callable[["View"], Any]
 
 
 class View(Mapping[str, cp.Expression]):

@@ -144,10 +144,6 @@ class Basis(Protocol):
         """
         ...
 
-    def value_rows(self, points: ArrayLike) -> Array:
-        """(len(points), P): rows @ mu are the values of f at the points."""
-        return self.values(points)
-
     def grid(self, n: int = 201) -> Array:
         """(n,) points that cover the interval evenly."""
         return np.linspace(*span(self), n)

@@ -85,7 +85,7 @@ def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
     if size == 0:
         raise StructureError(f"B of input {channel!r} is zero: it has no gauge but 'none'.")
     if gauge == "norm":
-        return size * _leading_sign(b)
+        return size * leading_sign(b)
     if gauge == "b0":
         scale, what = float(b.flat[0]), "first coefficient of B"
     else:
@@ -102,6 +102,8 @@ def _unit_gain(a: Array, b: Array) -> float:
     return float(b.sum()) / denominator if denominator else np.inf
 
 
-def _leading_sign(b: Array) -> float:
+def leading_sign(b: Array) -> float:
+    """Sign of the first entry of B that is not negligible; 1 where all are zero."""
     entries = b.ravel(order="F")
-    return float(np.sign(entries[np.abs(entries) > 1e-12 * np.abs(entries).max()][0]))
+    large = np.flatnonzero(np.abs(entries) > 1e-12 * np.abs(entries).max(initial=0.0))
+    return float(np.sign(entries[large[0]])) if large.size else 1.0

@@ -53,6 +53,18 @@ def invert_triangular(factor: Array, lower: bool = True) -> Array:
     return inverse
 
 
+def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
+    """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
+
+    Args:
+        theta: (P, nb).
+        factor_mu: (P, P) lower triangular.
+        factor_b: (nb, nb) lower triangular.
+    """
+    left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
+    return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
+
+
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.rank_one.whitening import invert_triangular, kronecker_factors
+from optid.rank_one import whitening
 from optid.regressors.layout import Layout
 
 
@@ -37,7 +37,7 @@ def leading_pair(matrix: Array, gram: Array | None, lags: int, outputs: int) -> 
     if gram is None:
         left, size, right = np.linalg.svd(matrix, full_matrices=False)
         return size[0] * left[:, 0], right[0]
-    factor_mu, factor_b = kronecker_factors(gram, (len(matrix), lags))
+    factor_mu, factor_b = whitening.kronecker_factors(gram, (len(matrix), lags))
     factor_b = np.kron(np.eye(outputs), factor_b)  # every output has the same regressor
-    left, size, right = np.linalg.svd(factor_mu.T @ matrix @ factor_b, full_matrices=False)
-    return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
+    mu, b = whitening.leading_pair(matrix, factor_mu, factor_b)
+    return np.asarray(mu, dtype=float), np.asarray(b, dtype=float)
