@@ -2,21 +2,24 @@
 
 import json
 import os
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from optid.bases import from_dict
 from optid.errors import LookupFailed, ModelFileError, StructureError
-from optid.models.nonlinearity import Nonlinearity
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinARX
 
 FORMAT = "optid model"
 VERSION = 1
 
+KINDS = {
+    "HammersteinARX": "optid.models.hammerstein_arx",
+    "HammersteinTF": "optid.models.hammerstein_tf",
+    "HammersteinSS": "optid.models.hammerstein_ss",
+}
+"""The module of every class of model, by the word that stands in the file."""
 
-def save(model: "HammersteinARX", path: str | Path) -> Path:
+
+def save(model: Any, path: str | Path) -> Path:
     """Write a model to a JSON file; numbers are written so that they are read back to the last bit.
 
     Args:
@@ -35,7 +38,7 @@ def save(model: "HammersteinARX", path: str | Path) -> Path:
     return path
 
 
-def load(path: str | Path, functions: dict[str, Any] | None = None) -> "HammersteinARX":
+def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
     """Read a model from a file written by `save`.
 
     Args:
@@ -81,47 +84,14 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> "Hammerst
         raise ModelFileError(f"{path} is damaged: {error} Save the model again.") from error
 
 
-def to_dict(model: "HammersteinARX") -> dict[str, Any]:
+def to_dict(model: Any) -> dict[str, Any]:
     """Describe a model in JSON types."""
-    return {
-        "kind": "HammersteinARX",
-        "a": model.a.tolist(),
-        "b": [b.tolist() for b in model.b],
-        "nonlinearities": [{"basis": f.basis.to_dict(), "mu": f.mu.tolist()} for f in model.nonlinearities],
-        "nk": list(model.nk),
-        "offset": model.offset.tolist(),
-        "dt": model.dt,
-        "inputs": list(model.inputs),
-        "outputs": list(model.outputs),
-        "input_units": list(model.input_units),
-        "output_units": list(model.output_units),
-        "gauge": model.gauge,
-    }
+    return model.to_dict()
 
 
-def from_content(content: dict[str, Any], functions: dict[str, Any] | None = None) -> "HammersteinARX":
+def from_content(content: dict[str, Any], functions: dict[str, Any] | None = None) -> Any:
     """Build the model that `to_dict` described; the errors are those of the parts."""
-    import numpy as np
-
-    from optid.models import HammersteinARX
-
-    if content["kind"] != "HammersteinARX":
-        raise ValueError(f"unknown kind of model {content['kind']!r}.")
-    outputs = len(content["outputs"])
-    a = np.array(content["a"], dtype=float)
-    return HammersteinARX(
-        a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
-        b=tuple(np.array(b, dtype=float) for b in content["b"]),
-        nonlinearities=tuple(
-            Nonlinearity(from_dict(f["basis"], functions), np.array(f["mu"], dtype=float))
-            for f in content["nonlinearities"]
-        ),
-        nk=tuple(content["nk"]),
-        offset=np.array(content["offset"], dtype=float),
-        dt=content["dt"],
-        inputs=tuple(content["inputs"]),
-        outputs=tuple(content["outputs"]),
-        input_units=tuple(content["input_units"]),
-        output_units=tuple(content["output_units"]),
-        gauge=content["gauge"],
-    )
+    kind = content["kind"]
+    if kind not in KINDS:
+        raise ValueError(f"unknown kind of model {kind!r}.")
+    return getattr(import_module(KINDS[kind]), kind).from_dict(content, functions)

@@ -367,3 +367,18 @@ def test_stable_models_do_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         siso().simulate(inputs(siso()))
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 3, 7])
+@pytest.mark.parametrize("make", [siso, mimo, lambda: siso(a=[])])
+def test_prediction_several_steps_ahead_is_simulation_from_the_state_then(make, horizon):
+    model = make()
+    u = inputs(model, 60)
+    y = by_hand(model, u, noise=np.random.default_rng(2).normal(size=(60, model.l)))
+    predicted = model.predict(Data(u, y, dt=model.dt), horizon)
+    for k in range(model.memory + horizon - 1, 60):
+        known = k - horizon + 1  # samples before this one are known
+        state = model.state(u[:known], y[:known])
+        assert predicted[k] == pytest.approx(model.simulate(u[known : k + 1], state)[-1], abs=1e-10)
+    with pytest.raises(StructureError, match="horizon = 0"):
+        model.predict(Data(u, y, dt=model.dt), 0)

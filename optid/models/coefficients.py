@@ -21,6 +21,17 @@ def coefficients(values: Any, name: str) -> Array:
     return array
 
 
+def checked_horizon(horizon: Any) -> int:
+    """Return a prediction horizon as an int.
+
+    Raises:
+        StructureError: not a whole number from 1.
+    """
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        raise StructureError(f"horizon = {horizon!r}: a whole number of samples from 1.")
+    return int(horizon)
+
+
 def check_shapes(model: "HammersteinARX") -> None:
     """Refuse parts of a model that do not agree.
 
@@ -52,3 +63,17 @@ def check_shapes(model: "HammersteinARX") -> None:
         raise StructureError(f"dt = {model.dt!r}: a positive number.")
     if model.gauge not in GAUGES:
         raise StructureError(f"Unknown gauge {model.gauge!r}: use one of {', '.join(GAUGES)}.")
+
+
+def listed(model: "HammersteinARX") -> list[tuple[str, float]]:
+    """Names and values of A, B and the offset, one line each; see `HammersteinARX.coefficients`."""
+    several, found = model.l > 1, []
+    for (i, *pair), value in np.ndenumerate(model.a):
+        found.append((f"a{i + 1}" + (f"[{','.join(model.outputs[o] for o in pair)}]" if several else ""), float(value)))
+    for channel, b in zip(model.inputs, model.b):
+        for (j, *output), value in np.ndenumerate(b):
+            words = ([channel] if model.m > 1 else []) + [model.outputs[o] for o in output]
+            found.append((f"b{j}" + (f"[{','.join(words)}]" if words else ""), float(value)))
+    return found + [
+        ("offset" + (f"[{name}]" if several else ""), float(value)) for name, value in zip(model.outputs, model.offset)
+    ]

@@ -1,6 +1,6 @@
 """The Hammerstein-ARX model: A(q) y = sum_c B_c(q) f_c(u_c) + d + e, one or several inputs and outputs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike
 from optid.bases.basis import Array
 from optid.channels import Transform, numbered_names
 from optid.data import Data
-from optid.errors import DataError, StructureError
+from optid.errors import StructureError
 from optid.models import responses, simulation
-from optid.models.coefficients import check_shapes, coefficients
+from optid.models.coefficients import check_shapes, checked_horizon, coefficients, listed
 from optid.models.gauges import in_raw_units, regauged
 from optid.models.nonlinearity import Nonlinearity
-from optid.reading.arrays import as_samples, is_scalar_list
 
 if TYPE_CHECKING:
     from optid.regressors.layout import Layout
@@ -103,6 +102,16 @@ class HammersteinARX:
         return tuple(len(b) for b in self.b)
 
     @property
+    def kind(self) -> str:
+        """The name of the class, the word that stands in a file."""
+        return "HammersteinARX"
+
+    @property
+    def title(self) -> str:
+        """What the model is called in print."""
+        return "ARX model" if all(_is_linear(f) for f in self.nonlinearities) else "Hammerstein-ARX model"
+
+    @property
     def orders(self) -> dict[str, Any]:
         """The orders na, nb and nk; nb and nk have one entry per input."""
         return {"na": self.na, "nb": self.nb, "nk": self.nk}
@@ -121,6 +130,20 @@ class HammersteinARX:
         return Layout(self.na, self.nb, self.nk, bases, self.outputs, self.inputs)
 
     # -- what it says --------------------------------------------------------------------------------------------
+
+    @property
+    def kind(self) -> str:
+        """The word for this class in model files."""
+        return "HammersteinARX"
+
+    @property
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        return f"{'Linear' if all(map(_is_linear, self.nonlinearities)) else 'Hammerstein'} ARX model"
+
+    def coefficients(self) -> list[tuple[str, float]]:
+        """Return (name, value) of every coefficient of A, B and the offset, as tables show them."""
+        return listed(self)
 
     @property
     def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
@@ -215,21 +238,24 @@ class HammersteinARX:
 
     # -- prediction and simulation -------------------------------------------------------------------------------
 
-    def predict(self, data: Data) -> Any:
-        """Predict one step ahead.
+    def predict(self, data: Data, horizon: int = 1) -> Any:
+        """Predict one or several steps ahead.
 
         Args:
             data: the record; detrended or scaled data are taken back to raw units first.
+            horizon: how many samples ahead: the outputs are known up to so many samples before, the inputs always.
 
         Returns:
-            (N, l) in raw units, NaN in the first `memory` samples and where a sample needed is missing; a tuple of such
-            arrays for several experiments.
+            (N, l) in raw units, NaN in the first `memory` + horizon - 1 samples and where a sample needed is missing; a
+            tuple of such arrays for several experiments.
 
         Raises:
             DataError: other channels or another sampling time than the model's.
+            StructureError: a horizon that is not a whole number from 1.
         """
+        horizon = checked_horizon(horizon)
         data = self._raw(data)
-        return _one_or_all([simulation.predict_record(self, e.u, e.y) for e in data.experiments])
+        return one_or_all([simulation.predict_record(self, e.u, e.y, horizon) for e in data.experiments])
 
     def simulate(self, data: Any, x0: Any = "zero") -> Any:
         """Compute the outputs from the inputs alone.
@@ -250,11 +276,11 @@ class HammersteinARX:
         Warns:
             DataWarning: the model is unstable.
         """
-        records, flat = self._records(data)
+        records, flat = records_of(self, data)
         states = self._states(data, records, x0)
         simulation.warn_unstable(self)
         outputs = [simulation.simulate_record(self, u, x, label) for (u, _, label), x in zip(records, states)]
-        return _one_or_all([y[:, 0] for y in outputs] if flat and self.l == 1 else outputs)
+        return one_or_all([y[:, 0] for y in outputs] if flat and self.l == 1 else outputs)
 
     def initial_state(self, data: Data) -> Any:
         """Estimate the state (n, l) at the first sample by least squares; a tuple for several experiments.
@@ -262,8 +288,8 @@ class HammersteinARX:
         Raises:
             DataError: as `simulate`.
         """
-        records, _ = self._records(data)
-        return _one_or_all(self._states(data, records, "fit"))
+        records, _ = records_of(self, data)
+        return one_or_all(self._states(data, records, "fit"))
 
     def state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Return the state (n, l) that follows the samples u (N, m) and y (N, l), N >= n.
@@ -273,19 +299,7 @@ class HammersteinARX:
         Raises:
             DataError: too few samples, or one of the last n missing.
         """
-        return simulation.following_state(self, self._channels(u, "u", self.m), self._channels(y, "y", self.l))
-
-    def _records(self, data: Any) -> tuple[list[tuple[Array, Array | None, str]], bool]:
-        """Return (u, y or None, label) of every experiment, and whether u was one-dimensional."""
-        if isinstance(data, Data):
-            raw, many = self._raw(data), data.n_experiments > 1
-            return [(e.u, e.y, f"Experiment {i}: " * many) for i, e in enumerate(raw.experiments, start=1)], False
-        arrays = [data] if is_scalar_list(data) else list(data)
-        flat = all(np.ndim(u) == 1 for u in arrays)
-        many = len(arrays) > 1
-        return [
-            (self._channels(u, "u", self.m), None, f"Experiment {i}: " * many) for i, u in enumerate(arrays, start=1)
-        ], flat
+        return simulation.following_state(self, samples_of(u, "u", self.m), samples_of(y, "y", self.l))
 
     def _states(self, data: Any, records: Sequence[Any], x0: Any) -> list[Array]:
         if isinstance(x0, str):
@@ -300,23 +314,6 @@ class HammersteinARX:
         if len(states) != len(records):
             raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
         return [simulation.state_like(self, state) for state in states]
-
-    def _raw(self, data: Data) -> Data:
-        for kind, given, wanted in (("inputs", data.inputs, self.inputs), ("outputs", data.outputs, self.outputs)):
-            if len(given) != len(wanted) or (given != wanted and set(given) == set(wanted)):
-                raise DataError(
-                    f"The data have the {kind} {', '.join(given)}; the model has {', '.join(wanted)}. "
-                    f"Use data.select({kind}={list(wanted)})."
-                )
-        if abs(data.dt - self.dt) > 1e-6 * self.dt:
-            raise DataError(f"The data are sampled every {data.dt:g}, the model every {self.dt:g}: resample the data.")
-        return data if data.transform.is_identity else data.raw()
-
-    def _channels(self, values: Any, what: str, count: int) -> Array:
-        samples = as_samples(values, what)
-        if samples.shape[1] != count:
-            raise DataError(f"{what} has {samples.shape[1]} channels; the model has {count}.")
-        return samples
 
     # -- changes -------------------------------------------------------------------------------------------------
 
@@ -345,11 +342,86 @@ class HammersteinARX:
 
     # -- leaving -------------------------------------------------------------------------------------------------
 
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return {
+            "kind": self.kind,
+            "a": self.a.tolist(),
+            "b": [b.tolist() for b in self.b],
+            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
+            "nk": list(self.nk),
+            "offset": self.offset.tolist(),
+            "dt": self.dt,
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+            "input_units": list(self.input_units),
+            "output_units": list(self.output_units),
+            "gauge": self.gauge,
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: Mapping[str, Any] | None = None) -> "HammersteinARX":
+        """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
+        outputs = len(content["outputs"])
+        a = np.array(content["a"], dtype=float)
+        return cls(
+            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
+            b=tuple(np.array(b, dtype=float) for b in content["b"]),
+            nonlinearities=tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
+            nk=tuple(content["nk"]),
+            offset=np.array(content["offset"], dtype=float),
+            dt=content["dt"],
+            inputs=tuple(content["inputs"]),
+            outputs=tuple(content["outputs"]),
+            input_units=tuple(content["input_units"]),
+            output_units=tuple(content["output_units"]),
+            gauge=content["gauge"],
+        )
+
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it exactly."""
         from optid.io import save
 
         return save(self, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return {
+            "kind": self.kind,
+            "a": self.a.tolist(),
+            "b": [b.tolist() for b in self.b],
+            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
+            "nk": list(self.nk),
+            "offset": self.offset.tolist(),
+            "dt": self.dt,
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+            "input_units": list(self.input_units),
+            "output_units": list(self.output_units),
+            "gauge": self.gauge,
+        }
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], functions: dict[str, Any] | None = None) -> "HammersteinARX":
+        """Build the model that `to_dict` described; the errors are those of the parts.
+
+        Args:
+            content: what `to_dict` returned.
+            functions: those of a basis of UserFunctions, by name.
+        """
+        outputs = len(content["outputs"])
+        a = np.array(content["a"], dtype=float)
+        return cls(
+            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
+            b=tuple(np.array(b, dtype=float) for b in content["b"]),
+            nonlinearities=tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
+            offset=np.array(content["offset"], dtype=float),
+            dt=content["dt"],
+            gauge=content["gauge"],
+            **{
+                name: tuple(content[name]) for name in ("nk", "inputs", "outputs", "input_units", "output_units")
+            },
+        )
 
     def to_dlti(self, output: int | str = 0, input: int | str = 0) -> Any:
         """Return the linear part from one f to one output as a `scipy.signal.dlti`."""
@@ -374,7 +446,3 @@ def _is_linear(nonlinearity: Nonlinearity) -> bool:
     from optid.bases.expansions import Linear
 
     return isinstance(nonlinearity.basis, Linear)
-
-
-def _one_or_all(arrays: list[Array]) -> Any:
-    return arrays[0] if len(arrays) == 1 else tuple(arrays)

@@ -60,6 +60,17 @@ class Nonlinearity:
             f[start : start + CHUNK] = sums
         return float(f[0]) if u.ndim == 0 else f.reshape(u.shape)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Describe basis and coefficients in JSON types; the constant belongs to the model."""
+        return {"basis": self.basis.to_dict(), "mu": self.mu.tolist()}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], functions: dict[str, Any] | None = None) -> "Nonlinearity":
+        """Build what `to_dict` described; `functions` are those of a basis of UserFunctions, by name."""
+        from optid.bases import from_dict
+
+        return cls(from_dict(content["basis"], functions), np.array(content["mu"], dtype=float))
+
     def slope(self, u: ArrayLike) -> Any:
         """Evaluate f'(u), any shape; to the right at kinks, zero where f is clamped."""
         u = np.asarray(u, dtype=float)

@@ -20,22 +20,31 @@ FORGOTTEN = 1e-12
 """A free response below this share of its start no longer informs about the initial state."""
 
 
-def predict_record(model: "HammersteinARX", u: Array, y: Array) -> Array:
-    """Predict each output sample from the samples before it (and the inputs up to it).
+def predict_record(model: "HammersteinARX", u: Array, y: Array, horizon: int = 1) -> Array:
+    """Predict each output sample from the outputs `horizon` and more samples before it, and the inputs up to it.
 
     Args:
         model: the model.
         u: (N, m) inputs, NaN = missing.
         y: (N, l) outputs, NaN = missing.
+        horizon: how many samples ahead, from 1.
 
     Returns:
         (N, l); NaN for the first samples, whose lags reach before the record, and where a sample needed is missing.
     """
-    prediction = driven(model, u)
-    for i, a in enumerate(matrices_of(model), start=1):
-        prediction[i:] -= y[:-i] @ a.T
-    prediction[: model.memory] = np.nan
-    return prediction
+    right = driven(model, u)
+    right[: model.memory] = np.nan
+    matrices = list(enumerate(matrices_of(model), start=1))
+    shorter: list[Array] = []  # predictions 1, 2, ... samples ahead, as far back as A looks
+    for ahead in range(1, horizon + 1):
+        prediction = right.copy()
+        if matrices:
+            prediction[: model.memory + ahead - 1] = np.nan
+        for i, a in matrices:
+            known = y if i >= ahead else shorter[-i]
+            prediction[i:] -= known[: len(known) - i] @ a.T
+        shorter = [*shorter[-max(model.na, 1) :], prediction]
+    return shorter[-1]
 
 
 def simulate_record(model: "HammersteinARX", u: Array, state: Array, label: str = "") -> Array:
