@@ -38,7 +38,7 @@ _HOME = {
     "RecursiveARX": "recursion",
     "bootstrap": "resampling",
 }
-_MODULES = {"signals", "bases", "plots", "report", "errors", "examples"}
+_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants"}
 
 
 def __getattr__(name: str) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optid import signals
+from optid import plants, signals
 from optid.data import Data
 from optid.errors import LookupFailed, nearest
 
@@ -17,9 +17,11 @@ class Example:
 
     Attributes:
         data: the record.
-        truth: a (na,), b (one (nb,) array per input), f (one function per input), sigma (standard deviation of the
-            equation error e), noise_free (N, l) output.
-        suggestion: arguments of `fit`: na, nb, nk, basis (text, as on the command line) and constraints (texts).
+        truth: of a Hammerstein-ARX system a (na,), b (one (nb,) array per input), f (one function per input), sigma
+            (standard deviation of the equation error e), noise_free (N, l) output; of a simulated plant f, the number
+            of states n, and noise_free where the noise is not fed back.
+        suggestion: arguments of `fit`: na, nb, nk, basis (text, as on the command line), constraints (texts), and nx
+            and feedback_basis for state-space formulations.
     """
 
     data: Data
@@ -82,10 +84,45 @@ def two_inputs(seed: int = 0, n: int = 2000) -> Example:
     return _TWO_INPUTS.example(u, float(np.var(_TWO_INPUTS.output(u))) / 25, rng)
 
 
+def pendulum(seed: int = 0, n: int = 4000) -> Example:
+    """Return a simulated reaction wheel pendulum: motor command to angle and wheel speed.
+
+    Dead zone, friction, an encoder of 4000 counts and noise on the speed; uniform levels within 8, held five samples
+    of 0.02 s (`optid.plants.pendulum`). Gravity and friction are nonlinear feedback of the outputs.
+
+    Args:
+        seed: seed of input and noise.
+        n: samples.
+    """
+    u = plants.pendulum_input("levels", n, seed)
+    plant = plants.ReactionWheelPendulum()
+    truth = {"n": 3, "f": (plant.torque,), "noise_free": plant.states(u)[:, [0, 2]]}
+    suggestion = {"na": 3, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": 3, "feedback_basis": "polynomial:4"}
+    return Example(plants.pendulum(u, seed), truth, suggestion)
+
+
+def vanderpol(seed: int = 0, n: int = 6000) -> Example:
+    """Return a simulated Van der Pol oscillator driven through f(u) = u + 0.5 u |u|.
+
+    White uniform input within 2, dt = 0.1 s, process noise 0.005, measurement noise 0.02 (`optid.plants.van_der_pol`).
+    The cubic damping is nonlinear feedback of the measured output.
+
+    Args:
+        seed: seed of input and noise.
+        n: samples.
+    """
+    u = np.random.default_rng([seed, 1]).uniform(-2.0, 2.0, n)
+    data = plants.van_der_pol(u, seed, process=0.005, measurement=0.02)
+    suggestion = {"na": 2, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": 2, "feedback_basis": "polynomial:4"}
+    return Example(data, {"n": 2, "f": (_square_with_sign,)}, suggestion)
+
+
 EXAMPLES: dict[str, Callable[..., Example]] = {
     "thruster": thruster,
     "dead_zone": dead_zone,
     "two_inputs": two_inputs,
+    "pendulum": pendulum,
+    "vanderpol": vanderpol,
 }
 """The built-in records by the name that the command line takes; each function takes seed and n."""
 
@@ -164,6 +201,10 @@ def _saturation(u: np.ndarray) -> np.ndarray:
 
 def _power(u: np.ndarray) -> np.ndarray:
     return u**2 / 4
+
+
+def _square_with_sign(u: np.ndarray) -> np.ndarray:
+    return u + 0.5 * u * np.abs(u)
 
 
 def _thrust(u: np.ndarray) -> np.ndarray:

@@ -72,6 +72,29 @@ def multisine(
     return np.tile(_stretched(np.fft.irfft(coefficients, size), low, high), periods)
 
 
+def sinusoid(
+    n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, dt: float = 1.0, phase: float = 0.0
+) -> np.ndarray:
+    """Return a sine around the middle of low and high.
+
+    Never a sufficient excitation by itself: a static polynomial of degree p turns it into p harmonics.
+
+    Args:
+        n: samples.
+        low: smallest value.
+        high: largest value.
+        frequency: 1/unit of dt, at most half the sampling rate.
+        dt: sampling time.
+        phase: at the first sample, rad.
+
+    Raises:
+        StructureError: an argument out of its range.
+    """
+    _check(n, low, high)
+    _check_rate(frequency, dt, "frequency")
+    return (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * frequency * dt * np.arange(n) + phase)
+
+
 def crest_factor(u: np.ndarray) -> float:
     """Return the largest deviation of u (N,) from its mean over the standard deviation; 1 for a square wave."""
     return float(np.max(np.abs(u - np.mean(u))) / np.std(u))

@@ -1,0 +1,127 @@
+"""Systems of a few states with two inputs and outputs: nonlinear feedback of outputs, and two lightly damped modes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.plants.sampling import as_input, as_state, check_bounded, gaussian
+
+
+@dataclass(frozen=True, eq=False)
+class FeedbackSystem:
+    """x+ = A x + B f(u) + E g(y) + w, y = C x + D f(u) + v, with the measured output in the feedback.
+
+    g(y) = (-sin y1, -y2 |y2| / (1 + y2^2)); with E = 0 there is no feedback.
+
+    Attributes:
+        a: (n, n).
+        b: (n, 2).
+        c: (2, n).
+        d: (2, 2).
+        e: (n, 2).
+        f: the input nonlinearities, one function per input.
+        name: name of its records.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    e: Array
+    f: tuple[Callable[[Array], Array], ...]
+    name: str
+
+    def __post_init__(self) -> None:
+        for matrix in (self.a, self.b, self.c, self.d, self.e):
+            matrix.flags.writeable = False
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    def feedback(self, y: ArrayLike) -> Array:
+        """Return g(y), (N, 2), of outputs (N, 2)."""
+        y1, y2 = np.asarray(y, dtype=float).T
+        return np.column_stack([-np.sin(y1), -y2 * np.abs(y2) / (1 + y2**2)])
+
+    def record(self, u: ArrayLike, seed: int | np.random.Generator = 0, *, process: float = 0.0,
+               measurement: float = 0.0, colour: float = 0.0, x0: ArrayLike | None = None) -> Data:
+        """Simulate a record.
+
+        Args:
+            u: (N, 2) inputs.
+            seed: of the noises.
+            process: standard deviation of w, white.
+            measurement: standard deviation of v.
+            colour: pole of the first-order autoregression v; 0 is white.
+            x0: state at the first sample; zero when not given.
+
+        Raises:
+            DataError: a missing input, a wrong shape, or a run that leaves all bounds.
+            StructureError: a noise size or colour out of its range.
+        """
+        from optid.plants.kernels import with_feedback
+
+        u = as_input(u, 2)
+        rng = np.random.default_rng(seed)
+        w = gaussian(rng, len(u), self.order, process, 0.0, "process")
+        v = gaussian(rng, len(u), 2, measurement, colour, "measurement")
+        fu = np.column_stack([f(u[:, i]) for i, f in enumerate(self.f)])
+        direct = fu @ self.d.T
+        start = as_state(np.zeros(self.order) if x0 is None else x0, self.order)
+        states = with_feedback(self.a, fu @ self.b.T + w, direct, self.c, self.e, v, start)
+        check_bounded(states, self.name)
+        return Data(u, states @ self.c.T + direct + v, name=self.name)
+
+
+def _cubic(u: Array) -> Array:
+    return u + 0.5 * u**3
+
+
+def _tanh(u: Array) -> Array:
+    return np.tanh(2 * u)
+
+
+def _identity(u: Array) -> Array:
+    return u
+
+
+def _rotation(radius: float, angle: float) -> Array:
+    cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
+    return np.array([[cosine, sine], [-sine, cosine]])
+
+
+EXAMPLE1 = FeedbackSystem(
+    a=np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]]),
+    b=np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]]),
+    c=np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -0.3]]),
+    d=np.zeros((2, 2)),
+    e=np.array([[0.4, 0.0], [-0.2, 0.3], [0.1, 0.5]]),
+    f=(_cubic, _tanh),
+    name="example1",
+)
+"""Order 3, f = (u1 + 0.5 u1^3, tanh 2 u2); meant for inputs within 2."""
+
+TWO_MODES = FeedbackSystem(
+    a=np.block([[_rotation(0.9, 0.5), np.zeros((2, 2))], [np.zeros((2, 2)), _rotation(0.75, 1.4)]]),
+    b=np.array([[1.0, 0.2], [0.0, 0.5], [0.3, 1.0], [-0.6, 0.4]]),
+    c=np.array([[1.0, 0.0, 0.5, 0.0], [0.0, 0.7, 0.0, 1.0]]),
+    d=np.diag([0.1, 0.2]),
+    e=np.zeros((4, 2)),
+    f=(_identity, _identity),
+    name="two_modes",
+)
+"""Order 4, linear: modes of radius 0.9 and 0.75 at 0.5 and 1.4 rad per sample."""
+
+NOISE_CASES: dict[str, tuple[float, float]] = {
+    "deterministic": (0.0, 0.0),
+    "measurement": (0.0, 0.1),
+    "combined": (0.05, 0.2),
+    "strong": (0.2, 0.5),
+}
+"""(process, measurement) noise of the order-estimation examples on `TWO_MODES`."""

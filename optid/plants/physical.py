@@ -1,0 +1,220 @@
+"""The reaction wheel pendulum and the Van der Pol oscillator: plants of known physics with known imperfections."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid import signals
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import StructureError, nearest
+from optid.plants.sampling import as_input, as_state, check_bounded, check_positive, gaussian
+
+METHODS = ("euler", "rk4")
+
+
+@dataclass(frozen=True)
+class ReactionWheelPendulum:
+    """A hanging pendulum with a motor and a wheel at its end.
+
+    J th'' = -mgl sin th - k f(u) + tau(w) - c th',  J_r (w' + th'') = k f(u) - tau(w),
+    tau(w) = viscous w + coulomb tanh(w / threshold); f is a dead zone within a saturation. Masses, lengths and
+    inertias after D. J. Block, K. J. Astrom, M. W. Spong, The Reaction Wheel Pendulum, 2007 (from memory, mutually
+    consistent); the friction is assumed.
+
+    Attributes:
+        pendulum_mass: kg.
+        wheel_mass: kg.
+        pendulum_inertia: about its centre of mass, kg m^2.
+        wheel_inertia: about its axle, kg m^2.
+        pendulum_length: pivot to the centre of mass of the pendulum, m.
+        wheel_length: pivot to the axle of the wheel, m.
+        gravity: m/s^2.
+        torque_gain: N m per command unit.
+        dead_zone: half width, command units.
+        saturation: largest command.
+        damping: damping ratio of small oscillations, from friction at the pivot.
+        viscous: friction of the wheel, N m s.
+        coulomb: friction of the wheel, N m.
+        threshold: speed at which its Coulomb friction is 76 % developed, rad/s.
+    """
+
+    pendulum_mass: float = 0.2164
+    wheel_mass: float = 0.0850
+    pendulum_inertia: float = 2.233e-4
+    wheel_inertia: float = 2.495e-5
+    pendulum_length: float = 0.1173
+    wheel_length: float = 0.1270
+    gravity: float = 9.81
+    torque_gain: float = 4.94e-3
+    dead_zone: float = 0.4
+    saturation: float = 10.0
+    damping: float = 0.02
+    viscous: float = 6e-5
+    coulomb: float = 5e-4
+    threshold: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("pendulum_mass", "wheel_inertia", "pendulum_length", "gravity", "saturation", "threshold"):
+            check_positive(**{name: getattr(self, name)})
+        for name in ("wheel_mass", "pendulum_inertia", "wheel_length", "dead_zone", "damping", "viscous", "coulomb"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise StructureError(f"{name} = {getattr(self, name)}: a finite number that is not negative is needed.")
+
+    @property
+    def inertia(self) -> float:
+        """Inertia about the pivot, the wheel as a point mass, kg m^2."""
+        return (self.pendulum_inertia + self.pendulum_mass * self.pendulum_length**2
+                + self.wheel_mass * self.wheel_length**2)
+
+    @property
+    def weight(self) -> float:
+        """Largest torque of gravity (mgl), N m."""
+        return self.gravity * (self.pendulum_mass * self.pendulum_length + self.wheel_mass * self.wheel_length)
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency of small oscillations with the wheel blocked by nothing, rad/s."""
+        return float(np.sqrt(self.weight / self.inertia))
+
+    @property
+    def coefficients(self) -> Array:
+        """(7,) inertia, weight, wheel inertia, pivot friction (N m s), viscous, coulomb, threshold."""
+        pivot = 2 * self.damping * self.inertia * self.frequency
+        return np.array([self.inertia, self.weight, self.wheel_inertia, pivot, self.viscous, self.coulomb,
+                         self.threshold])
+
+    def torque(self, u: ArrayLike) -> Array:
+        """Return the motor torque (N m) of commands of any shape: saturation, then dead zone."""
+        u = np.clip(np.asarray(u, dtype=float), -self.saturation, self.saturation)
+        return self.torque_gain * np.sign(u) * np.maximum(np.abs(u) - self.dead_zone, 0.0)
+
+    def energy(self, states: Array) -> Array:
+        """Return potential plus kinetic energy (J) of states (N, 3): angle, rate, wheel speed.
+
+        It is conserved without torque and friction.
+        """
+        angle, rate, speed = np.asarray(states).T
+        return (self.weight * (1 - np.cos(angle)) + 0.5 * self.inertia * rate**2
+                + 0.5 * self.wheel_inertia * (speed + rate) ** 2)
+
+    def states(self, u: ArrayLike, *, dt: float = 0.02, substeps: int = 4, x0: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+        """Return angle (rad), rate (rad/s) and wheel speed (rad/s), (N, 3), under commands (N,) held between samples.
+
+        Args:
+            u: (N,) commands.
+            dt: sampling time, s.
+            substeps: steps of the classical Runge-Kutta method per sample.
+            x0: state at the first sample.
+
+        Raises:
+            DataError: a missing command, a wrong shape, or a run that leaves all bounds.
+            StructureError: dt or substeps not positive.
+        """
+        from optid.plants.kernels import pendulum as run
+
+        check_positive(dt=dt, substeps=substeps)
+        torque = self.torque(as_input(u, 1)[:, 0])
+        states = run(torque, as_state(x0, 3), self.coefficients, float(dt), int(substeps))
+        check_bounded(states, "pendulum")
+        return states
+
+
+def pendulum(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: float = 0.2,
+             quantum: float = 2 * np.pi / 4000, dt: float = 0.02, substeps: int = 4,
+             x0: ArrayLike = (0.0, 0.0, 0.0), plant: ReactionWheelPendulum | None = None) -> Data:
+    """Simulate the reaction wheel pendulum: command to angle (rad, from an encoder) and wheel speed (rad/s).
+
+    Args:
+        u: (N,) commands, useful up to 10 either way.
+        seed: of the noise on the speed.
+        measurement: its standard deviation, rad/s.
+        quantum: resolution of the encoder, rad; 0 for none.
+        dt: sampling time, s.
+        substeps: Runge-Kutta steps per sample.
+        x0: angle, rate and wheel speed at the first sample.
+        plant: the parameters; those of the class when not given.
+
+    Raises:
+        DataError: a missing command, a wrong shape, or a run that leaves all bounds.
+        StructureError: a parameter out of its range.
+    """
+    u = as_input(u, 1)
+    if not (np.isfinite(quantum) and quantum >= 0):
+        raise StructureError(f"quantum = {quantum}: the resolution is finite and not negative.")
+    states = (plant or ReactionWheelPendulum()).states(u, dt=dt, substeps=substeps, x0=x0)
+    angle = np.round(states[:, 0] / quantum) * quantum if quantum else states[:, 0]
+    speed = states[:, 2] + gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
+    return Data(u, np.column_stack([angle, speed]), dt, inputs="command", outputs=["angle", "speed"],
+                output_units=["rad", "rad/s"], name="pendulum")
+
+
+def pendulum_input(kind: str, n: int, seed: int = 0, *, dt: float = 0.02) -> Array:
+    """Return one of the four excitations (N,) of the pendulum experiments.
+
+    "sinusoid": 3 sin(2 pi 1.2 t); "chirp": 0.1 to 4 Hz, four sweeps, amplitude 4; "noise": white noise below 4 Hz
+    (fourth-order Butterworth, clipped at 8); "levels": uniform within 8, held five samples.
+
+    Args:
+        kind: one of the four words.
+        n: samples; for the chirp the sweeps are a quarter of them each.
+        seed: of the random ones.
+        dt: sampling time, s.
+
+    Raises:
+        StructureError: an unknown word or a length that is not positive.
+    """
+    makers = {
+        "sinusoid": lambda: signals.sinusoid(n, -3.0, 3.0, frequency=1.2, dt=dt),
+        "chirp": lambda: signals.chirp(4 * -(-n // 4), -4.0, 4.0, f0=0.1, f1=4.0, dt=dt, repeats=4)[:n],
+        "noise": lambda: signals.band_limited_noise(n, -8.0, 8.0, cutoff=4.0, dt=dt, seed=seed),
+        "levels": lambda: signals.uniform_levels(n, -8.0, 8.0, hold=5, seed=seed),
+    }
+    if kind not in makers:
+        raise StructureError(f"no excitation {kind!r}. {nearest(kind, makers)}")
+    return makers[kind]()
+
+
+def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: float = 0.0, measurement: float = 0.0,
+                colour: float = 0.0, eps: float = 1.0, dt: float = 0.1, method: str = "euler", substeps: int = 4,
+                x0: ArrayLike = (0.0, 0.0)) -> Data:
+    """Simulate a Van der Pol oscillator in Lienard form, driven through f(u) = u + 0.5 u |u|.
+
+    x1+ = x1 + dt (x2 + eps (x1 - y^3 / 3)) + w1, x2+ = x2 + dt (f(u) - x1) + w2, y = x1 + v: one measured output enters
+    the feedback (method "euler", the plant within the model class). Method "rk4" integrates the differential equation
+    instead, which no difference equation of order two describes exactly.
+
+    Args:
+        u: (N,) input, of the order of 2.
+        seed: of the noises.
+        process: standard deviation of w1 and w2.
+        measurement: standard deviation of v, which the feedback sees.
+        colour: pole of the first-order autoregression v; 0 is white.
+        eps: strength of the nonlinear damping.
+        dt: sampling time.
+        method: "euler" or "rk4".
+        substeps: Runge-Kutta steps per sample.
+        x0: state at the first sample.
+
+    Raises:
+        DataError: a missing input, a wrong shape, or a run that leaves all bounds.
+        StructureError: a parameter out of its range.
+    """
+    from optid.plants.kernels import van_der_pol_euler, van_der_pol_rk4
+
+    u = as_input(u, 1)
+    check_positive(dt=dt, substeps=substeps)
+    if method not in METHODS:
+        raise StructureError(f"method = {method!r}. {nearest(method, METHODS)}")
+    rng = np.random.default_rng(seed)
+    w = gaussian(rng, len(u), 2, process, 0.0, "process")
+    v = gaussian(rng, len(u), 1, measurement, colour, "measurement")[:, 0]
+    drive = u[:, 0] + 0.5 * u[:, 0] * np.abs(u[:, 0])
+    start = as_state(x0, 2)
+    if method == "euler":
+        states = van_der_pol_euler(drive, w, v, start, float(eps), float(dt))
+    else:
+        states = van_der_pol_rk4(drive, w, v, start, float(eps), float(dt), int(substeps))
+    check_bounded(states, "Van der Pol oscillator")
+    return Data(u, states[:, 0] + v, dt, name="vanderpol")

@@ -1,0 +1,81 @@
+"""What every simulated plant does alike: check the input, draw the noise, refuse a run that leaves all bounds."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+
+WILD = 1e8
+
+
+def as_input(u: ArrayLike, channels: int) -> Array:
+    """Return the input as (N, channels).
+
+    Raises:
+        DataError: another shape, no sample, or a sample that is not finite, named by channel and position.
+    """
+    array = np.asarray(u, dtype=float)
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[1] != channels or not len(array):
+        wanted = f"(N,) or (N, {channels})" if channels == 1 else f"(N, {channels})"
+        raise DataError(f"the input has shape {np.shape(u)}; this plant takes {wanted} with N of at least 1.")
+    missing = ~np.isfinite(array)
+    if missing.any():
+        k, c = (int(i[0]) for i in np.nonzero(missing))
+        raise DataError(f"input channel {c + 1} is {array[k, c]} at sample {k}: a simulation needs every sample.")
+    return array
+
+
+def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colour: float, what: str) -> Array:
+    """Return (n, channels) Gaussian noise of standard deviation `size`, first-order autoregressive with pole `colour`.
+
+    Raises:
+        StructureError: a negative size, or a pole that is not inside the unit circle.
+    """
+    if not (np.isfinite(size) and size >= 0):
+        raise StructureError(f"{what} = {size}: the standard deviation of a noise is finite and not negative.")
+    if not abs(colour) < 1:
+        raise StructureError(f"colour = {colour}: the pole of the noise lies strictly between -1 and 1.")
+    # Drawn even when the size is zero, so that a seed gives the same numbers to the other noises.
+    white = rng.standard_normal((n, channels))
+    if size == 0 or colour == 0:
+        return size * white
+    from scipy.signal import lfilter
+
+    # The first sample has the stationary deviation; the filter then keeps it.
+    white[1:] *= np.sqrt(1 - colour**2)
+    return size * np.asarray(lfilter([1.0], [1.0, -colour], white, axis=0))
+
+
+def check_bounded(states: Array, plant: str) -> None:
+    """Refuse a simulation that left all bounds.
+
+    Raises:
+        DataError: with the first sample at which it did.
+    """
+    with np.errstate(invalid="ignore"):
+        wild = ~(np.abs(states) < WILD).all(axis=1)
+    if wild.any():
+        raise DataError(f"the simulated {plant} leaves all bounds at sample {int(np.argmax(wild))}: "
+                        "use a smaller input, less noise or a shorter sampling time.")
+
+
+def as_state(x0: ArrayLike, order: int) -> Array:
+    """Return the initial state as (order,).
+
+    Raises:
+        DataError: another shape, or a value that is not finite.
+    """
+    state = np.array(x0, dtype=float)
+    if state.shape != (order,) or not np.isfinite(state).all():
+        raise DataError(f"x0 = {x0!r}: {order} finite numbers are needed.")
+    return state
+
+
+def check_positive(**values: float) -> None:
+    """Refuse parameters that are not positive and finite, by name."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise StructureError(f"{name} = {value}: a positive number is needed.")
