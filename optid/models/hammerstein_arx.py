@@ -1,6 +1,6 @@
 """The Hammerstein-ARX model: A(q) y = sum_c B_c(q) f_c(u_c) + d + e, one or several inputs and outputs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ from optid.data import Data
 from optid.errors import StructureError
 from optid.models import responses, simulation
 from optid.models.coefficients import check_shapes, checked_horizon, coefficients, listed
+from optid.models.experiments import in_units_of, one_or_all, records_of, samples_of
 from optid.models.gauges import in_raw_units, regauged
 from optid.models.nonlinearity import Nonlinearity
 
@@ -100,16 +101,6 @@ class HammersteinARX:
     def nb(self) -> tuple[int, ...]:
         """Number of numerator coefficients, one per input."""
         return tuple(len(b) for b in self.b)
-
-    @property
-    def kind(self) -> str:
-        """The name of the class, the word that stands in a file."""
-        return "HammersteinARX"
-
-    @property
-    def title(self) -> str:
-        """What the model is called in print."""
-        return "ARX model" if all(_is_linear(f) for f in self.nonlinearities) else "Hammerstein-ARX model"
 
     @property
     def orders(self) -> dict[str, Any]:
@@ -254,7 +245,7 @@ class HammersteinARX:
             StructureError: a horizon that is not a whole number from 1.
         """
         horizon = checked_horizon(horizon)
-        data = self._raw(data)
+        data = in_units_of(self, data)
         return one_or_all([simulation.predict_record(self, e.u, e.y, horizon) for e in data.experiments])
 
     def simulate(self, data: Any, x0: Any = "zero") -> Any:
@@ -341,42 +332,6 @@ class HammersteinARX:
         return in_raw_units(self, transform)
 
     # -- leaving -------------------------------------------------------------------------------------------------
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe the model in JSON types."""
-        return {
-            "kind": self.kind,
-            "a": self.a.tolist(),
-            "b": [b.tolist() for b in self.b],
-            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
-            "nk": list(self.nk),
-            "offset": self.offset.tolist(),
-            "dt": self.dt,
-            "inputs": list(self.inputs),
-            "outputs": list(self.outputs),
-            "input_units": list(self.input_units),
-            "output_units": list(self.output_units),
-            "gauge": self.gauge,
-        }
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any], functions: Mapping[str, Any] | None = None) -> "HammersteinARX":
-        """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
-        outputs = len(content["outputs"])
-        a = np.array(content["a"], dtype=float)
-        return cls(
-            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
-            b=tuple(np.array(b, dtype=float) for b in content["b"]),
-            nonlinearities=tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
-            nk=tuple(content["nk"]),
-            offset=np.array(content["offset"], dtype=float),
-            dt=content["dt"],
-            inputs=tuple(content["inputs"]),
-            outputs=tuple(content["outputs"]),
-            input_units=tuple(content["input_units"]),
-            output_units=tuple(content["output_units"]),
-            gauge=content["gauge"],
-        )
 
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it exactly."""
