@@ -9,6 +9,7 @@ from optid.errors import StructureError
 MAKERS = {
     "multisine": lambda n, lo, hi: signals.multisine(n, lo, hi),
     "prbs": lambda n, lo, hi: signals.prbs(n, lo, hi, hold=2),
+    "sinusoid": lambda n, lo, hi: signals.sinusoid(n, lo, hi, frequency=0.07, phase=1.0),
     "chirp": lambda n, lo, hi: signals.chirp(n, lo, hi, f0=0.01, f1=0.3),
     "band_limited_noise": lambda n, lo, hi: signals.band_limited_noise(n, lo, hi, cutoff=0.2),
     "uniform_levels": lambda n, lo, hi: signals.uniform_levels(n, lo, hi, hold=3, levels=7),
