@@ -21,7 +21,8 @@ from optid.errors import (
     UnboundedError,
     nearest,
 )
-from optid.prices import Price, price_constraints
+from optid.models.functions import has_feedback
+from optid.prices import Price, price_constraints, price_earlier_steps
 from optid.program import Program
 from optid.registry import check_arguments, formulation, named_constraint
 from optid.solution import Solution, Status
@@ -42,7 +43,8 @@ class Fit:
         data: the record.
         prices: activity and price of every user constraint.
         findings: what the examination of the record found, one sentence each.
-        figures: rows used, rows there are, condition number, method of the statistics.
+        figures: rows used, rows there are, condition number, method of the statistics; for a procedure what it measured
+            on its way (singular values, number of starts, ...).
         steps: (name, solution) of every programme on the way.
         seconds: wall time of the whole call.
     """
@@ -61,23 +63,49 @@ class Fit:
 
     @cached_property
     def one_step_fit(self) -> np.ndarray:
-        """One-step fit in % of every output on the rows used for the estimate."""
-        return self.program.compressed.one_step_fit(self.solution.values)
+        """One-step fit in % of every output: on the rows used for the estimate where the programme knows them.
+
+        Otherwise over the samples of the record that the model can predict; NaN for a stream then.
+        """
+        from optid.validation import fit_percent
+        from optid.validation.predictions import one_step
+
+        if hasattr(self.program.compressed, "one_step_fit"):
+            return self.program.compressed.one_step_fit(self.solution.values)
+        if isinstance(self.data, Stream):
+            return np.full(len(self.data.outputs), np.nan)
+        raw = self.data.raw()
+        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(one_step(self.model, raw)))
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
         """Simulation fit in % of every output on the estimation record, initial conditions fitted.
 
-        NaN for a stream, and where an input has missing samples: a simulation needs every one of them.
+        NaN for a stream, where an input has missing samples (a simulation needs every one of them), and where the
+        simulation runs away.
         """
+        return self._simulated_fit("simulation")
+
+    @cached_property
+    def measured_feedback_fit(self) -> np.ndarray:
+        """Fit in % of the simulation that takes the outputs in the feedback from the record.
+
+        The same as `simulation_fit` for a model without nonlinear feedback.
+        """
+        return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
+
+    def _simulated_fit(self, word: str) -> np.ndarray:
         from optid.validation import fit_percent
+        from optid.validation.predictions import simulated
 
         if isinstance(self.data, Stream) or any(self.data.missing[name] for name in self.data.inputs):
             return np.full(len(self.data.outputs), np.nan)
         raw = self.data.raw()
-        simulated = self.model.simulate(raw, x0="fit")
-        several = simulated if isinstance(simulated, list | tuple) else [simulated]
-        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(several))
+        try:
+            outputs = simulated(self.model, raw, word)
+        except DataError:  # it leaves the range of the data
+            return np.full(len(self.data.outputs), np.nan)
+        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(outputs))
 
     @cached_property
     def uncertainty(self) -> Any:
@@ -183,12 +211,15 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     if model is not None and transform is not None and not transform.is_identity:
         model = model.with_transform(transform)
     statistics = getattr(outcome.program.compressed, "statistics", None)
-    figures = {} if statistics is None else {"rows": statistics.rows, "candidates": statistics.candidates,
-                                             "condition": statistics.condition, "method": statistics.method}
+    figures = dict(outcome.figures)
     if statistics is not None:
+        figures |= {"rows": statistics.rows, "candidates": statistics.candidates, "condition": statistics.condition,
+                    "method": statistics.method}
         findings = findings + examine_rows(statistics.rows, statistics.candidates, statistics.condition)
     return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
-               program=outcome.program, data=data, prices=price_constraints(outcome.program, outcome.solution),
+               program=outcome.program, data=data,
+               prices=(*price_constraints(outcome.program, outcome.solution),
+                       *price_earlier_steps(outcome.constrained, outcome.program)),
                findings=tuple(findings), figures=figures, steps=outcome.steps, seconds=time.perf_counter() - started)
 
 

@@ -1,6 +1,7 @@
 """What every constraint costs: activity, slack, multiplier, and the multiplier in points of fit."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
@@ -26,7 +27,7 @@ class Price:
         multiplier: largest multiplier over the rows, in units of the objective per unit of the constraint; ``nan``
             where the solver gives none.
         fit_points: points of one-step fit (%, all outputs together) gained per unit by which the most expensive row
-            is relaxed.
+            is relaxed; ``nan`` where the constraint belongs to a step with an objective of its own.
     """
 
     name: str
@@ -66,6 +67,22 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
         dual = solution.duals.get(name)
         multiplier = float(np.max(np.abs(dual), initial=0.0)) if dual is not None else np.nan
         found.append(Price(name, active, rows, max(slack, 0.0), multiplier, multiplier * worth))
+    return tuple(found)
+
+
+def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:
+    """Return the prices of the constraints that stood in earlier steps of a procedure only.
+
+    Their multipliers are in units of the objective of their own step, so they have no price in points of fit.
+
+    Args:
+        steps: programme and solution of every constraint, by its name.
+        last: the last programme, whose constraints are left out.
+    """
+    found = []
+    for name, (program, solution) in steps.items():
+        if name not in last.user_constraints:
+            found += [replace(p, fit_points=np.nan) for p in price_constraints(program, solution) if p.name == name]
     return tuple(found)
 
 

@@ -1,8 +1,8 @@
 """Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, ask for a proof."""
 
 import time
-from collections.abc import Callable, Generator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -210,6 +210,9 @@ class Evidence:
         bound: bound on that objective, with the reason where there can be none.
         status: status of the procedure as a whole.
         reason: one sentence for people.
+        figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
+            "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
+            which the report draws. The fit prints them in this order.
     """
 
     model: Any
@@ -217,6 +220,7 @@ class Evidence:
     bound: Bound
     status: Status
     reason: str = ""
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -228,12 +232,17 @@ class Outcome:
         solution: the last solution.
         program: the last programme.
         steps: every (name, solution) on the way; one entry for a plain programme.
+        figures: those of the procedure's `Evidence`.
+        constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
+            constraints to the steps they are about.
     """
 
     model: Any
     solution: Solution
     program: Program
     steps: tuple[tuple[str, Solution], ...]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -244,22 +253,24 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         solver: as in `solve`.
         settings: as in `solve`.
     """
+    constrained: dict[str, tuple[Program, Solution]] = {}
     if isinstance(problem, Program):
         solution = solve(problem, solver, **settings)
         model = problem.recover(solution.values) if solution.has_point else None
-        return Outcome(model, solution, problem, ((problem.name, solution),))
+        constrained = dict.fromkeys(problem.user_constraints, (problem, solution))
+        return Outcome(model, solution, problem, ((problem.name, solution),), constrained=constrained)
     steps: list[tuple[str, Solution]] = []
     program = next(problem)
     while True:
         solution = solve(program, solver, **settings)
         steps.append((program.name, solution))
+        constrained |= dict.fromkeys(program.user_constraints, (program, solution))
         try:
-            program_next = problem.send(solution)
+            program = problem.send(solution)
         except StopIteration as stop:
-            if isinstance(stop.value, Evidence):
-                found = stop.value
+            found, figures = stop.value, {}
+            if isinstance(found, Evidence):
                 solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
                                    reason=found.reason)
-                return Outcome(found.model, solution, program, tuple(steps))
-            return Outcome(stop.value, solution, program, tuple(steps))
-        program = program_next
+                found, figures = found.model, found.figures
+            return Outcome(found, solution, program, tuple(steps), figures, constrained)

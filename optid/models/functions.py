@@ -1,0 +1,70 @@
+"""The static functions of a model, of its inputs and of the outputs it feeds back, as tables and figures name them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from optid.bases.expansions import Linear
+from optid.models.nonlinearity import Nonlinearity
+
+
+@dataclass(frozen=True, eq=False)
+class StaticFunction:
+    """One static function of a model.
+
+    Attributes:
+        word: its name in equations and tables: "f", "f_valve", "g_level".
+        nonlinearity: the function.
+        channel: index of its argument among the inputs, or the outputs for a feedback.
+        name: name of that channel.
+        unit: its unit, "" where unknown.
+        fed_back: whether the argument is an output.
+    """
+
+    word: str
+    nonlinearity: Nonlinearity
+    channel: int
+    name: str
+    unit: str
+    fed_back: bool = False
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether there is nothing to draw."""
+        return isinstance(self.nonlinearity.basis, Linear)
+
+
+def static_functions(model: Any) -> list[StaticFunction]:
+    """Return the functions of the inputs, then those of the outputs that are fed back.
+
+    With one input and one function of it the word is "f"; several functions of one input are numbered.
+    """
+    shown = tuple(model.nonlinearities)
+    if model.m == 1 and len(shown) == 1 and isinstance(getattr(model, "f", None), Nonlinearity):
+        shown = (model.f,)  # with its offset, where the model knows it
+    places = tuple(getattr(model, "input_of", range(model.m)))
+    names = _words("f", places, model.inputs, alone=model.m == 1)
+    found = [
+        StaticFunction(word, f, c, model.inputs[c], model.input_units[c]) for word, f, c in zip(names, shown, places)
+    ]
+    if has_feedback(model):
+        places = tuple(model.output_of)
+        names = _words("g", places, model.outputs, alone=model.l == 1)
+        found += [
+            StaticFunction(word, g, o, model.outputs[o], model.output_units[o], fed_back=True)
+            for word, g, o in zip(names, model.feedback, places)
+        ]
+    return found
+
+
+def has_feedback(model: Any) -> bool:
+    """Whether outputs are fed back through static functions, so that a simulation may take them from a record."""
+    return bool(getattr(model, "feedback", ()))
+
+
+def _words(letter: str, places: tuple[int, ...], channels: tuple[str, ...], alone: bool) -> list[str]:
+    words, count = [], {}
+    for c in places:
+        count[c] = count.get(c, 0) + 1
+        word = letter if alone else f"{letter}_{channels[c]}"
+        words.append(f"{word}{count[c]}" if places.count(c) > 1 else word)
+    return words
