@@ -16,11 +16,14 @@ class Rule:
         build: view -> CVXPY constraint or list of them.
         verify: model -> what is wrong with it, "" where it obeys; for statements that the constraint itself only
             approximates.
+        about: what it restricts, "poles" or "coefficients": a procedure of several steps hands it to the steps that
+            choose these.
     """
 
     name: str
     build: Callable[[View], Any]
     verify: Callable[[Any], str] | None = None
+    about: frozenset[str] = frozenset({"coefficients"})
 
     def __call__(self, view: View) -> dict[str, Any]:
         """Build the constraint in the variables of a formulation."""

@@ -26,6 +26,7 @@ from optid.program import View
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
+FACTORED = ("exact", "tangent")  # kinds whose variables are mu and b
 SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
 
 
@@ -176,7 +177,7 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
         raise StructureError("coefficients needs low= and/or high=")
 
     def build(view: View) -> Any:
-        if view.kind == "exact" and view.gauge == "norm" and name not in ("a", "offset"):
+        if view.kind in FACTORED and view.gauge == "norm" and name not in ("a", "offset"):
             raise StructureError(f"bounds on {name!r} depend on the gauge, and 'norm' only fixes a length; choose "
                                  "gauge='b0' or gauge='gain', or bound the static gain or slope instead")
         variable = view[name] if index is None else cp.hstack([view[name][int(index)]])
@@ -203,7 +204,7 @@ def fixed(name: str, value: Any) -> Rule:
             direction = np.ravel(known, order="F") / np.linalg.norm(known)
             rest = np.eye(direction.size) - np.outer(direction, direction)
             rest = _independent(rest)
-            if view.kind == "exact":
+            if view.kind in FACTORED:
                 _check_shape(name, known, view[name].shape)
                 target = view[name] if view[name].ndim == 1 else cp.vec(view[name], order="F")
                 return rest @ target == 0
@@ -259,7 +260,7 @@ def _basis(view: View, channel: str | None) -> Any:
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
         matrix = rows(_basis(view, one))
-        if view.kind == "exact":
+        if view.kind in FACTORED and view.key("mu", one) in view:
             return matrix @ view[view.key("mu", one)] >= 0
         return matrix @ _static_theta(view, one) >= 0
 
@@ -270,7 +271,8 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
         matrix = _independent(rows(_basis(view, one)))
-        return matrix @ view[view.key("mu" if view.kind == "exact" else "Theta", one)] == 0
+        factored = view.kind in FACTORED and view.key("mu", one) in view
+        return matrix @ view[view.key("mu" if factored else "Theta", one)] == 0
 
     return Rule(_label(word, channel), lambda view: _every(view, channel, lambda one: build(view, one)))
 
@@ -300,7 +302,7 @@ def _static_theta(view: View, channel: str | None) -> Any:
     _basis(view, channel)
     if view["offset"].size > 1:
         raise StructureError("constraints on the static characteristic are defined for one output")
-    if view.kind == "linear":
+    if view.key("Theta", channel) not in view:  # a linear model has b alone
         return cp.hstack([cp.sum(view[view.key("b", channel)])])
     return cp.sum(view[view.key("Theta", channel)], axis=1)
 

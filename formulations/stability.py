@@ -4,6 +4,10 @@ Exact for na <= 2 (the stability triangle); above that a stated convex inner reg
 ``Re(A(e^{iw}) / C(e^{iw})) > 0`` on the circle, which makes A as stable as C (strict positive realness; Henrion,
 Sebek and Kucera 2003 use the same central polynomial in LMI form). It is imposed on a grid of frequencies that is
 dense where a root of C is near the circle, as linear inequalities; the roots are verified after the fit.
+
+In the steps of an output-error fit (kind "tangent") C is the current iterate, pulled inwards only as far as the
+iterate stays inside the region: no step is therefore cut off, and every iterate is stable by construction. For the
+matrix A of a state-space model (kind "shift") the disc is an exact linear matrix inequality.
 """
 
 from collections.abc import Sequence
@@ -11,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from formulations.pole_regions import disc_side, lmi
 from formulations.rule import Rule
 from optid.errors import StructureError
 from optid.program import View
@@ -18,6 +23,8 @@ from optid.program import View
 FREQUENCIES = 128
 MARGIN = 1e-6  # by how much of the radius the disc is shrunk, so that a binding constraint leaves a stable model
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
+
+LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of the centre end, as shares of the radius
 
 
 def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> Rule:
@@ -38,6 +45,10 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
     name, radius = f"stable:{radius:g}", radius * (1 - MARGIN)
 
     def build(view: View) -> Any:
+        if view.kind == "shift":
+            if points is not None:
+                raise StructureError("real= is defined for the coefficients of a polynomial, not for a matrix A")
+            return lmi(view, [disc_side(radius)], name)
         if "a" not in view:
             raise StructureError("there is nothing to stabilise: na is 0")
         a = view["a"]
@@ -52,12 +63,9 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         if na == 2:
             scaled = [powers[0] * a[0], powers[1] * a[1]]
             return [1 + scaled[0] + scaled[1] >= 0, 1 - scaled[0] + scaled[1] >= 0, scaled[1] <= 1]
-        reference = central(np.asarray(view.reference.get("a", np.zeros(na))), radius) * powers
-        lags = np.exp(-1j * frequencies(np.roots([1.0, *reference])))[:, None] ** np.arange(1, na + 1)
-        centre = 1 + lags @ reference
-        rows = np.real(np.conj(centre)[:, None] * lags * powers)
-        size = np.abs(centre) ** 2
-        return (rows / size[:, None]) @ a + np.real(centre) / size >= GAP
+        reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
+        rows, levels = inner_region(reference, radius, keep=view.kind == "tangent")
+        return rows @ a >= levels
 
     def verify(model: Any) -> str:
         largest = float(np.max(np.abs(model.poles), initial=0.0))
@@ -65,7 +73,37 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
             return ""
         return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; ask for a smaller radius"
 
-    return Rule(name, build, verify)
+    return Rule(name, build, verify, frozenset({"poles"}))
+
+
+def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return (rows, levels) such that every a with ``rows @ a >= levels`` has its roots in the disc.
+
+    Args:
+        reference: coefficients (na,) of the polynomial to centre on.
+        radius: of the disc.
+        keep: the reference itself has to lie inside, where its roots do: its centre is then pulled inwards no
+            further than that allows.
+    """
+    whole = np.asarray(reference, dtype=float)
+    inside = float(np.max(np.abs(np.roots([1.0, *whole])), initial=0.0)) < radius
+    for limit in LIMITS if keep and inside else LIMITS[:1]:
+        rows, levels = _positive_real(central(whole, radius, limit), radius)
+        if not (keep and inside) or np.all(rows @ whole >= levels):
+            return rows, levels
+    return _positive_real(whole, radius)
+
+
+def _positive_real(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inequalities Re(A / C) >= `GAP` on a grid of the circle."""
+    order = np.arange(1, centre.size + 1)
+    powers = radius ** -order.astype(float)
+    scaled = centre * powers
+    lags = np.exp(-1j * frequencies(np.roots([1.0, *scaled])))[:, None] ** order
+    values = 1 + lags @ scaled
+    size = np.abs(values) ** 2
+    rows = np.real(np.conj(values)[:, None] * lags * powers) / size[:, None]
+    return rows, GAP - np.real(values) / size
 
 
 def frequencies(roots: np.ndarray) -> np.ndarray:
@@ -79,10 +117,10 @@ def frequencies(roots: np.ndarray) -> np.ndarray:
     return np.unique(found[(found >= 0) & (found <= np.pi)])
 
 
-def central(a: np.ndarray, radius: float) -> np.ndarray:
-    """Return the coefficients of ``A`` with every pole outside ``0.98 radius`` pulled back onto that circle."""
+def central(a: np.ndarray, radius: float, share: float = LIMITS[0]) -> np.ndarray:
+    """Return the coefficients of ``A`` with every pole outside ``share * radius`` pulled back onto that circle."""
     roots = np.roots(np.concatenate([[1.0], a]))
-    limit = 0.98 * radius
+    limit = share * radius
     sizes = np.abs(roots)
     pulled = np.where(sizes > limit, roots * limit / np.maximum(sizes, 1e-300), roots)
     return np.real(np.poly(pulled))[1:]

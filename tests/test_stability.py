@@ -16,10 +16,10 @@ from optid.models import HammersteinARX
 from optid.program import View
 
 
-def build(rule, na, reference=None):
+def build(rule, na, reference=None, kind="linear"):
     """The constraint on a, with its variable."""
     a = cp.Variable(na, name="a")
-    view = View({"a": a}, kind="linear", channels=("u",), reference={} if reference is None else {"a": reference})
+    view = View({"a": a}, kind=kind, channels=("u",), reference={} if reference is None else {"a": reference})
     members = rule.build(view)
     return a, members if isinstance(members, list) else [members]
 
@@ -61,6 +61,40 @@ def test_the_inner_region_holds_stable_polynomials_only(na, radius):
                     inside += 1
                     assert largest(trial) < radius
     assert inside > 100
+
+
+def near_the_circle(rng, na, distance):
+    """Poles in conjugate pairs, clustered and close to the unit circle."""
+    angle = rng.uniform(0.1, 3.0)
+    pairs = [(1 - distance * rng.uniform(0.5, 2)) * np.exp(1j * (angle + 0.05 * rng.normal())) for _ in range(na // 2)]
+    return np.array([*pairs, *np.conj(pairs), *([1 - distance] if na % 2 else [])])
+
+
+@pytest.mark.parametrize("na", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("distance", [0.3, 1e-2, 1e-3, 1e-5])
+def test_a_stable_iterate_lies_in_its_own_region_and_all_of_the_region_is_stable(na, distance):
+    rng = np.random.default_rng(na)
+    reached = 0
+    for _ in range(8):
+        radius = float(rng.choice([1.0, 0.9]))
+        iterate = np.real(np.poly(radius * near_the_circle(rng, na, distance)))[1:]
+        a, members = build(stable(radius), na, iterate, kind="tangent")
+        assert holds(a, members, iterate)
+        for _ in range(25):  # as far as the region reaches in a random direction
+            way, low, high = rng.normal(size=na), 0.0, 10.0
+            for _ in range(50):
+                middle = (low + high) / 2
+                low, high = (middle, high) if holds(a, members, iterate + middle * way) else (low, middle)
+            assert largest(iterate + low * way) < radius
+            reached = max(reached, low * float(np.linalg.norm(way)))
+    assert reached > 1e-4 * min(1.0, 100 * distance)
+
+
+def test_a_tangent_step_from_an_unstable_iterate_is_led_back():
+    iterate = np.real(np.poly([1.05, 0.9 + 0.3j, 0.9 - 0.3j]))[1:]
+    a, members = build(stable(1.0), 3, iterate, kind="tangent")
+    cp.Problem(cp.Minimize(cp.sum_squares(a - iterate)), members).solve(solver=cp.CLARABEL)
+    assert largest(a.value) < 1
 
 
 @given(st.lists(st.floats(-2, 2), min_size=2, max_size=4), st.data())

@@ -1,0 +1,112 @@
+"""Pole regions: the matrix inequality holds for some P exactly when the eigenvalues lie in the region."""
+
+import warnings
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from formulations import pole_regions
+from formulations.pole_regions import damping_sides, disc, disc_side, sector, strip, wedge_side
+from formulations.stability import stable
+from optid.errors import StructureError
+from optid.program import View
+from optid.registry import named_constraint
+
+
+def admits(rule, matrix):
+    """Whether some P > 0 satisfies the rule for a given A: the margin it leaves when tr P = n."""
+    n = len(matrix)
+    p, slack = cp.Variable((n, n), symmetric=True), cp.Variable()
+    members = rule.build(View({"P": p, "Q": matrix @ p}, kind="shift"))
+    eased = [c.args[0] - slack * np.eye(c.args[0].shape[0]) >> 0 for c in members]
+    problem = cp.Problem(cp.Maximize(slack), [p >> 1e-3 * np.eye(n), cp.trace(p) == n, slack <= 1, *eased])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # outside, the largest slack may be attained at a singular P
+        problem.solve(solver=cp.CLARABEL)
+    return slack.value > 1e-6
+
+
+def member(name, z):
+    return {
+        "stable": abs(z) <= 0.8,
+        "disc": abs(z - 0.4) <= 0.5,
+        "strip": -0.1 <= z.real <= 0.7,
+        "sector": abs(np.angle(z)) <= 0.9,
+        "damped": abs(z) <= np.exp(-0.3 / np.sqrt(1 - 0.09) * abs(np.angle(z))),
+    }[name]
+
+
+RULES = {"stable": stable(0.8), "disc": disc(0.4, 0.5), "strip": strip(-0.1, 0.7), "sector": sector(0.9),
+         "damped": pole_regions.damped(0.3)}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_certificate_exists_exactly_for_eigenvalues_inside(name):
+    rng = np.random.default_rng(1)
+    seen = {True: 0, False: 0}
+    for _ in range(60):
+        modulus, angle = rng.uniform(0.05, 1.0), rng.uniform(0, 3.1)
+        z = modulus * np.exp(1j * angle)
+        block = np.array([[z.real, z.imag], [-z.imag, z.real]])
+        matrix = np.zeros((3, 3))
+        matrix[:2, :2], matrix[2, 2], matrix[:2, 2] = block, 0.3, 0.3 * rng.normal(size=2)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        inside = admits(RULES[name], turn @ matrix @ turn.T)
+        seen[inside] += 1
+        if name == "damped":  # an inner region
+            assert not inside or member(name, z)
+        elif min(abs(modulus - 0.8), abs(abs(z - 0.4) - 0.5), abs(z.real + 0.1), abs(z.real - 0.7),
+                 abs(angle - 0.9)) > 1e-2:
+            assert inside == member(name, z)
+    assert min(seen.values()) > 5
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.3, 0.7, 0.95])
+def test_the_polygon_fills_the_convex_part_of_a_damping_region(ratio):
+    rate = ratio / np.sqrt(1 - ratio**2)
+    sides = damping_sides(rate)
+    x, y = np.meshgrid(np.linspace(-1, 1, 121), np.linspace(0, 1, 61))
+    points = (x + 1j * y).ravel()
+    true = np.abs(points) <= np.exp(-rate * np.angle(points))
+    inside = np.array([min(side.slack(z) for side in sides) >= 0 for z in points])
+    assert not np.any(inside & ~true)
+    convex = true & (points.real >= -np.exp(-rate * np.pi))
+    assert np.sum(inside) > 0.93 * np.sum(convex)
+
+
+@pytest.mark.parametrize("side, z, value", [(disc_side(0.5, 0.4), 0.4 + 0.3j, 0.2), (wedge_side(0.0, 0.7), 0.2, 1.0),
+                                            (wedge_side(np.pi, 0.1), 0.2 + 0.5j, 0.6)])
+def test_the_slack_of_a_side_is_its_distance(side, z, value):
+    assert side.slack(z) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("word, name", [
+    ("damped:0.5", "damped:0.5"), ("strip:0.1,0.9", "strip:0.1,0.9"), ("strip:high=0.9", "strip:-inf,0.9"),
+    ("sector:0.7", "sector:0.7"), ("disc:0.2,0.6", "disc:0.2,0.6"), ("stable:0.995", "stable:0.995"),
+])
+def test_every_region_has_a_word_and_is_about_poles(word, name):
+    rule = named_constraint(word)
+    assert rule.name == name and rule.about == {"poles"}
+
+
+@pytest.mark.parametrize("call, words", [
+    (lambda: disc(0.2, 0.0), "positive radius"),
+    (lambda: strip(), "low= and/or high="),
+    (lambda: strip(0.9, 0.1), "low < high"),
+    (lambda: sector(2.0), r"\(0, pi/2\]"),
+    (lambda: pole_regions.damped(1.0), r"\(0, 1\)"),
+    (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(2)}, kind="linear")), "only 'stable' is available"),
+    (lambda: stable(real=0.3).build(View({"P": cp.Variable((2, 2))}, kind="shift")), "not for a matrix A"),
+])
+def test_bad_arguments(call, words):
+    with pytest.raises(StructureError, match=words):
+        call()
+
+
+def test_verification_names_the_pole_outside():
+    class Model:
+        poles = np.array([0.5, 0.95 + 0.1j, 0.95 - 0.1j])
+
+    assert pole_regions.strip(high=0.9).verify(Model()) and "0.95" in strip(high=0.9).verify(Model())
+    assert strip(high=0.96).verify(Model()) == ""
