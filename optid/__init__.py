@@ -23,6 +23,7 @@ _HOME = {
     "UserFunctions": "bases",
     "Nonlinearity": "models",
     "HammersteinARX": "models",
+    "HammersteinTF": "models",
     "Program": "program",
     "Status": "solution",
     "Solution": "solution",

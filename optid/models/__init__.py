@@ -1,5 +1,6 @@
-"""The Hammerstein-ARX model: what it says, what it predicts, its gauges, units and exports."""
+"""The models: what they say, what they predict, their gauges, units and exports."""
 
 from optid.models.hammerstein_arx import HammersteinARX, Nonlinearity
+from optid.models.hammerstein_tf import HammersteinTF
 
-__all__ = ["HammersteinARX", "Nonlinearity"]
+__all__ = ["HammersteinARX", "HammersteinTF", "Nonlinearity"]

@@ -1,5 +1,6 @@
 """A model as text: one difference equation per output."""
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from optid.bases.expansions import Linear
@@ -12,6 +13,12 @@ if TYPE_CHECKING:
 def written(model: "HammersteinARX", digits: int = 4) -> str:
     """Write one difference equation per output, with coefficients of so many significant digits."""
     return "\n".join(_equation(model, o, digits) for o in range(model.l))
+
+
+def polynomial(coefficients: Iterable[float], digits: int = 4) -> str:
+    """Write 1 + c_1 q^-1 + c_2 q^-2 + ..., without the terms that are zero."""
+    terms = [f" {'-' if c < 0 else '+'} {abs(c):.{digits}g} q^-{i}" for i, c in enumerate(coefficients, start=1) if c]
+    return "1" + "".join(terms)
 
 
 def _equation(model: "HammersteinARX", o: int, digits: int) -> str:

@@ -4,6 +4,7 @@ The state x (n, l) is what the past adds to the right-hand side of the next n eq
 It shifts by one every sample and receives B_i f(u) - A_i y, so a free response is 1/A driven by the rows of x.
 """
 
+import sys
 import warnings
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -213,11 +214,14 @@ def _radius(model: "HammersteinARX") -> str:
 
 
 def _horizon(model: "HammersteinARX", count: int) -> int:
-    radius = float(np.max(np.abs(model.poles), initial=0.0))
+    return min(count, horizon_of(float(np.max(np.abs(model.poles), initial=0.0)), model.memory))
+
+
+def horizon_of(radius: float, memory: int) -> int:
+    """Number of samples that inform about an initial state when the largest pole has this radius."""
     if radius >= 1:
-        return count
-    decay = 0 if radius == 0 else int(2 * np.log(FORGOTTEN) / np.log(radius))
-    return min(count, 10 * model.memory + decay)
+        return sys.maxsize
+    return 10 * memory + (0 if radius == 0 else int(2 * np.log(FORGOTTEN) / np.log(radius)))
 
 
 def _march(a: Array, right: Array) -> Array:

@@ -1,0 +1,431 @@
+"""Transfer-function Hammerstein models: y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + C(q)/D(q) e, one output."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.bases.expansions import Linear
+from optid.channels import Transform
+from optid.data import Data
+from optid.errors import StructureError
+from optid.models import noise_filter, simulation
+from optid.models.coefficients import checked_horizon, coefficients, listed
+from optid.models.equations import polynomial, written
+from optid.models.experiments import in_units_of, one_or_all
+from optid.models.hammerstein_arx import HammersteinARX
+from optid.models.nonlinearity import Nonlinearity
+
+TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins"}
+
+
+@dataclass(frozen=True, eq=False)
+class HammersteinTF:
+    """A plant without noise and a noise filter: ``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + offset``.
+
+    Four noise models are one class: output error (C = D = 1), ARX (C = 1, D = A), ARMAX (D = A) and Box-Jenkins. With
+    the basis `Linear` the model is a linear one.
+
+    Attributes:
+        plant: A, B, the nonlinearities, the offset and the names; one output.
+        c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...
+        d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; ``plant.a`` for ARX and ARMAX.
+
+    Raises:
+        StructureError: several outputs, coefficients that are not finite, or a C that is not invertible (a zero on or
+            outside the unit circle): no predictor belongs to it.
+    """
+
+    plant: HammersteinARX
+    c: Array = ()  # type: ignore[assignment]
+    d: Array = ()  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.plant.l != 1:
+            raise StructureError(f"A transfer-function model has one output; this plant has {self.plant.l}.")
+        for name in ("c", "d"):
+            values = coefficients(getattr(self, name), name)
+            if values.ndim != 1:
+                raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
+            object.__setattr__(self, name, values)
+        largest = noise_filter.radius(self.c)
+        if largest >= 1:
+            raise StructureError(
+                f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
+                "(optid.models.noise_filter.reflected): the spectrum of the noise stays what it is."
+            )
+
+    # -- what it is ----------------------------------------------------------------------------------------------
+
+    @property
+    def kind(self) -> str:
+        """The word for this class in model files."""
+        return "HammersteinTF"
+
+    @cached_property
+    def structure(self) -> str:
+        """Which of the four it is: "oe", "arx", "armax" or "bj"."""
+        if self.d.size and np.array_equal(self.d, self.plant.a):
+            return "armax" if self.c.size else "arx"
+        return "bj" if self.c.size or self.d.size else "oe"
+
+    @property
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        linear = all(isinstance(f.basis, Linear) for f in self.nonlinearities)
+        return f"{'Linear' if linear else 'Hammerstein'} {TITLES[self.structure]} model"
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.plant.m
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs, one."""
+        return 1
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.plant.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Name of the output."""
+        return self.plant.outputs
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Units of the inputs, "" where unknown."""
+        return self.plant.input_units
+
+    @property
+    def output_units(self) -> tuple[str, ...]:
+        """Unit of the output, "" where unknown."""
+        return self.plant.output_units
+
+    @property
+    def dt(self) -> float:
+        """Sampling time."""
+        return self.plant.dt
+
+    @property
+    def nonlinearities(self) -> tuple[Nonlinearity, ...]:
+        """One per input; the constants together are ``offset``."""
+        return self.plant.nonlinearities
+
+    @property
+    def f(self) -> Any:
+        """The nonlinearity, see `HammersteinARX.f`."""
+        return self.plant.f
+
+    @property
+    def c0(self) -> float | None:
+        """Offset of f, see `HammersteinARX.c0`."""
+        return self.plant.c0
+
+    @property
+    def offset_note(self) -> str:
+        """Why the offset of f is not identifiable; "" when it is."""
+        return self.plant.offset_note
+
+    @property
+    def a(self) -> Array:
+        """(na,) coefficients of A."""
+        return self.plant.a
+
+    @property
+    def b(self) -> tuple[Array, ...]:
+        """One (nb,) per input."""
+        return self.plant.b
+
+    @property
+    def nk(self) -> tuple[int, ...]:
+        """Delays in samples, one per input."""
+        return self.plant.nk
+
+    @property
+    def offset(self) -> Array:
+        """(1,) constant of the plant's equation."""
+        return self.plant.offset
+
+    @property
+    def gauge(self) -> str:
+        """How the scale between f and B is fixed."""
+        return self.plant.gauge
+
+    @property
+    def orders(self) -> dict[str, Any]:
+        """The orders na, nb, nk and, as far as the noise model has them, nc and nd."""
+        noise = {"armax": {"nc": self.c.size}, "bj": {"nc": self.c.size, "nd": self.d.size}}
+        return self.plant.orders | noise.get(self.structure, {})
+
+    @property
+    def memory(self) -> int:
+        """Samples at the start of a record that cannot be predicted.
+
+        None for output error and Box-Jenkins, whose initial state is estimated; the largest lag for ARX and ARMAX.
+        """
+        return self.plant.memory if self._shares_poles else 0
+
+    @property
+    def poles(self) -> Any:
+        """Poles of the plant, complex, largest first."""
+        return self.plant.poles
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all poles of the plant lie inside the unit circle."""
+        return self.plant.is_stable
+
+    @cached_property
+    def noise_poles(self) -> Any:
+        """Roots of D, complex (nd,), largest first."""
+        return _roots(self.d)
+
+    @cached_property
+    def noise_zeros(self) -> Any:
+        """Roots of C, complex (nc,), largest first; all inside the unit circle."""
+        return _roots(self.c)
+
+    @property
+    def noise(self) -> str:
+        """The noise model in words and numbers."""
+        c, d = polynomial(self.c), polynomial(self.d)
+        return {
+            "oe": "e is added to the output: C = D = 1",
+            "arx": "e is added to the equation: C = 1, D = A",
+            "armax": f"C = {c}, D = A",
+            "bj": f"C = {c}, D = {d}",
+        }[self.structure]
+
+    def theta(self, c: int = 0) -> Array:
+        """Return mu b^T of input c (P, nb), the same in every gauge."""
+        return self.plant.theta(c)
+
+    def coefficients(self) -> list[tuple[str, float]]:
+        """Return (name, value) of every coefficient of A, B, the offset, C and (Box-Jenkins) D, as tables show them."""
+        found = listed(self.plant)
+        for name, values in (("c", self.c), ("d", () if self._shares_poles else self.d)):
+            found += [(f"{name}{i}", float(value)) for i, value in enumerate(values, start=1)]
+        return found
+
+    def static_gain(self, u0: ArrayLike) -> Any:
+        """Return the slope of the steady-state characteristic at u0, see `HammersteinARX.static_gain`."""
+        return self.plant.static_gain(u0)
+
+    def impulse_response(self, n: int = 100) -> Array:
+        """Return the response of the plant's linear part to a unit impulse of f_c, (n, 1, m)."""
+        return self.plant.impulse_response(n)
+
+    def step_response(self, n: int = 100) -> Array:
+        """Return the response of the plant's linear part to a unit step of f_c, (n, 1, m)."""
+        return self.plant.step_response(n)
+
+    def frequency_response(self, w: ArrayLike) -> Array:
+        """Return A^-1 B_c at the frequencies w (radians per unit of time), complex (len(w), 1, m)."""
+        return self.plant.frequency_response(w)
+
+    def noise_impulse_response(self, n: int = 100) -> Array:
+        """Return the response of C/D to a unit impulse of e, (n,)."""
+        return noise_filter.impulse_response(self.c, self.d, n)
+
+    def noise_frequency_response(self, w: ArrayLike) -> Array:
+        """Return C/D at the frequencies w (radians per unit of time), complex (len(w),)."""
+        shift = np.exp(-1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
+        above, below = (np.polyval([*reversed(p), 1.0], shift) for p in (self.c, self.d))
+        return above / below
+
+    def equation(self, digits: int = 4) -> str:
+        """Write the model as difference equations: of the plant and, where it is apart, of the noise."""
+        return _equations(self, digits)
+
+    def __str__(self) -> str:
+        """Return the equations, the poles and the noise model."""
+        text = self.equation()
+        for name, roots in (("poles", self.poles), ("poles of the noise", self.noise_poles), ("zeros", self.noise_zeros)):
+            if roots.size and not (name == "poles of the noise" and self._shares_poles):
+                name = "zeros of the noise" if name == "zeros" else name
+                text += f"\n{name}: " + ", ".join(f"{r.real:.4g}" if abs(r.imag) < 1e-12 else f"{r:.4g}" for r in roots)
+        return text
+
+    @property
+    def _shares_poles(self) -> bool:
+        return self.structure in ("arx", "armax")
+
+    # -- prediction and simulation -------------------------------------------------------------------------------
+
+    def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
+        """Predict one or several steps ahead.
+
+        Args:
+            data: the record; detrended or scaled data are taken back to raw units first.
+            horizon: how many samples ahead: the outputs are known up to so many samples before, the inputs always.
+            x0: initial state of the plant for output-error and Box-Jenkins models: "fit" (least squares of the
+                one-step prediction errors), "zero", or the state, one for each experiment. ARX and ARMAX models
+                need none.
+
+        Returns:
+            (N, 1) in raw units; a tuple of such arrays for several experiments. A missing output counts as an
+            innovation of zero. NaN where a missing input leaves no prediction: in the samples that it reaches (ARX,
+            ARMAX), or in it (the others, whose state is estimated anew after the gap; also in stretches between gaps
+            too short for that). ARX and ARMAX: NaN in the first `memory` + horizon - 1 samples.
+
+        Raises:
+            DataError: other channels or another sampling time than the model's.
+            StructureError: a horizon that is not a whole number from 1, or an x0 that cannot be read.
+        """
+        horizon = checked_horizon(horizon)
+        raw = in_units_of(self, data)
+        states = _states(x0, raw.n_experiments)
+        return one_or_all([
+            self._predicted(e.u, e.y, horizon, state, f"Experiment {i}: " * (raw.n_experiments > 1))
+            for i, (e, state) in enumerate(zip(raw.experiments, states), start=1)
+        ])
+
+    def innovations(self, data: Data, x0: Any = "fit") -> Any:
+        """Return the one-step prediction errors (N, 1), NaN where there is none; a tuple for several experiments.
+
+        Args:
+            data: as `predict`.
+            x0: as `predict`.
+        """
+        raw, predicted = in_units_of(self, data), self.predict(data, 1, x0)
+        several = predicted if raw.n_experiments > 1 else (predicted,)
+        return one_or_all([e.y - p for e, p in zip(raw.experiments, several)])
+
+    def simulate(self, data: Any, x0: Any = "zero") -> Any:
+        """Compute the noise-free outputs from the inputs alone, see `HammersteinARX.simulate`."""
+        return self.plant.simulate(data, x0)
+
+    def initial_state(self, data: Data) -> Any:
+        """Estimate the state of the plant at the first sample from the simulation errors by least squares."""
+        return self.plant.initial_state(data)
+
+    def state(self, u: ArrayLike, y: ArrayLike) -> Array:
+        """Return the state of the plant after samples without noise, see `HammersteinARX.state`."""
+        return self.plant.state(u, y)
+
+    def _predicted(self, u: Array, y: Array, horizon: int, x0: Any, label: str) -> Array:
+        if self._shares_poles:
+            drive = simulation.driven(self.plant, u)[:, 0]
+            found = noise_filter.innovations(y[:, 0], drive, self.c, self.d, start=self.memory)
+            return noise_filter.predict(found, self.c, self.d, horizon)[:, None]
+        gaps = ~np.isfinite(u).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], gaps, [True]]).astype(int)))
+        prediction = np.full((len(y), 1), np.nan)
+        for first, last in zip(edges[::2], edges[1::2]):
+            present = int(np.isfinite(y[first:last]).sum())
+            state = x0 if first == 0 else "fit"
+            if gaps.any() and isinstance(state, str) and state == "fit" and present <= 2 * self.plant.memory:
+                continue  # the estimated state would repeat the outputs
+            prediction[first:last] = self._predicted_apart(u[first:last], y[first:last], horizon, state, label)
+        return prediction
+
+    def _predicted_apart(self, u: Array, y: Array, horizon: int, x0: Any, label: str) -> Array:
+        """Predict a stretch without missing inputs: the plant's output and, apart from it, the noise."""
+        plant = self.plant
+        if isinstance(x0, str):
+            state = np.zeros((plant.memory, 1)) if x0 == "zero" else fitted_state(self, u, y, label)
+        else:
+            state = simulation.state_like(plant, x0)
+        x = simulation.simulate_record(plant, u, state, label)
+        found = noise_filter.innovations((y - x)[:, 0], None, self.c, self.d)
+        return x + noise_filter.predict(found, self.c, self.d, horizon)[:, None]
+
+    # -- changes -------------------------------------------------------------------------------------------------
+
+    def regauge(self, gauge: str) -> "HammersteinTF":
+        """Fix the scale between f and B of every input, see `HammersteinARX.regauge`; predictions do not change."""
+        return replace(self, plant=self.plant.regauge(gauge))
+
+    def with_transform(self, transform: Transform) -> "HammersteinTF":
+        """Return the model in raw units; A, C and D have no units, see `HammersteinARX.with_transform`."""
+        return replace(self, plant=self.plant.with_transform(transform))
+
+    # -- leaving -------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model to a JSON file, from which `optid.load` restores it exactly."""
+        from optid.io import save
+
+        return save(self, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return {"kind": self.kind, "plant": self.plant.to_dict(), "c": self.c.tolist(), "d": self.d.tolist()}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> "HammersteinTF":
+        """Build the model that `to_dict` described; the errors are those of the parts.
+
+        Args:
+            content: what `to_dict` returned.
+            functions: those of a basis of UserFunctions, by name.
+        """
+        plant = HammersteinARX.from_dict(content["plant"], functions)
+        return cls(plant, np.array(content["c"], dtype=float), np.array(content["d"], dtype=float))
+
+
+def fitted_state(model: HammersteinTF, u: Array, y: Array, label: str = "") -> Array:
+    """Estimate the state (n, 1) of the plant at the first sample by least squares of the one-step prediction errors.
+
+    Args:
+        model: a model whose noise has poles of its own.
+        u: (N, m) inputs, none missing.
+        y: (N, 1) outputs, NaN = missing.
+        label: words that name the experiment in a message.
+
+    Raises:
+        DataError: a missing input, or an output that leaves the range of numbers.
+    """
+    plant, n = model.plant, model.plant.memory
+    if n == 0:
+        return np.zeros((0, 1))
+    count = min(len(y), simulation.horizon_of(max(noise_filter.radius(plant.a), noise_filter.radius(model.c)), n))
+    rest = (y - simulation.simulate_record(plant, u, np.zeros((n, 1)), label))[:count, 0]
+    present = np.isfinite(rest)
+    free = simulation.impulse_of_inverse(plant, count)[:, 0, 0]
+    columns = np.zeros((count, n))
+    for i in range(min(n, count)):
+        column = np.concatenate([np.zeros(i), free[: count - i]])
+        columns[:, i] = noise_filter.innovations(np.where(present, column, np.nan), None, model.c, model.d).innovations
+    target = noise_filter.innovations(rest, None, model.c, model.d).innovations
+    sizes = np.linalg.norm(columns[present], axis=0)
+    sizes[sizes == 0] = 1.0
+    return (np.linalg.lstsq(columns[present] / sizes, target[present])[0] / sizes)[:, None]
+
+
+def _states(x0: Any, count: int) -> Sequence[Any]:
+    if isinstance(x0, str):
+        if x0 not in ("fit", "zero"):
+            raise StructureError(f"x0={x0!r}: use 'fit', 'zero' or a state for each experiment.")
+        return [x0] * count
+    states = list(x0) if count > 1 else [x0]
+    if len(states) != count:
+        raise StructureError(f"{len(states)} initial states for {count} experiments: give one each.")
+    return states
+
+
+def _roots(values: Array) -> Any:
+    roots: Any = np.roots(np.concatenate([[1.0], values])).astype(complex)
+    return roots[np.lexsort((roots.imag, -np.abs(roots)))]
+
+
+def _equations(model: HammersteinTF, digits: int) -> str:
+    name = model.outputs[0]
+    noise = "".join(f" {'-' if v < 0 else '+'} {abs(v):.{digits}g} e(k-{i})" for i, v in enumerate(model.c, 1) if v)
+    if model.structure in ("arx", "armax"):
+        return written(model.plant, digits) + " + e(k)" + noise
+    x = next(word for word in ("x", "x0", "x_plant", f"{name}_x") if word not in (*model.inputs, name))
+    plant = written(replace(model.plant, outputs=(x,)), digits)
+    if model.structure == "oe":
+        return f"{plant}\n{name}(k) = {x}(k) + e(k)"
+    past = "".join(f" {'+' if v < 0 else '-'} {abs(v):.{digits}g} v(k-{i})" for i, v in enumerate(model.d, 1) if v)
+    return f"{plant}\nv(k) = e(k){noise}{past}\n{name}(k) = {x}(k) + v(k)"

@@ -1,0 +1,110 @@
+"""Innovations and predictions of s = g + H e with H = C/D, without a Python loop over samples.
+
+``s(k) = g(k) - sum_i d_i s(k-i) + sum_i c_i e(k-i) + e(k)``. An innovation that cannot be computed, because the sample
+or its prediction is missing, counts as zero; a missing sample is then replaced by its prediction. This is the
+stationary predictor: it forgets the larger uncertainty after a gap at the rate of the zeros of C.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optid.bases.basis import Array
+
+
+class Filtered(NamedTuple):
+    """What one pass of the noise filter over a record finds, each (N,).
+
+    Attributes:
+        innovations: zero where they cannot be computed.
+        filled: the samples, the missing ones replaced by their predictions.
+        predicted: one step ahead; NaN where that is impossible.
+    """
+
+    innovations: Array
+    filled: Array
+    predicted: Array
+
+
+def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 0) -> Filtered:
+    """Run the noise filter over one record from rest.
+
+    Args:
+        s: (N,) samples, NaN = missing.
+        drive: (N,) what is known besides, NaN = missing; None for zero.
+        c: (nc,) coefficients of C after the leading one.
+        d: (nd,) coefficients of D after the leading one.
+        start: number of first samples whose innovation counts as zero and that are not predicted.
+    """
+    known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
+    with np.errstate(all="ignore"):
+        found = _kernel()(np.ascontiguousarray(s, dtype=float), known, np.asarray(c), np.asarray(d), start)
+    return Filtered(*found)
+
+
+def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
+    """Predict ``horizon`` samples ahead, (N,): the sample less what the last innovations added to it.
+
+    NaN where one of these innovations cannot be told.
+    """
+    told = np.where(np.isnan(found.predicted), np.nan, found.innovations)
+    weights = impulse_response(c, d, horizon)
+    prediction = found.filled.copy()
+    for i, weight in enumerate(weights):
+        prediction[i:] -= weight * told[: len(told) - i]
+    return prediction
+
+
+def impulse_response(c: Array, d: Array, n: int) -> Array:
+    """Return the first n samples of C/D, which begins with one."""
+    from scipy.signal import lfilter
+
+    impulse = np.zeros(n)
+    impulse[0] = 1.0
+    return np.asarray(lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), impulse))
+
+
+def radius(coefficients: Array) -> float:
+    """Largest modulus of the roots of 1 + c_1 q^-1 + ..; zero without coefficients."""
+    return float(np.max(np.abs(np.roots(np.concatenate([[1.0], coefficients]))), initial=0.0))
+
+
+def reflected(coefficients: Array, limit: float = 1.0) -> Array:
+    """Return the coefficients with every root outside the circle of radius ``limit`` reflected into it.
+
+    For ``limit`` 1 the spectrum of C e keeps its shape (spectral factorisation).
+    """
+    roots = np.roots(np.concatenate([[1.0], coefficients])).astype(complex)
+    outside = np.abs(roots) > limit
+    roots[outside] = limit**2 / np.conj(roots[outside])
+    found = np.zeros(len(coefficients))
+    product = np.real(np.poly(roots))[1:]
+    found[: product.size] = product
+    return found
+
+
+def _march(s: Array, drive: Array, c: Array, d: Array, start: int) -> tuple[Array, Array, Array]:
+    count = s.shape[0]
+    e, filled, predicted = np.zeros(count), np.empty(count), np.empty(count)
+    for k in range(count):
+        value = drive[k]
+        for i in range(min(d.shape[0], k)):
+            value -= d[i] * filled[k - 1 - i]
+        for i in range(min(c.shape[0], k)):
+            value += c[i] * e[k - 1 - i]
+        predicted[k] = value if k >= start else np.nan
+        if np.isnan(s[k]):
+            filled[k] = value
+        else:
+            filled[k] = s[k]
+            if k >= start and not np.isnan(value):
+                e[k] = s[k] - value
+    return e, filled, predicted
+
+
+@cache
+def _kernel() -> Any:
+    from numba import njit
+
+    return njit(cache=True, nogil=True, error_model="numpy")(_march)
