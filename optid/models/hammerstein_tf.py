@@ -249,9 +249,11 @@ class HammersteinTF:
     def __str__(self) -> str:
         """Return the equations, the poles and the noise model."""
         text = self.equation()
-        for name, roots in (("poles", self.poles), ("poles of the noise", self.noise_poles), ("zeros", self.noise_zeros)):
-            if roots.size and not (name == "poles of the noise" and self._shares_poles):
-                name = "zeros of the noise" if name == "zeros" else name
+        parts = {"poles": self.poles, "zeros of the noise": self.noise_zeros}
+        if not self._shares_poles:
+            parts["poles of the noise"] = self.noise_poles
+        for name, roots in parts.items():
+            if roots.size:
                 text += f"\n{name}: " + ", ".join(f"{r.real:.4g}" if abs(r.imag) < 1e-12 else f"{r:.4g}" for r in roots)
         return text
 
