@@ -15,10 +15,12 @@ from matplotlib.figure import Figure
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, DataWarning
+from optid.models.functions import has_feedback, static_functions
 from optid.showing import panels
 from optid.showing.estimates import uncertainty
 from optid.showing.panels import BLUE, INK, MUTED, ORANGE, STYLE, shorten, with_unit
 from optid.validation import validate
+from optid.validation.predictions import one_step, simulated
 
 if TYPE_CHECKING:
     from optid.fitting import Fit
@@ -58,13 +60,14 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     Raises:
         DataError: the fit was made from a stream and no test record is given.
     """
-    record, model = _record(fit, test), fit.model
+    record, model, functions = _record(fit, test), fit.model, static_functions(fit.model)
     long = _needs_closeup(record, 5)
-    heights = [(4.2 if long else 2.9) * record.l, *([2.9 * -(-model.m // 3)] if model.m > 1 else []), 3.0, 2.5]
+    rows_of_f = [2.9 * -(-len(functions) // 3)] if len(functions) > 1 else []
+    heights = [(4.2 if long else 2.9) * record.l, *rows_of_f, 3.0, 2.5]
     figure = Figure(figsize=(10.0, sum(heights)), layout="constrained")
     rows = cast(Any, figure.subfigures(len(heights), 1, height_ratios=heights))
     _time_panels(rows[0], fit, record, "test record" if test is not None else "estimation record", closeup=long)
-    if model.m > 1:
+    if rows_of_f:
         _nonlinearity_panels(rows[1], fit)
         _dynamics_panels(rows[2], fit)
     else:
@@ -95,9 +98,9 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
 
 @_styled
 def nonlinearity(fit: "Fit") -> Figure:
-    """Draw the static nonlinearity of every input with its 95 % band and the density of the samples."""
-    m = fit.model.m
-    figure = Figure(figsize=(9.0 if m > 1 else 6.4, 3.4 * -(-m // 3)), layout="constrained")
+    """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie."""
+    count = len(static_functions(fit.model))
+    figure = Figure(figsize=(9.0 if count > 1 else 6.4, 3.4 * -(-count // 3)), layout="constrained")
     _nonlinearity_panels(figure, fit)
     return figure
 
@@ -171,7 +174,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     Inputs whose Theta is a vector are left out.
     """
     compressed, found = fit.program.compressed, {}
-    if compressed is None or not fit.solution.has_point:
+    if not (hasattr(compressed, "matrices") and hasattr(compressed, "problem") and fit.solution.has_point):
         return found
     if fit.program.view.kind == "exact":
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
@@ -203,16 +206,12 @@ def _needs_closeup(record: Data, factor: int) -> bool:
     return record.n_experiments == 1 and record.n_samples > factor * ZOOM
 
 
-def _listed(arrays: Any) -> list[Array]:
-    return list(arrays) if isinstance(arrays, list | tuple) else [arrays]
-
-
-def _simulated(fit: "Fit", record: Data) -> list[Array] | None:
+def _shown_simulation(fit: "Fit", record: Data) -> list[Array] | None:
     """Simulated outputs, or None where an input is missing or the model runs away."""
-    if not fit.model.is_stable:
+    if not (fit.model.is_stable or has_feedback(fit.model)):
         return None
     try:
-        return _listed(fit.model.simulate(record, x0="fit"))
+        return simulated(fit.model, record)
     except DataError:
         return None
 
@@ -229,15 +228,15 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
         height_ratios=heights,
         width_ratios=[max(e.n_samples, 0.25 * _longest(record)) for e in shown],
     )
-    predicted, simulated = _listed(fit.model.predict(record)), _simulated(fit, record)
+    predicted, free = one_step(fit.model, record), _shown_simulation(fit, record)
     for k, e in enumerate(shown):
         t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
         for o, name in enumerate(record.outputs):
             lines: list[tuple[str, Array, dict[str, Any]]] = [
                 ("measured", e.y[:, o], {"color": INK, "linewidth": 1.0, "alpha": 0.75})
             ]
-            if simulated is not None:
-                lines.append(("simulated", simulated[k][:, o], {"color": BLUE, "linewidth": 1.6}))
+            if free is not None:
+                lines.append(("simulated", free[k][:, o], {"color": BLUE, "linewidth": 1.6}))
             lines.append(
                 ("one step ahead", predicted[k][:, o], {"color": ORANGE, "linewidth": 1.0, "linestyle": (0, (3, 1.2))})
             )
@@ -269,27 +268,28 @@ def _closeup(ax: Any, below: Any, t: Array, y: Array, lines: Sequence[tuple[str,
 
 
 def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
-    model = fit.model
-    columns = min(model.m, 3)
-    axes = figure.subplots(-(-model.m // columns), columns, squeeze=False)
-    functions = model.nonlinearities if model.m > 1 else (model.f,)
+    functions = static_functions(fit.model)
+    columns = min(len(functions), 3)
+    axes = figure.subplots(-(-len(functions) // columns), columns, squeeze=False)
     record = fit.data.raw() if isinstance(fit.data, Data) else None
-    for c, ax in enumerate(axes.flat):
-        if c >= model.m:
-            ax.set_axis_off()
-            continue
-        u = np.zeros(0) if record is None else np.concatenate([e.u[:, c] for e in record.experiments])
-        word = f"f_{model.inputs[c]}" if model.m > 1 else "f"
+    for ax in list(axes.flat)[len(functions) :]:
+        ax.set_axis_off()
+    for ax, function in zip(axes.flat, functions):
+        samples = np.zeros(0)
+        if record is not None:
+            c, fed_back = function.channel, function.fed_back
+            samples = np.concatenate([(e.y if fed_back else e.u)[:, c] for e in record.experiments])
         panels.draw_nonlinearity(
             ax,
-            functions[c],
-            u,
-            _f_band(fit, c),
-            name=with_unit(model.inputs[c], model.input_units[c]),
-            label=word.replace("$", r"\$"),
+            function.nonlinearity,
+            samples,
+            None if function.fed_back else _f_band(fit, function.channel),
+            name=with_unit(function.name, function.unit),
+            label=function.word.replace("$", r"\$"),
         )
-        ax.set_ylabel(f"{word}({model.inputs[c]})".replace("$", r"\$"))
-        ax.set_title("Nonlinearity" if model.m == 1 else with_unit(f"Nonlinearity of {model.inputs[c]}", ""))
+        ax.set_ylabel(f"{function.word}({function.name})".replace("$", r"\$"))
+        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
+        ax.set_title(what if len(functions) == 1 else with_unit(f"{what} of {function.name}", ""))
 
 
 def _residual_panels(figure: Any, fit: "Fit", record: Data, outputs: int, inputs: int) -> None:
@@ -316,7 +316,10 @@ def _dynamics_panels(figure: Any, fit: "Fit") -> None:
     panels.draw_poles(poles, model.poles)
     w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
     curves = model.frequency_response(w).reshape(w.size, -1)
-    names = [f"{u} to {y}".replace("$", r"\$") for y in model.outputs for u in model.inputs]
+    columns = model.frequency_response(w[:1]).shape[-1]
+    # one column per input, or per function where an input has several
+    sources = model.inputs if columns == model.m else tuple(f.word for f in static_functions(model) if not f.fed_back)
+    names = [f"{u} to {y}".replace("$", r"\$") for y in model.outputs for u in sources]
     panels.draw_response(response, w, curves, _response_bands(fit, w), names)
 
 
@@ -331,7 +334,7 @@ def _f_band(fit: "Fit", channel: int) -> tuple[Array, Array, Array] | None:
 def _response_bands(fit: "Fit", w: Array) -> list[tuple[Array, Array] | None]:
     known, _ = uncertainty(fit)
     if known is None:
-        return [None] * (fit.model.l * fit.model.m)
+        return [None] * fit.model.frequency_response(w[:1]).size
     size, _ = known.frequency_response(w)
     lower, upper = (edge.reshape(w.size, -1).T for edge in (size.lower, size.upper))
     return list(zip(lower, upper))

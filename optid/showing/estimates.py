@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.expansions import Linear
 from optid.bases.splines import Triangular
 from optid.errors import OptidError
+from optid.models.functions import static_functions
 from optid.showing.wording import Table, number
 
 if TYPE_CHECKING:
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
+
+MOST_ROWS, ABREAST = 12, 3
+"""More coefficients than the first, without errors to show, stand in so many columns beside each other."""
 
 
 def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
@@ -29,51 +32,54 @@ def parameter_table(fit: "Fit") -> Table:
     """Coefficients of A, B and the offset with standard errors and 95 % intervals where there are some."""
     known, reason = uncertainty(fit)
     if known is None:
-        rows = [(name, number(value)) for name, value in _coefficients(fit.model)]
-        return Table("Parameters", ("parameter", "estimate"), rows, f"No standard errors: {reason.rstrip('.')}.")
+        rows = [(name, number(value)) for name, value in fit.model.coefficients()]
+        note = f"No standard errors: {reason.rstrip('.')}."
+        if len(rows) <= MOST_ROWS:
+            return Table("Parameters", ("parameter", "estimate"), rows, note)
+        return Table("Parameters", ("parameter", "estimate") * ABREAST, _abreast(rows), note)
     rows = [_interval_row(name, *row) for name, *row in known.table()]
     return Table("Parameters", ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows)
 
 
 def nonlinearity_tables(fit: "Fit") -> list[Table]:
     """Values of every nonlinearity at a few points, with their pointwise bands where there are some."""
-    model, found = fit.model, []
+    found = []
     known, _ = uncertainty(fit)
-    functions = (model.f,) if model.m == 1 else model.nonlinearities
-    for c, (name, unit, f) in enumerate(zip(model.inputs, model.input_units, functions)):
-        if isinstance(f.basis, Linear):
+    for function in static_functions(fit.model):
+        if function.is_linear:
             continue
+        f = function.nonlinearity
         points = _points(f.basis)
-        label = f"{name} ({unit})" if unit else name
-        word = "f" if model.m == 1 else f"f_{name}"
-        if known is None:
+        label = f"{function.name} ({function.unit})" if function.unit else function.name
+        if known is None or function.fed_back:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
         else:
-            band = known.band(c, points)
+            band = known.band(function.channel, points)
             numeric = zip(points, band.value, band.error, band.lower, band.upper)
             size = float(np.max(np.abs(band.value)))
             rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
-        found.append(Table(f"Nonlinearity {word}, basis {_basis(f.basis)}", (label, word, *head), rows))
+        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
+        found.append(Table(f"{what} {function.word}, basis {_basis(f.basis)}", (label, function.word, *head), rows))
     return found
 
 
 def coefficient_table(fit: "Fit") -> Table | None:
     """Coefficients mu of the bases; None where every channel is linear."""
     known, _ = uncertainty(fit)
-    rows = []
-    for c, (name, f) in enumerate(zip(fit.model.inputs, fit.model.nonlinearities)):
-        if isinstance(f.basis, Linear):
+    functions, rows = static_functions(fit.model), []
+    for function in functions:
+        if function.is_linear:
             continue
-        for j, value in enumerate(f.mu):
-            label = f"mu{j + 1}" + (f"[{name}]" if fit.model.m > 1 else "")
-            rows.append(
-                (label, number(value))
-                if known is None
-                else _interval_row(
-                    label, value, *(getattr(known.mu[c], part)[j] for part in ("error", "lower", "upper"))
-                )
-            )
+        letter = "nu" if function.fed_back else "mu"
+        where = function.word.partition("_")[2] or (function.word[1:] if len(functions) > 1 else "")
+        for j, value in enumerate(function.nonlinearity.mu):
+            label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
+            if known is None or function.fed_back:
+                rows.append((label, number(value)))
+            else:
+                interval = known.mu[function.channel]
+                rows.append(_interval_row(label, value, interval.error[j], interval.lower[j], interval.upper[j]))
     head = () if known is None else ("std. error", "95 % low", "95 % high")
     return Table("Coefficients of the basis", ("coefficient", "estimate", *head), rows) if rows else None
 
@@ -105,15 +111,9 @@ def _basis(basis: Any) -> str:
     return f"{type(basis).__name__.lower()} with {basis.size} functions on [{low:.4g}, {high:.4g}]"
 
 
-def _coefficients(model: Any) -> list[tuple[str, float]]:
-    """Names and values of A, B and the offset, where no uncertainty names them."""
-    several, found = model.l > 1, []
-    for (i, *pair), value in np.ndenumerate(model.a):
-        found.append((f"a{i + 1}" + (f"[{','.join(model.outputs[o] for o in pair)}]" if several else ""), float(value)))
-    for channel, b in zip(model.inputs, model.b):
-        for (j, *output), value in np.ndenumerate(b):
-            words = ([channel] if model.m > 1 else []) + [model.outputs[o] for o in output]
-            found.append((f"b{j}" + (f"[{','.join(words)}]" if words else ""), float(value)))
-    return found + [
-        ("offset" + (f"[{name}]" if several else ""), float(value)) for name, value in zip(model.outputs, model.offset)
-    ]
+def _abreast(rows: list[tuple[str, str]]) -> list[tuple[str, ...]]:
+    """Set many short rows in `ABREAST` columns, read downwards."""
+    height = -(-len(rows) // ABREAST)
+    blank = [("", "")] * (height * ABREAST - len(rows))
+    columns = [(rows + blank)[c * height : (c + 1) * height] for c in range(ABREAST)]
+    return [tuple(cell for pair in line for cell in pair) for line in zip(*columns)]

@@ -2,7 +2,7 @@
 
 from itertools import zip_longest
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from optid.showing import estimates, summary
 from optid.showing.summary import Facts
@@ -11,7 +11,6 @@ from optid.showing.wording import Table
 if TYPE_CHECKING:
     from optid.data import Data
     from optid.fitting import Fit
-    from optid.models import HammersteinARX
 
 WIDTH, LEFT = 80, 36
 
@@ -51,6 +50,8 @@ def describe(fit: "Fit") -> str:
         *_equation(fit.model.equation()),
         *_facts(summary.model_facts(fit)),
     ]
+    if evidence := summary.evidence_facts(fit):
+        lines += [_rule("-"), *_facts(evidence)]
     for table in (estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)):
         lines += [_rule("-"), *_table(table)]
     if fit.prices:
@@ -63,7 +64,7 @@ def describe(fit: "Fit") -> str:
     return "\n".join([*lines, _rule("=")])
 
 
-def describe_validation(model: "HammersteinARX", data: "Data") -> str:
+def describe_validation(model: Any, data: "Data") -> str:
     """Return the validation of a model on a record as text."""
     from optid.validation import validate
 

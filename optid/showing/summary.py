@@ -1,14 +1,15 @@
 """What there is to say about a fit, in words and rows; the printed result and the HTML page both read it here."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.expansions import Linear
 from optid.data import Data
+from optid.models.functions import has_feedback, static_functions
 from optid.showing.wording import Table, gap_text, number, percent, seconds
 from optid.solution import Status
+from optid.validation.predictions import predictors
 
 if TYPE_CHECKING:
     from optid.fitting import Fit
@@ -16,14 +17,16 @@ if TYPE_CHECKING:
 
 Facts = list[tuple[str, str]]
 
+MOST = 12
+"""Entries of an array among the figures that are printed."""
+
 PRICE_NOTE = "Price: points of one-step fit (%) gained per unit by which the dearest row of the constraint is relaxed."
 
 
 def title(fit: "Fit") -> str:
     """Say what was identified from what."""
     model = fit.model
-    linear = all(isinstance(f.basis, Linear) for f in model.nonlinearities)
-    return f"{'Linear' if linear else 'Hammerstein'} ARX model of {_and(model.outputs)} from {_and(model.inputs)}"
+    return f"{model.title} of {_and(model.outputs)} from {_and(model.inputs)}"
 
 
 def verdict(fit: "Fit") -> tuple[str, str, str]:
@@ -47,18 +50,21 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
 
 
 def fit_table(fit: "Fit") -> Table:
-    """One-step and simulation fit of every output on the estimation record."""
-    rows = [
-        (name, percent(one), percent(free))
-        for name, one, free in zip(fit.model.outputs, np.atleast_1d(fit.one_step_fit), simulation_fit(fit))
-    ]
-    return Table("Fit on the estimation record", ("output", "one step", "simulation"), rows)
+    """Fit of every output on the estimation record, by every predictor that the model has."""
+    columns = [np.atleast_1d(fit.one_step_fit)]
+    if has_feedback(fit.model):
+        columns.append(np.atleast_1d(fit.measured_feedback_fit))
+    columns.append(simulation_fit(fit))
+    rows = [(name, *map(percent, values)) for name, *values in zip(fit.model.outputs, *columns)]
+    return Table("Fit on the estimation record", ("output", *predictors(fit.model)), rows)
 
 
 def simulation_fit(fit: "Fit") -> np.ndarray:
-    """Simulation fit of every output in %; NaN where the model is unstable or an input is missing."""
-    whole = isinstance(fit.data, Data) and not any(np.isnan(e.u).any() for e in fit.data.experiments)
-    if not (whole and fit.model.is_stable):
+    """Simulation fit of every output in %; NaN where there is none: see `Fit.simulation_fit`, or an unstable model.
+
+    With nonlinear feedback the poles of the linear part do not decide about stability; the simulation does.
+    """
+    if not (fit.model.is_stable or has_feedback(fit.model)):
         return np.full(fit.model.l, np.nan)
     return np.atleast_1d(fit.simulation_fit)
 
@@ -116,7 +122,7 @@ def record_facts(fit: "Fit") -> Facts:
         facts.append(("Missing", ", ".join(missing) or "none"))
         if not data.transform.is_identity:
             facts.append(("Units", "detrended or scaled for the fit; everything here is in raw units"))
-    if figures:
+    if "rows" in figures:
         facts.append(("Rows used", f"{figures['rows']} of {figures['candidates']}"))
         facts.append(
             (
@@ -125,6 +131,19 @@ def record_facts(fit: "Fit") -> Facts:
             )
         )
     return facts
+
+
+def evidence_facts(fit: "Fit") -> Facts:
+    """What a procedure measured on its way, in its own words and order."""
+    return [(name[:1].upper() + name[1:], _measured(value)) for name, value in fit.figures.items() if name not in _ROWS]
+
+
+def spectra(fit: "Fit") -> dict[str, np.ndarray]:
+    """Return the singular values and other falling sequences among the figures of a procedure, by their names."""
+    named = {name: value for name, value in fit.figures.items() if "singular" in name.lower()}
+    lists = {name: value for name, value in named.items() if isinstance(value, np.ndarray | list | tuple)}
+    found = {name: np.asarray(value, dtype=float) for name, value in lists.items()}
+    return {name: values for name, values in found.items() if values.ndim == 1 and values.size > 1}
 
 
 def channel_table(fit: "Fit") -> Table | None:
@@ -181,24 +200,35 @@ def call(fit: "Fit") -> str:
 
 
 def model_facts(fit: "Fit") -> Facts:
-    """Poles, gauge, what f does outside the range of the record, and why its offset is not identifiable."""
+    """Orders, poles, noise, gauge, what f does outside the range, and why its offset is not identifiable."""
     model = fit.model
-    facts = [("Poles", ", ".join(_complex(p) for p in model.poles) or "none")]
-    positive = all(b.flat[0] >= 0 for b in model.b)
-    gauge = {
+    facts = [
+        ("Orders", ", ".join(f"{name} {_order(value)}" for name, value in model.orders.items())),
+        ("Poles", ", ".join(_complex(p) for p in model.poles) or "none"),
+    ]
+    if isinstance(getattr(model, "noise", None), str):
+        facts.append(("Noise", model.noise))
+    if gauge := _gauge(model):
+        facts.append(("Gauge", gauge))
+    functions = [function for function in static_functions(model) if not function.is_linear]
+    outside = sorted({f"{function.nonlinearity.basis.outside}" for function in functions})
+    if outside:
+        facts.append(("Outside the range", ", ".join(outside)))
+    if model.offset_note and functions:
+        facts.append(("Offset", model.offset_note))
+    return facts
+
+
+def _gauge(model: Any) -> str:
+    """Say how the scale between f and the linear part is fixed; "" where the word says nothing."""
+    positive = all(b.flat[0] >= 0 for b in getattr(model, "b", ()))
+    return {
         "norm": "norm of b is one, "
         + ("its first coefficient positive" if positive else "its sign follows from the constraints"),
         "gain": "static gain of the linear part is one",
         "b0": "first coefficient of b is one",
-    }.get(model.gauge)
-    if gauge:
-        facts.append(("Gauge", gauge))
-    outside = sorted({f"{f.basis.outside}" for f in model.nonlinearities if not isinstance(f.basis, Linear)})
-    if outside:
-        facts.append(("Outside the range", ", ".join(outside)))
-    if model.offset_note and not all(isinstance(f.basis, Linear) for f in model.nonlinearities):
-        facts.append(("Offset", model.offset_note))
-    return facts
+        "none": "",
+    }.get(model.gauge, model.gauge)
 
 
 def validation_tables(checked: "Validation") -> list[Table]:
@@ -244,6 +274,30 @@ def validation_tables(checked: "Validation") -> list[Table]:
         ),
         Table("Tests", ("hypothesis", "verdict", "p value", "lags outside the 99 % band"), tests),
     ]
+
+
+_ROWS = ("rows", "candidates", "condition", "method")
+"""Figures of the compressed statistics, which `record_facts` tells."""
+
+
+def _measured(value: Any) -> str:
+    """Write a figure of a procedure: a number, a text, or the first entries of an array."""
+    if isinstance(value, bool | str) or value is None:
+        return {True: "yes", False: "no", None: "-"}.get(value, str(value))
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_measured(entry)}" for key, entry in value.items())
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        return str(value)
+    if array.ndim == 0:
+        return number(float(array), 5)
+    shown = " ".join(number(float(entry), 4) for entry in array.ravel()[:MOST])
+    return shown + (f" ... ({array.size} in all)" if array.size > MOST else "")
+
+
+def _order(value: Any) -> str:
+    """Write an order, or those of the inputs."""
+    return str(value) if np.ndim(value) == 0 else " ".join(map(str, value))
 
 
 def _complex(value: complex) -> str:
