@@ -16,7 +16,8 @@ from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, DataWarning
 from optid.models.functions import has_feedback, static_functions
-from optid.showing import panels
+from optid.models.responses import response_pairs, step_length
+from optid.showing import panels, summary
 from optid.showing.estimates import uncertainty
 from optid.showing.panels import BLUE, INK, MUTED, ORANGE, STYLE, shorten, with_unit
 from optid.validation import validate
@@ -124,9 +125,9 @@ def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
 
 @_styled
 def poles_and_response(fit: "Fit") -> Figure:
-    """Draw the poles and the frequency response of the linear part, with 95 % bands."""
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    _dynamics_panels(figure, fit)
+    """Draw poles, frequency response (with 95 % bands) and step response of the linear part."""
+    figure = Figure(figsize=(10.0, 3.3), layout="constrained")
+    _dynamics_panels(figure, fit, step=True)
     return figure
 
 
@@ -165,6 +166,23 @@ def singular_values(fit: "Fit") -> Figure:
     figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
     for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
         panels.draw_singular_values(ax, values, f"Singular values of Theta, {name}".replace("$", r"\$"))
+    return figure
+
+
+@_styled
+def spectra(fit: "Fit") -> Figure:
+    """Draw the singular values that a procedure of several steps measured, from which it read the order.
+
+    Raises:
+        DataError: the formulation has none.
+    """
+    found = summary.spectra(fit)
+    if not found:
+        raise DataError(f"formulation {fit.formulation!r} reports no singular values")
+    figure = Figure(figsize=(min(9.0, 4.4 * len(found) + 1.0), 2.9), layout="constrained")
+    order = fit.model.orders.get("nx", 0)
+    for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
+        panels.draw_singular_values(ax, values, (name[:1].upper() + name[1:]).replace("$", r"\$"), order or 1)
     return figure
 
 
@@ -309,17 +327,18 @@ def _residual_panels(figure: Any, fit: "Fit", record: Data, outputs: int, inputs
                 ax.set_ylabel(f"residual of {shorten(name)}".replace("$", r"\$"))
 
 
-def _dynamics_panels(figure: Any, fit: "Fit") -> None:
-    """Poles, and the magnitude of every input-output pair."""
+def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
+    """Poles, the magnitude of every input-output pair and, where it is asked for, the step responses."""
     model = fit.model
-    poles, response = figure.subplots(1, 2, width_ratios=[1, 1.7])
+    widths = [1.0, 1.45, 1.25] if step else [1.0, 1.7]
+    poles, response, *last = figure.subplots(1, len(widths), width_ratios=widths)
     panels.draw_poles(poles, model.poles)
+    names = [f"{u} to {y}".replace("$", r"\$") for u, y in response_pairs(model)]
+    for ax in last:
+        steps = model.step_response(step_length(model))
+        panels.draw_steps(ax, model.dt, steps.reshape(len(steps), -1), names)
     w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
     curves = model.frequency_response(w).reshape(w.size, -1)
-    columns = model.frequency_response(w[:1]).shape[-1]
-    # one column per input, or per function where an input has several
-    sources = model.inputs if columns == model.m else tuple(f.word for f in static_functions(model) if not f.fed_back)
-    names = [f"{u} to {y}".replace("$", r"\$") for y in model.outputs for u in sources]
     panels.draw_response(response, w, curves, _response_bands(fit, w), names)
 
 
@@ -334,7 +353,7 @@ def _f_band(fit: "Fit", channel: int) -> tuple[Array, Array, Array] | None:
 def _response_bands(fit: "Fit", w: Array) -> list[tuple[Array, Array] | None]:
     known, _ = uncertainty(fit)
     if known is None:
-        return [None] * fit.model.frequency_response(w[:1]).size
+        return [None] * len(response_pairs(fit.model))
     size, _ = known.frequency_response(w)
     lower, upper = (edge.reshape(w.size, -1).T for edge in (size.lower, size.upper))
     return list(zip(lower, upper))

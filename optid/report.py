@@ -77,6 +77,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "equation": [_breakable(line) for line in fit.model.equation().splitlines()],
         "model_notes": [f"{name}: {value}" for name, value in summary.model_facts(fit)],
         "model_tables": tables,
+        "evidence": summary.evidence_facts(fit),
         "coefficients": estimates.coefficient_table(fit),
         "figures": _figures(fit),
         "constraints": summary.constraint_table(fit) if fit.prices else None,
@@ -161,7 +162,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
         _figure(
             "nonlinearity",
             lambda: plots.nonlinearity(fit),
-            "Static nonlinearity with its 95 % band. The bars show where the samples of the input lie.",
+            "Static nonlinearity, with its 95 % band where there is one. The bars show where the samples lie.",
         )
     )
     if plots.theta_singular_values(fit):
@@ -173,11 +174,20 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
                 "its rank is forced to one. A single one that stands out speaks for the Hammerstein structure.",
             )
         )
+    if summary.spectra(fit):
+        found.append(
+            _figure(
+                "spectra",
+                lambda: plots.spectra(fit),
+                "Singular values from which the order is read, relative to the first; those kept in colour.",
+            )
+        )
     found.append(
         _figure(
             "dynamics",
             lambda: plots.poles_and_response(fit),
-            "Poles and frequency response of the linear part, with 95 % bands, up to the Nyquist frequency.",
+            "Poles, frequency response (with 95 % bands where there are standard errors, up to the Nyquist frequency) "
+            "and step response of the linear part.",
         )
     )
     return found

@@ -120,6 +120,16 @@ def test_poles_are_the_roots_of_the_denominator():
     assert np.allclose(np.sort_complex(drawn), np.sort_complex(np.roots([1, -0.5, 0.2])), atol=1e-6)
 
 
+def test_the_step_response_is_that_of_the_difference_equation():
+    ax = plots.poles_and_response(linear_fit()).axes[2]
+    t, drawn = ax.get_lines()[0].get_data()
+    y = np.zeros(len(t) + 2)
+    for k in range(1, len(t)):
+        y[k] = 0.5 * y[k - 1] - 0.2 * y[k - 2] + 2
+    assert np.allclose(drawn, y[: len(t)], atol=1e-9) and np.allclose(np.diff(t), 0.1)
+    assert drawn[-1] == pytest.approx(2 / 0.7, rel=0.03)
+
+
 def test_the_magnitude_is_that_of_the_transfer_function():
     from scipy.signal import freqz
 

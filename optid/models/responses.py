@@ -51,3 +51,31 @@ def frequency_response(model: "HammersteinARX", w: ArrayLike) -> Array:
         for lag, row in simulation.lagged(model, c):
             numerator[:, :, c] += (shift**lag)[:, None] * row
     return np.asarray(np.linalg.solve(denominator, numerator))
+
+
+LONGEST_STEP, SETTLED = 400, 0.02
+
+
+def step_length(model: Any) -> int:
+    """Return the number of samples after which the step response of the linear part has settled within 2 %.
+
+    At least 20 and at most 400, and 50 for an unstable model, whose response does not settle.
+    """
+    radius = float(np.max(np.abs(model.poles), initial=0.0))
+    if radius >= 1:
+        return 50
+    decay = 0 if radius == 0 else int(np.ceil(np.log(SETTLED) / np.log(radius)))
+    return int(np.clip(1.5 * decay, 20, LONGEST_STEP))
+
+
+def response_pairs(model: Any) -> list[tuple[str, str]]:
+    """Return (input, output) of every column of a response of the linear part, in the order of its last two axes.
+
+    Where an input has several static functions there is one column for each of them, by its word.
+    """
+    from optid.models.functions import static_functions
+
+    columns = model.frequency_response(np.array([0.1 / model.dt])).shape[-1]
+    words = [function.word for function in static_functions(model) if not function.fed_back]
+    sources = model.inputs if columns == model.m else words
+    return [(source, output) for output in model.outputs for source in sources]

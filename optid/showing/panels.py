@@ -52,6 +52,9 @@ STYLE: dict[str, Any] = {
     "axes.prop_cycle": f"cycler('color', ['{BLUE}', '{ORANGE}', '{GREEN}'])",
 }
 
+LINES = [(colour, dash) for dash in ("-", "--", ":") for colour in (BLUE, ORANGE, GREEN)]
+"""Colour and dash of the first, second, ... of several curves."""
+
 POINTS = 2000
 """A line with more samples than this is drawn as the smallest and largest sample of each of half as many bins."""
 
@@ -164,6 +167,17 @@ def draw_poles(ax: Axes, poles: Array) -> None:
     ax.set_title("Poles")
 
 
+def draw_steps(ax: Axes, dt: float, responses: Array, labels: Sequence[str]) -> None:
+    """Draw step responses (n, K) over the time; K names, one alone is not shown."""
+    t = dt * np.arange(len(responses))
+    for k, (label, (colour, dash)) in enumerate(zip(labels, LINES * len(labels))):
+        ax.step(t, responses[:, k], linestyle=dash, color=colour, label=label, where="post")
+    ax.axhline(0, color=MUTED, linewidth=0.8)
+    ax.margins(x=0.01)
+    ax.set(xlabel="time")
+    ax.set_title("Step response")
+
+
 def draw_response(
     ax: Axes, w: Array, response: Array, bands: Sequence[tuple[Array, Array] | None], labels: Sequence[str]
 ) -> None:
@@ -176,9 +190,8 @@ def draw_response(
         bands: K pairs of lower and upper magnitude (F,), or None.
         labels: K names; one alone is not shown.
     """
-    styles = [(c, s) for s in ("-", "--", ":") for c in (BLUE, ORANGE, GREEN)]
     for k, (label, band) in enumerate(zip(labels, bands)):
-        colour, dash = styles[k % len(styles)]
+        colour, dash = LINES[k % len(LINES)]
         if band is not None:
             ax.fill_between(w, _decibels(band[0]), _decibels(band[1]), color=colour, alpha=0.2, linewidth=0)
         ax.plot(w, _decibels(np.abs(response[:, k])), dash, color=colour, label=label)
@@ -282,14 +295,14 @@ def draw_ladder(ax: Axes, rungs: Sequence[str], reached: int, closed: bool) -> N
             )
 
 
-def draw_singular_values(ax: Axes, values: Array, name: str) -> None:
-    """Draw the singular values of Theta relative to the first; one stands out where the structure is Hammerstein."""
+def draw_singular_values(ax: Axes, values: Array, name: str, rank: int = 1) -> None:
+    """Draw singular values relative to the first; those up to `rank` in colour: they should stand out."""
     relative = values / max(float(values[0]), 1e-300)
     order = np.arange(1, values.size + 1)
     floor = max(1e-16, 0.3 * float(np.min(relative[relative > 0], initial=1.0)))
     ax.vlines(order, floor, np.maximum(relative, floor), color=GRID, linewidth=3)
-    ax.plot(order[:1], relative[:1], "o", color=BLUE, markersize=7)
-    ax.plot(order[1:], np.maximum(relative[1:], floor), "o", color=MUTED, markersize=6)
+    ax.plot(order[:rank], np.maximum(relative[:rank], floor), "o", color=BLUE, markersize=7)
+    ax.plot(order[rank:], np.maximum(relative[rank:], floor), "o", color=MUTED, markersize=6)
     ax.set_yscale("log")
     ax.set(ylim=(floor, 2.0), xlabel="index", ylabel="relative to the first", xlim=(0.5, values.size + 0.5))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
