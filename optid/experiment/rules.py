@@ -1,0 +1,190 @@
+"""The rules of experiment design as checks of a record: each has the number, the limit and the remedy.
+
+They hold for the record to be fitted and for the excitation to be applied alike. What makes the answer meaningless is
+an error, what weakens it a warning.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from optid.bases.basis import Array, Basis
+from optid.channels import count_levels
+from optid.experiment.expansion import LINEAR, Expansion
+from optid.experiment.lines import longest_run, many_lines, remaining_shares
+
+Severity = Literal["fine", "warning", "error"]
+
+FEW_LEVELS = 20
+"""Below this many distinct values a curve between them is interpolation, not identification."""
+HIDDEN, DOMINANT = 1e-3, 1e-2
+"""Share of the variance beside a few sinusoids that is noise on a singular record, or a weak excitation."""
+WORST_CONDITION = 1e7
+"""Condition number beyond which the estimates keep less than half of their digits."""
+NEARLY_LINEAR = 0.05
+"""Nonlinear share of the feedback functions below which noise decides them."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What one rule says of one channel or record.
+
+    Attributes:
+        rule: "levels", "lines", "feedback", "excitation" or "instruments".
+        subject: the channel, or "" for the record.
+        number: what was measured.
+        limit: what it is held against.
+        severity: "fine", "warning" or "error".
+        sentence: the finding with its remedy.
+    """
+
+    rule: str
+    subject: str
+    number: float
+    limit: float
+    severity: Severity
+    sentence: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.sentence}"
+
+
+def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Check:
+    """Hold the number of distinct values of an input against the functions of its basis.
+
+    n levels determine n - 1 functions besides the constant; a binary signal shows a straight line whatever f is.
+
+    Args:
+        name: of the input.
+        u: (N,) samples without missing ones.
+        basis: the fitted basis.
+        few: number of values below which the curve between them counts as interpolation.
+    """
+    needed = basis.size + 1
+    if basis.size == 1 or count_levels(u[:4096]) > 4 * FEW_LEVELS:
+        return Check("levels", name, float(count_levels(u[:4096])), needed, "fine", f"input {name!r} takes many levels")
+    levels = count_levels(u)
+    if levels == 2:
+        sentence = (f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
+                    "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
+        return Check("levels", name, levels, needed, "error", sentence)
+    if levels < needed:
+        sentence = (f"input {name!r} takes {levels} levels, which determine at most {levels - 1} functions besides "
+                    f"the constant; the basis has {basis.size}. Use a smaller basis or excite more levels")
+        return Check("levels", name, levels, needed, "error", sentence)
+    if levels < few:
+        sentence = (f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis functions; "
+                    "the nonlinearity between them is interpolation")
+        return Check("levels", name, levels, few, "warning", sentence)
+    return Check("levels", name, levels, needed, "fine", f"input {name!r} takes {levels} levels")
+
+
+def check_lines(name: str, u: Array, basis: Basis, lags: int) -> Check:
+    """Hold the sinusoids that the functions of an input consist of against the regressors they are to excite.
+
+    A sinusoid through a polynomial of degree p has p harmonics, and L sinusoids excite 2 L + 1 regressors, however
+    many lags there are. Noise and quantisation of the record hide that singularity, they do not cure it.
+
+    Args:
+        name: of the input.
+        u: (N,) samples; NaN = missing. The longest stretch without one is looked at.
+        basis: the fitted basis.
+        lags: regressors per function: block rows of a subspace method, coefficients of B of an equation-error one.
+
+    Returns:
+        The check; its number is the regressors excited.
+    """
+    needed = lags * basis.size
+    most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
+    fine = Check("lines", name, float("inf"), needed, "fine",
+                 f"the functions of input {name!r} have more than {most} spectral lines")
+    run = longest_run(np.asarray(u, dtype=float)[:, None])[:, 0]
+    if needed <= 3 or run.size < 4 * needed or many_lines(run, most, DOMINANT):
+        return fine
+    shares = remaining_shares(basis.values(run), most, HIDDEN)
+    if shares[-1] > DOMINANT:
+        return fine
+    lines = shares.size - 1
+    excited = 2 * lines + 1
+    if excited >= needed:
+        return fine
+    kind = "consists of a few sinusoids" if _several(run) else "is a single sinusoid"
+    share = f"{100 * (1 - shares[-1]):.2f} %"
+    sentence = (
+        f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
+        f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
+        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions"
+    )
+    return Check("lines", name, excited, needed, "error" if shares[-1] <= HIDDEN else "warning", sentence)
+
+
+def _several(u: Array) -> bool:
+    """Whether u needs more than one sinusoid."""
+    return bool(remaining_shares(u[:, None], 1, DOMINANT)[-1] > DOMINANT)
+
+
+def check_feedback(outputs: Sequence[str], expansion: Expansion) -> list[Check]:
+    """Hold the part of the feedback functions that is not linear in y against the functions themselves, per output."""
+    checks = []
+    for name, ratio in zip(outputs, expansion.nonlinear):
+        measured = f"the functions of output {name!r} differ from a straight line by {100 * ratio:.2g} % of their size"
+        if ratio <= LINEAR:
+            severity, more = "error", (" on this record. A linear feedback cannot be told from the dynamics (A - L C "
+                                       "with any L behaves alike): leave the feedback basis out, use a nonlinear one, "
+                                       "or excite larger amplitudes")
+        elif ratio < NEARLY_LINEAR:
+            severity, more = "warning", (" on this record: what is left of them is small beside the noise. Excite "
+                                         "larger amplitudes, or leave the feedback basis out")
+        else:
+            severity, more = "fine", ""
+        checks.append(Check("feedback", name, ratio, NEARLY_LINEAR, severity, measured + more))
+    return checks
+
+
+def check_condition(number: float, what: str = "the expanded regressor") -> Check:
+    """Hold a condition number (columns scaled) against what leaves half of the digits.
+
+    Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input.
+
+    Args:
+        number: condition number; inf when singular.
+        what: of what.
+    """
+    if number > WORST_CONDITION:
+        sentence = (f"{what} is poorly excited: condition number {number:.1e}; "
+                    "use fewer functions or lags, or a richer input")
+        return Check("excitation", "", number, WORST_CONDITION, "warning", sentence)
+    return Check("excitation", "", number, WORST_CONDITION, "fine", f"condition number of {what}: {number:.2g}")
+
+
+def check_instruments(number: float) -> Check:
+    """Hold the condition number of R11, the regressors projected on the instruments, against the same limit.
+
+    With instruments that do not reach the regressors it grows with the root of the number of samples.
+    """
+    if number > WORST_CONDITION:
+        sentence = (f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented instruments "
+                    "(hammerstein_ss.asivid), fewer block rows or functions, or an input with more lines and levels")
+        return Check("instruments", "", number, WORST_CONDITION, "warning", sentence)
+    return Check("instruments", "", number, WORST_CONDITION, "fine", f"cond(R11) = {number:.2g}")
+
+
+def expanded_condition(records: Sequence[Array], expand: Expansion, rows: int) -> float:
+    """Return the condition number of all windows of the expanded signals about their means, columns scaled.
+
+    Args:
+        records: raw channels (N, m + l) per experiment, inputs first; the outputs may be left out without feedback.
+        expand: the expansion.
+        rows: block rows, the samples of a window.
+
+    Returns:
+        inf when the windows are singular.
+
+    Raises:
+        RankError: no complete window.
+    """
+    from optid.subspace.hankel import hankel_statistics
+
+    return hankel_statistics(records, rows, expand, names=expand.names, centre="mean").condition
