@@ -1,0 +1,176 @@
+"""The constrained shift step: poles where they were wanted, bounds that hold, and the true optimum by brute force."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from formulations.pole_regions import damped, disc, sector, strip
+from formulations.shift import constrained_shift
+from formulations.stability import stable
+from optid.backends import Answer, find
+from optid.errors import StructureError
+from optid.infeasibility import explain
+from optid.solution import Status
+from optid.solving import Evidence, run
+
+
+def observability(matrix, outputs, rows, rng, noise=0.0):
+    """(up, down) of a noisy observability matrix with orthonormal columns."""
+    blocks = [rng.normal(size=(outputs, len(matrix)))]
+    for _ in range(rows - 1):
+        blocks.append(blocks[-1] @ matrix)
+    gamma = np.vstack(blocks)
+    gamma = np.linalg.svd(gamma + noise * rng.normal(size=gamma.shape), full_matrices=False)[0]
+    return gamma[:-outputs], gamma[outputs:]
+
+
+def unstable(n, rng, size=1.02):
+    matrix = rng.normal(size=(n, n))
+    return matrix * size / np.max(np.abs(np.linalg.eigvals(matrix)))
+
+
+def solved(up, down, rules, solver="auto"):
+    """Run the step inside a procedure that also works where it poses nothing."""
+    step = constrained_shift(up, down, rules)
+    try:
+        first = next(step)
+    except StopIteration as stop:
+        return stop.value, None
+
+    def procedure():
+        solution = yield first
+        while True:
+            try:
+                program = step.send(solution)
+            except StopIteration as stop:
+                return stop.value
+            solution = yield program
+
+    outcome = run(procedure(), solver)
+    return outcome.model, outcome
+
+
+REGIONS = [stable(1.0), stable(0.8), damped(0.3), strip(-0.2, 0.8), sector(1.2), disc(0.3, 0.6)]
+
+
+@pytest.mark.parametrize("rule", REGIONS, ids=lambda rule: rule.name)
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_the_poles_lie_where_they_were_wanted(rule, n):
+    rng = np.random.default_rng(n)
+    applied = 0
+    for _ in range(4):
+        shift, _ = solved(*observability(unstable(n, rng), 2, 10, rng, 0.02), [rule])
+        assert shift.status in (Status.OPTIMAL, Status.LOCAL) or "not stationary" in shift.reason, shift.reason
+        assert rule.verify(type("Model", (), {"poles": np.linalg.eigvals(shift.a)})) == ""
+        assert shift.suboptimality >= -1e-12
+        applied += shift.applied
+    assert applied or n == 1
+
+
+def test_the_residual_is_measured_and_the_certificate_proves_the_poles():
+    rng = np.random.default_rng(3)
+    up, down = observability(unstable(4, rng), 2, 10, rng, 0.02)
+    shift, outcome = solved(up, down, [stable(0.95)])
+    assert shift.residual == pytest.approx(np.linalg.norm(up @ shift.a - down))
+    assert shift.bound == pytest.approx(np.linalg.norm(up @ shift.least_squares - down))
+    change = np.linalg.qr(up, mode="r")
+    inner = change @ shift.a @ np.linalg.inv(change)
+    p = shift.certificate
+    whole = np.block([[0.95 * p, inner @ p], [(inner @ p).T, 0.95 * p]])
+    assert np.min(np.linalg.eigvalsh(p)) > 0 and np.min(np.linalg.eigvalsh(whole)) > -1e-7
+    falls = [s.objective for name, s in outcome.steps if name == "shift with fixed P"]
+    assert np.all(np.diff(falls) <= 1e-7)
+
+
+@pytest.mark.parametrize("radius", [1.0, 0.8])
+def test_close_to_the_best_stable_matrix_of_a_search(radius):
+    """With two states, |eigenvalues| < r is the triangle of trace and determinant: searched from many starts."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        up, down = observability(unstable(2, rng, 1.1), 2, 8, rng, 0.05)
+        shift, _ = solved(up, down, [stable(radius)])
+        if not shift.applied:
+            continue
+
+        def slack(x):
+            a = x.reshape(2, 2) / radius
+            trace, determinant = np.trace(a), np.linalg.det(a)
+            return np.array([1 - determinant, 1 + determinant - trace, 1 + determinant + trace])
+
+        found = []
+        for start in [shift.a, 0.5 * shift.least_squares, *(0.3 * rng.normal(size=(2, 2)) for _ in range(8))]:
+            got = minimize(lambda x: float(np.sum((up @ x.reshape(2, 2) - down) ** 2)), start.ravel(), method="SLSQP",
+                           constraints={"type": "ineq", "fun": slack}, options={"maxiter": 500, "ftol": 1e-14})
+            if np.min(slack(got.x)) > -1e-7:
+                found.append(np.sqrt(got.fun))
+        assert shift.bound <= min(found) + 1e-7
+        assert min(found) - 1e-5 <= shift.residual <= 1.05 * min(found) + 0.02 * (min(found) - shift.bound)
+
+
+def test_nothing_is_posed_where_least_squares_obeys():
+    rng = np.random.default_rng(0)
+    shift, outcome = solved(*observability(unstable(3, rng, 0.7), 1, 8, rng), [stable(0.99), sector(np.pi / 2)][:1])
+    assert outcome is None and not shift.applied and shift.suboptimality == 0 and shift.status is Status.OPTIMAL
+
+
+@pytest.mark.parametrize("solver", ["scs", "cvxopt"])
+def test_any_semidefinite_back_end_gives_the_same_matrix(solver):
+    rng = np.random.default_rng(5)
+    up, down = observability(unstable(3, rng), 2, 10, rng, 0.02)
+    one, _ = solved(up, down, [stable(0.95)])
+    other, _ = solved(up, down, [stable(0.95)], solver)
+    assert other.residual == pytest.approx(one.residual, rel=2e-3)
+
+
+def test_scales_of_the_states_do_not_matter():
+    rng = np.random.default_rng(6)
+    up, down = observability(unstable(3, rng), 2, 10, rng, 0.02)
+    scales = np.diag([1.0, 1e-4, 1e3])
+    shift, _ = solved(up @ scales, down @ scales, [stable(0.9)])
+    assert shift.applied and shift.status in (Status.OPTIMAL, Status.LOCAL)
+    assert np.max(np.abs(np.linalg.eigvals(shift.a))) < 0.9 + 1e-6
+
+
+def test_regions_that_exclude_each_other_are_named():
+    rng = np.random.default_rng(0)
+    step = constrained_shift(*observability(unstable(3, rng), 2, 10, rng), [disc(0.0, 0.3), stable(0.99),
+                                                                          strip(0.5, 0.9)])
+
+    def procedure():
+        shift = yield from step
+        return Evidence(shift.a, shift.residual, None, shift.status, shift.reason)
+
+    outcome = run(procedure())
+    assert outcome.model is None and outcome.solution.status is Status.INFEASIBLE
+    text = explain(outcome.program)
+    assert "disc:0,0.3" in text and "strip:0.5,0.9" in text and "stable" not in text
+
+
+def test_an_inaccurate_semidefinite_programme_is_reported():
+    def sloppy(program, settings):
+        answer = find("clarabel").run(program, settings)
+        values = {name: value * (1.003 if name in ("Q", "A") else 1.0) for name, value in answer.values.items()}
+        return Answer(Status.OPTIMAL, "fine", values, answer.duals)
+
+    rng = np.random.default_rng(3)
+    up, down = observability(unstable(4, rng), 2, 10, rng, 0.02)
+    shift, _ = solved(up, down, [stable(0.8)], sloppy)
+    assert shift.status in (Status.INACCURATE, Status.FAILED)
+    assert "pole" in shift.reason or "violated" in shift.reason or "stationary" in shift.reason
+
+
+def test_a_back_end_without_an_answer_is_reported():
+    rng = np.random.default_rng(3)
+    up, down = observability(unstable(4, rng), 2, 10, rng, 0.02)
+    shift, _ = solved(up, down, [stable(0.8)], lambda program, settings: Answer(Status.FAILED, "numbers ran out"))
+    assert shift.a is None and shift.status is Status.FAILED and "numbers ran out" in shift.reason
+
+
+@pytest.mark.parametrize("up, down, words", [
+    (np.ones((2, 3)), np.ones((2, 3)), "as many rows as states"),
+    (np.ones((4, 2)), np.ones((3, 2)), "one shape"),
+    (np.ones((4, 2)), np.ones((4, 2)), "rank below 2"),
+])
+def test_bad_matrices(up, down, words):
+    with pytest.raises(StructureError, match=words):
+        solved(up, down, [strip(2.0, 3.0)])
