@@ -95,7 +95,7 @@ def _march(s: Array, drive: Array, c: Array, d: Array, start: int) -> tuple[Arra
             value += c[i] * e[k - 1 - i]
         predicted[k] = value if k >= start else np.nan
         if np.isnan(s[k]):
-            filled[k] = value
+            filled[k] = predicted[k]
         else:
             filled[k] = s[k]
             if k >= start and not np.isnan(value):

@@ -9,7 +9,7 @@ weighted sums. What leaves a chunk is a Gram matrix of [sensitivities | errors];
 chunk to the next. The initial states of an experiment are eliminated within it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -173,18 +173,33 @@ def linearise(data: "Data", unknowns: Unknowns, point: PlantPoint, *, gauge: Arr
         method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
         chunk: samples at a time.
     """
-    p, use = unknowns.shared, "qr" if method == "qr" else "gram"
+    use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
     parts = [_experiment(data, unknowns, point, i, use, chunk) for i in range(unknowns.experiments)]
-    rows = sum(part.rows for part in parts)
-    states, rest = zip(*(_eliminated(part.factor, unknowns.memory) for part in parts))
+    found = assembled(parts, unknowns.memory, unknowns.shared, gauge, use)
+    if method == "auto" and not found.condition < CONDITION_LIMIT:
+        return linearise(data, unknowns, point, gauge=gauge, method="qr", chunk=chunk)
+    return found
+
+
+def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
+              ) -> Linearised:
+    """Put the experiments together.
+
+    Args:
+        parts: one for each experiment.
+        n: size of an initial state.
+        p: number of shared unknowns.
+        gauge: as in `linearise`.
+        method: how the parts were compressed.
+    """
+    states, rest = zip(*(_eliminated(part.factor, n) for part in parts))
     stacked = np.vstack([*rest, *_weighted(gauge, rest, p)])
     triangle = np.linalg.qr(stacked, mode="r")
     full = np.zeros((p + 1, p + 1))
     full[: len(triangle)] = triangle
     condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
-    if method == "auto" and not condition < CONDITION_LIMIT:
-        return linearise(data, unknowns, point, gauge=gauge, method="qr", chunk=chunk)
-    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, use)
+    rows = sum(part.rows for part in parts)
+    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, method)
 
 
 def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK) -> Array:
@@ -211,25 +226,32 @@ def simulate(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = C
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    factor: Array  # root, or the factor of the Gram matrix, of [x0 | shared | (measured) | errors]
+class Compressed:
+    """One experiment: a factor of [x0 | shared | (measured) | errors], and the number of errors in it."""
+
+    factor: Array
     rows: int
 
 
-def _experiment(data: "Data", unknowns: Unknowns, point: PlantPoint, index: int, method: str, chunk: int,
-                measured: bool = False) -> _Part:
-    """Compress one experiment."""
-    e = data.experiments[index]
-    columns = unknowns.memory + unknowns.shared + measured * unknowns.layout.na + 1
+def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str) -> Compressed:
+    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left."""
     total, rows = np.zeros((columns, columns)), 0
-    for block, count in _blocks(e.u, e.y[:, 0], unknowns, point, point.x0[index], chunk, measured):
+    for block, count in blocks:
         rows += count
-        used = slice(columns - block.shape[1], None)  # the columns of a state that is forgotten are left out
+        used = slice(columns - block.shape[1], None)
         if method == "qr":
             total[used, used] = add_to_root(total[used, used], block) if used.start else add_to_root(total, block)
         else:
             total[used, used] += block.T @ block
-    return _Part(total if method == "qr" else _factor(total), rows)
+    return Compressed(total if method == "qr" else _factor(total), rows)
+
+
+def _experiment(data: "Data", unknowns: Unknowns, point: PlantPoint, index: int, method: str, chunk: int,
+                measured: bool = False) -> Compressed:
+    e = data.experiments[index]
+    columns = unknowns.memory + unknowns.shared + measured * unknowns.layout.na + 1
+    found = _blocks(e.u, e.y[:, 0], unknowns, point, point.x0[index], chunk, measured)
+    return compressed(found, columns, method)
 
 
 def _blocks(u: Array, y: Array, unknowns: Unknowns, point: PlantPoint, x0: Array, chunk: int, measured: bool

@@ -1,0 +1,141 @@
+"""Prediction errors with a noise filter: against the model's own predictor, finite differences and output error."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from systems import inputs, nonlinearity
+
+from optid.bases import Linear, Polynomial, Triangular
+from optid.data import Data
+from optid.models import HammersteinARX, HammersteinTF
+from optid.regressors import sensitivities
+from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns, blocks, linearise, predict
+from optid.regressors.sensitivities import PlantPoint, Unknowns
+
+C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
+
+
+def plant(a=(-1.2, 0.5)):
+    functions = nonlinearity(Triangular(4), 1), nonlinearity(Polynomial(3), 2)
+    return HammersteinARX(a, ([1.0, 0.4], [0.3, -0.2, 0.1]), functions, (0, 2), 0.4)
+
+
+def records(model, counts=(90, 60), gaps="", seed=0):
+    rng = np.random.default_rng(seed)
+    us, ys = [], []
+    for count in counts:
+        u = inputs(model.plant, count, seed + count)
+        v = lfilter(np.r_[1, model.c], np.r_[1, model.d], 0.3 * rng.standard_normal(count))
+        y = model.simulate(u, rng.normal(size=model.plant.memory)) + v[:, None]
+        if "y" in gaps:
+            y[rng.uniform(size=count) < 0.15] = np.nan
+        if "u" in gaps:
+            u[[30, 33], [0, 1]] = np.nan
+        us.append(u)
+        ys.append(y)
+    return Data(us, ys)
+
+
+def point_of(model, data, apart, seed=3):
+    """A point off the truth, with its unknowns."""
+    rng = np.random.default_rng(seed)
+    layout = model.plant.layout
+    unknowns = Unknowns(layout, data.n_experiments, tuple(not isinstance(b, Linear) for b in layout.bases))
+    noise = NoiseUnknowns(unknowns, len(model.c), len(model.d) if apart else None)
+    x0 = rng.normal(size=(data.n_experiments, layout.first_row))
+    mus = tuple(f.mu for f in model.nonlinearities)
+    point = NoisePoint(PlantPoint(model.a, mus, model.b, float(model.offset[0]), x0), model.c, model.d)
+    return noise, noise.pack(point) + 0.02 * rng.standard_normal(noise.size)
+
+
+CASES = {"armax": (HammersteinTF(plant(), C, plant().a), False), "arx": (HammersteinTF(plant(), (), plant().a), False),
+         "long": (HammersteinTF(plant(), [0.2, 0.0, 0.1, -0.3, 0.2], plant().a), False),
+         "bj": (HammersteinTF(plant(), C, D), True), "oe": (HammersteinTF(plant()), True),
+         "ma": (HammersteinTF(plant(), C), True), "ar": (HammersteinTF(plant(), (), D), True),
+         "fir": (HammersteinTF(plant(()), C), True)}
+
+
+def errors(data, unknowns, x):
+    found = []
+    for i, e in enumerate(data.experiments):
+        one = predict(e.u, e.y[:, 0], unknowns, unknowns.unpack(x), i)
+        found.append(np.where(one.state == 0, -one.innovations, 0.0))
+    return np.concatenate(found)
+
+
+# the state of a plant apart is lost where an input is missing, so that such records are refused
+GAPS = [(name, gaps) for name, (_, apart) in CASES.items() for gaps in (("", "y") if apart else ("", "y", "u", "uy"))]
+
+
+@pytest.mark.parametrize(("name", "gaps"), GAPS)
+def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps):
+    model, apart = CASES[name]
+    data = records(model, gaps=gaps)
+    unknowns, x = point_of(model, data, apart)
+    rows = []
+    for i, e in enumerate(data.experiments):
+        found = predict(e.u, e.y[:, 0], unknowns, unknowns.unpack(x), i)
+        part = np.vstack([block for block, _ in blocks(e.u, found, unknowns, unknowns.unpack(x), chunk=17)])
+        states = np.zeros((len(part), data.n_experiments * unknowns.memory))
+        states[:, i * unknowns.memory : (i + 1) * unknowns.memory] = part[:, : unknowns.memory]
+        rows.append(np.hstack([part[:, unknowns.memory : -1], states, part[:, -1:]]))
+        assert found.rows == np.count_nonzero(found.state == 0) < len(e.u) + apart
+    whole = np.vstack(rows)
+    assert whole[:, -1] == pytest.approx(errors(data, unknowns, x), abs=1e-13)
+    for j in range(unknowns.size):
+        step = 1e-6 * np.eye(unknowns.size)[j]
+        slope = (errors(data, unknowns, x + step) - errors(data, unknowns, x - step)) / 2e-6
+        assert whole[:, j] == pytest.approx(slope, abs=2e-7 * (1 + np.max(np.abs(slope)))), j
+
+
+@pytest.mark.parametrize("method", ["gram", "qr", "auto"])
+@pytest.mark.parametrize("name", ["armax", "bj"])
+def test_compression_keeps_values_gradients_and_steps(name, method):
+    model, apart = CASES[name]
+    data = records(model, gaps="y")
+    unknowns, x = point_of(model, data, apart)
+    at = linearise(data, unknowns, unknowns.unpack(x), method=method, chunk=23)
+    e = errors(data, unknowns, x)
+    assert at.value == pytest.approx(e @ e, rel=1e-9)
+    matrix, pull = at.whole
+    value = lambda x: np.sum(errors(data, unknowns, x) ** 2)  # noqa: E731
+    gradient = np.array([(value(x + s) - value(x - s)) / 2e-6 for s in 1e-6 * np.eye(unknowns.size)])
+    assert 2 * matrix.T @ pull == pytest.approx(gradient, rel=1e-4, abs=1e-5 * np.max(np.abs(gradient)))
+    assert at.rows == sum(np.isfinite(p.y[unknowns.skipped :]).sum() for p in data.experiments)
+
+
+def test_errors_are_those_of_the_models_predictor():
+    for name, gaps in (("armax", "uy"), ("arx", "u"), ("long", "y"), ("bj", "y"), ("ma", "")):
+        model, apart = CASES[name]
+        data = records(model, gaps=gaps)
+        unknowns, x = point_of(model, data, apart)
+        point = unknowns.unpack(x)
+        truth = HammersteinTF(HammersteinARX(point.plant.a, point.plant.bs, tuple(
+            type(f)(f.basis, mu) for f, mu in zip(model.nonlinearities, point.plant.mus)), (0, 2),
+            point.plant.offset, inputs=data.inputs), point.c, point.d)
+        expected = truth.innovations(data, list(point.plant.x0) if apart else "fit")
+        for i, e in enumerate(data.experiments):
+            found = predict(e.u, e.y[:, 0], unknowns, point, i)
+            assert np.array_equal(found.state == 0, np.isfinite(expected[i][:, 0]))
+            assert found.innovations == pytest.approx(np.nan_to_num(expected[i][:, 0]), abs=1e-11)
+
+
+def test_without_a_noise_filter_it_is_the_output_error():
+    model, _ = CASES["oe"]
+    data = records(model, counts=(300, 200), gaps="y")
+    unknowns, x = point_of(model, data, True)
+    ours = linearise(data, unknowns, unknowns.unpack(x), method="qr")
+    theirs = sensitivities.linearise(data, unknowns.plant, unknowns.unpack(x).plant, method="qr")
+    assert ours.value == pytest.approx(theirs.value, rel=1e-10)
+    assert np.abs(ours.root.T @ ours.root) == pytest.approx(np.abs(theirs.root.T @ theirs.root), rel=1e-8, abs=1e-8)
+
+
+def test_packing():
+    model, _ = CASES["bj"]
+    data = records(model)
+    unknowns, x = point_of(model, data, True)
+    assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
+    model, _ = CASES["armax"]
+    unknowns, x = point_of(model, data, False)
+    assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
+    assert np.array_equal(unknowns.unpack(x).d, unknowns.unpack(x).plant.a)
