@@ -1,0 +1,189 @@
+"""Noise statistics: what the data determine is recovered on simulated systems with known covariances."""
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+from scipy.signal import csd
+
+from optid.data import Data
+from optid.errors import StructureError
+from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.kalman import kalman_gain
+from optid.models.noise_covariances import NoiseCovariances
+from optid.noise import (
+    _covariance,
+    _direction,
+    _innovations,
+    colour,
+    estimate_noise,
+    noise_spectrum,
+    residuals,
+    with_noise,
+)
+
+A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
+B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])
+C = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -0.3]])
+
+
+def truth(seed=0, A=A, size=0.1):
+    """A model with random Q, R, S and the gain that belongs to them."""
+    W = size * np.random.default_rng(seed).normal(size=(5, 5))
+    Q, R, S = (W @ W.T)[:3, :3], (W @ W.T)[3:, 3:], (W @ W.T)[:3, 3:]
+    found = kalman_gain(A, C, Q, R, S)
+    return HammersteinSS(A, B, C, K=found.K, noise=NoiseCovariances(Q, R, S, found.innovation))
+
+
+def record(model, lengths=(20000,), seed=1, missing=0.0):
+    rng = np.random.default_rng(seed)
+    noise = model.noise
+    cov = np.block([[noise.Q, noise.S], [noise.S.T, noise.R]])
+    us, ys = [], []
+    for N in lengths:
+        u, wv = rng.normal(size=(N, 2)), rng.multivariate_normal(np.zeros(5), cov, N)
+        x, y = rng.normal(size=3), np.zeros((N, 2))
+        for k in range(N):
+            y[k] = model.C @ x + wv[k, 3:]
+            x = model.A @ x + model.B @ u[k] + wv[k, :3]
+        y[rng.uniform(size=y.shape) < missing] = np.nan
+        us.append(u)
+        ys.append(y)
+    return Data(us, ys)
+
+
+def bare(model):
+    return HammersteinSS(model.A, model.B, model.C)
+
+
+@pytest.mark.parametrize(("lengths", "missing", "most"), [((20000,), 0.0, 0.1), ((9000, 4000, 7000), 0.1, 0.12)])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_gain_innovations_and_spectrum_are_recovered(lengths, missing, most, seed):
+    model = truth(seed)
+    found = with_noise(bare(model), record(model, lengths, seed + 10, missing))
+    w = np.linspace(0.02, 3.1, 50)
+    for got, true in (
+        (found.K, model.K),
+        (found.noise.innovation, model.noise.innovation),
+        (noise_spectrum(found, w), noise_spectrum(model, w)),
+    ):
+        assert np.linalg.norm(got - true) < most * np.linalg.norm(true)
+
+
+def test_errors_shrink_like_the_root_of_the_record():
+    model, errors = truth(4), []
+    for N in (1000, 16000):
+        runs = [estimate_noise(bare(model), record(model, (N,), seed)).K - model.K for seed in range(8)]
+        errors.append(np.sqrt(np.mean(np.square(runs))))
+    assert 2.5 < errors[0] / errors[1] < 6.5  # 4 in theory
+
+
+def test_covariances_are_positive_semidefinite_and_give_the_gain_back():
+    model = truth(5)
+    found = estimate_noise(bare(model), record(model, (3000,)))
+    noise = found.covariances
+    joint = np.block([[noise.Q, noise.S], [noise.S.T, noise.R]])
+    assert np.linalg.eigvalsh(joint)[0] > -1e-12 * np.trace(joint)
+    again = kalman_gain(A, C, noise.Q, noise.R, noise.S)
+    assert again.K == pytest.approx(found.K, abs=1e-7) and again.innovation == pytest.approx(noise.innovation)
+
+
+def test_no_other_gain_predicts_better():
+    model = truth(6)
+    data = record(model, (1500,), missing=0.05)
+    found = estimate_noise(bare(model), data)
+    rest = residuals(bare(model), data)
+
+    def loss(gain):
+        return np.linalg.slogdet(_innovations(A, C, gain.reshape(3, 2), rest))[1]
+
+    slope = approx_fprime(found.K.ravel(), loss, 1e-6)
+    assert np.abs(slope).max() < 1e-3
+    rng = np.random.default_rng(0)
+    best = loss(found.K.ravel())
+    assert all(loss(found.K.ravel() + 0.02 * rng.normal(size=6)) > best for _ in range(20))
+
+
+def test_the_step_is_that_of_a_formed_jacobian():
+    model = truth(7)
+    data = record(model, (400,), missing=0.1)
+    rest, gain = residuals(bare(model), data), 0.5 * model.K
+    covariance = _innovations(A, C, gain, rest)
+    weight = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def errors(flat):
+        x, e = np.zeros(3), []
+        for r in rest[0]:
+            e.append(np.where(np.isnan(r), 0.0, r - C @ x))
+            x = A @ x + flat.reshape(2, 3).T @ e[-1]
+        return (np.array(e) @ weight.T).ravel()
+
+    start = gain.T.ravel()
+    jacobian = np.column_stack(
+        [(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(6)]
+    )
+    step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0].reshape(2, 3).T
+    assert _direction(A, C, gain, rest, covariance) == pytest.approx(step, rel=1e-4, abs=1e-7)
+
+
+@pytest.mark.parametrize("radius", [1.0, 1.02])
+def test_poles_on_and_outside_the_unit_circle(radius):
+    A1 = A * radius / np.max(np.abs(np.linalg.eigvals(A)))
+    model = truth(8, A1)
+    found = estimate_noise(bare(model), record(model, (200,) * 8))
+    assert np.linalg.norm(found.K - model.K) < 0.25 * np.linalg.norm(model.K)
+    assert np.max(np.abs(np.linalg.eigvals(A1 - found.K @ C))) < 1
+
+
+def test_white_noise_at_the_outputs_needs_no_gain():
+    model = HammersteinSS(A, B, C, noise=NoiseCovariances(np.zeros((3, 3)), np.diag([0.04, 1.0]), np.zeros((3, 2)),
+                                                          np.diag([0.04, 1.0])))
+    data = record(model, (8000,))
+    found = estimate_noise(bare(model), data)
+    assert np.abs(found.K / [5.0, 1.0]).max() < 0.05
+    assert np.diag(found.covariances.R) == pytest.approx([0.04, 1.0], rel=0.06)
+    assert all(test.passed for test in colour(bare(model), data).values())
+
+
+def test_the_colour_test_names_the_output():
+    model = HammersteinSS(np.diag([0.9, 0.5]), np.eye(2), np.eye(2), K=np.zeros((2, 2)))
+    rng, N = np.random.default_rng(3), 3000
+    u, e = rng.normal(size=(N, 2)), 0.1 * rng.normal(size=(N, 2))
+    for k in range(1, N):
+        e[k, 1] += 0.6 * e[k - 1, 1]
+    tests = colour(model, Data(u, model.simulate(u) + e))
+    assert tests["y1"].passed and not tests["y2"].passed
+
+
+def test_the_spectrum_is_that_of_the_residuals():
+    model = truth(9)
+    rest = residuals(bare(model), record(model, (60000,)))[0]
+    w = 2 * np.pi * csd(rest[:, 0], rest[:, 1], nperseg=256)[0]
+    measured = np.array([[csd(rest[:, i], rest[:, j], nperseg=256)[1] for j in range(2)] for i in range(2)]) / 2
+    expected = np.transpose(noise_spectrum(model, w), (1, 2, 0)).conj()  # scipy conjugates the first signal
+    inner = slice(3, -3)
+    error = np.linalg.norm((measured - expected)[..., inner]) / np.linalg.norm(expected[..., inner])
+    assert error < 0.12
+
+
+def test_scaled_data_are_in_the_units_of_their_model():
+    model = truth(10)
+    data = record(model, (4000,)).scale({"y1": 10.0, "y2": 0.1})
+    scaled = HammersteinSS(A, B, np.diag([0.1, 10.0]) @ C)
+    found = with_noise(scaled, data).with_transform(data.transform)
+    plain = with_noise(bare(model), data.raw())
+    assert found.K == pytest.approx(plain.K, rel=1e-4)
+    assert found.noise.innovation == pytest.approx(plain.noise.innovation, rel=1e-4)
+
+
+def test_without_noise_there_is_nothing_to_estimate():
+    model, u = bare(truth()), np.random.default_rng(0).normal(size=(300, 2))
+    found = estimate_noise(model, Data(u, model.simulate(u)))
+    assert not found.K.any() and np.abs(found.covariances.innovation).max() < 1e-15
+    with pytest.raises(StructureError, match="no noise covariances"):
+        noise_spectrum(model, [0.1])
+
+
+def test_covariances_with_missing_samples_by_hand():
+    x = np.array([[1.0, 2.0], [np.nan, 1.0], [3.0, np.nan], [0.0, 1.0]])
+    assert _covariance([x])[0, 0] == pytest.approx(10 / 3) and _covariance([x])[0, 1] == pytest.approx(2 / 2)
+    assert _covariance([x], 1)[0, 1] == pytest.approx(3 / 1)
