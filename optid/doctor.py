@@ -1,39 +1,45 @@
 """Examine a record before solving: what makes the answer meaningless is an error, what weakens it a warning."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from optid.bases.basis import Basis
-from optid.channels import count_levels
 from optid.data import Data
 from optid.errors import DataError, DataWarning
+from optid.experiment.rules import Check, check_condition, check_levels, check_lines
 
-FEW_LEVELS = 20  # below this many distinct values a curve between them is interpolation, not identification
 OUTLIER = 10.0  # robust standard deviations
 LEAST_KEPT = 0.5
-WORST_CONDITION = 1e7
 
 
-def examine(data: Data, bases: Sequence[Basis]) -> list[str]:
+def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
     """Examine inputs and outputs against the bases that are to be identified from them.
 
     Args:
         data: the record.
         bases: one fitted basis per input.
+        arguments: of the formulation; its lags (nb, or rows of a subspace method) are held against the spectral lines
+            of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
 
     Returns:
         What weakens the answer, one sentence each; every sentence is also issued as a `DataWarning`.
 
     Raises:
-        DataError: a constant or missing input, or too few levels to determine the basis.
+        DataError: a constant or missing input, too few levels to determine the basis, or too few spectral lines to
+            determine its coefficients at every lag.
     """
+    arguments = arguments or {}
     found: list[str] = []
     for c, (name, basis) in enumerate(zip(data.inputs, bases)):
         u = np.concatenate([e.u[:, c] for e in data.experiments])
         u = u[~np.isnan(u)]
         found += _levels(name, u, basis)
+        forced = arguments.get("tolerance") is not None
+        found += _lines(name, [e.u[:, c] for e in data.experiments], basis, _lags(arguments, c), forced)
         found += _range(name, u, basis)
         found += _outliers("input", name, u)
     for o, name in enumerate(data.outputs):
@@ -56,19 +62,33 @@ def _levels(name: str, u: np.ndarray, basis: Basis) -> list[str]:
     if np.ptp(u) == 0:
         raise DataError(f"input {name!r} is constant ({u[0]:g}): nothing can be identified from it; "
                         "excite the input or drop the channel")
-    if count_levels(u[:4096]) > 4 * FEW_LEVELS or basis.size == 1:
+    return _told(check_levels(name, u, basis))
+
+
+def _lines(name: str, records: Sequence[np.ndarray], basis: Basis, lags: int | None, forced: bool) -> list[str]:
+    if lags is None:
         return []
-    levels = count_levels(u)
-    if levels == 2:
-        raise DataError(f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
-                        "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
-    if levels - 1 < basis.size:
-        raise DataError(f"input {name!r} takes {levels} levels, which determine at most {levels - 1} functions besides "
-                        f"the constant; the basis has {basis.size}. Use a smaller basis or excite more levels")
-    if levels < FEW_LEVELS:
-        return [f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis functions; "
-                "the nonlinearity between them is interpolation"]
-    return []
+    check = check_lines(name, records, basis, lags)
+    return _told(replace(check, severity="warning") if check.severity == "error" and forced else check)
+
+
+def _told(check: Check) -> list[str]:
+    """Return the sentence of a warning, nothing of what is fine.
+
+    Raises:
+        DataError: of an error.
+    """
+    if check.severity == "error":
+        raise DataError(check.sentence)
+    return [check.sentence] if check.severity == "warning" else []
+
+
+def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
+    """Number of lags at which the functions of input c are regressors, as far as the arguments tell."""
+    given = arguments.get("rows", arguments.get("nb"))
+    if isinstance(given, list | tuple):
+        given = given[c] if c < len(given) else None
+    return int(given) if isinstance(given, int | np.integer) else None
 
 
 def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:
@@ -115,10 +135,7 @@ def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:
         candidates: rows there would be without missing samples.
         condition: estimated condition number of the column-scaled expanded regressor.
     """
-    found = []
-    if condition > WORST_CONDITION:
-        found.append(f"the expanded regressor is poorly excited: condition number {condition:.1e}; "
-                     "use fewer functions or lags, or a richer input")
+    found = _told(check_condition(condition))
     for sentence in found:
         warnings.warn(sentence, DataWarning, stacklevel=4)
     if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning

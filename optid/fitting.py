@@ -226,7 +226,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
     if isinstance(data, Stream):
         return []
-    return examine(data, fitted_bases(data, arguments.get("basis", Linear())))
+    return examine(data, fitted_bases(data, arguments.get("basis", Linear())), arguments)
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

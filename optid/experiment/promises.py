@@ -89,7 +89,7 @@ def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[floa
     expand = expansion(record, basis, feedback_basis)
     condition = expanded_condition([np.hstack([u, y])], expand, rows)
     checks = [check_levels(name, u[:, c], expand.inputs[c], few) for c, name in enumerate(like.inputs)]
-    checks += [check_lines(name, u[:, c], expand.inputs[c], rows) for c, name in enumerate(like.inputs)]
+    checks += [check_lines(name, [u[:, c]], expand.inputs[c], rows) for c, name in enumerate(like.inputs)]
     if feedback_basis is not None:
         checks += check_feedback(like.outputs, expand)
     checks.append(check_condition(condition))

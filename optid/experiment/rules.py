@@ -81,7 +81,7 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
     return Check("levels", name, levels, needed, "fine", f"input {name!r} takes {levels} levels")
 
 
-def check_lines(name: str, u: Array, basis: Basis, lags: int) -> Check:
+def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) -> Check:
     """Hold the sinusoids that the functions of an input consist of against the regressors they are to excite.
 
     A sinusoid through a polynomial of degree p has p harmonics, and L sinusoids excite 2 L + 1 regressors, however
@@ -89,40 +89,38 @@ def check_lines(name: str, u: Array, basis: Basis, lags: int) -> Check:
 
     Args:
         name: of the input.
-        u: (N,) samples; NaN = missing. The longest stretch without one is looked at.
+        records: (N,) samples per experiment; NaN = missing. The longest stretch of each without one is looked at.
         basis: the fitted basis.
         lags: regressors per function: block rows of a subspace method, coefficients of B of an equation-error one.
 
     Returns:
-        The check; its number is the regressors excited.
+        The check; its number is the regressors excited, by all experiments together at most.
     """
     needed = lags * basis.size
     most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
     fine = Check("lines", name, float("inf"), needed, "fine",
                  f"the functions of input {name!r} have more than {most} spectral lines")
-    run = longest_run(np.asarray(u, dtype=float)[:, None])[:, 0]
-    if needed <= 3 or run.size < 4 * needed or many_lines(run, most, DOMINANT):
-        return fine
-    shares = remaining_shares(basis.values(run), most, HIDDEN)
-    if shares[-1] > DOMINANT:
-        return fine
-    lines = shares.size - 1
+    lines, remaining, single = 0, 0.0, True
+    for record in records:
+        u = longest_run(np.asarray(record, dtype=float)[:, None])[:, 0]
+        if needed <= 3 or u.size < 4 * needed or np.ptp(u) == 0 or many_lines(u, most, DOMINANT):
+            return fine
+        shares = remaining_shares(basis.values(u), most, HIDDEN)
+        if shares[-1] > DOMINANT:
+            return fine
+        lines, remaining = lines + shares.size - 1, max(remaining, shares[-1])
+        single = single and remaining_shares(u[:, None], 1, DOMINANT)[-1] <= DOMINANT
     excited = 2 * lines + 1
     if excited >= needed:
         return fine
-    kind = "consists of a few sinusoids" if _several(run) else "is a single sinusoid"
-    share = f"{100 * (1 - shares[-1]):.2f} %"
+    kind = "is a single sinusoid" if single else "consists of a few sinusoids"
+    share = f"{100 * (1 - remaining):.2f} %"
     sentence = (
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
         f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
         "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions"
     )
-    return Check("lines", name, excited, needed, "error" if shares[-1] <= HIDDEN else "warning", sentence)
-
-
-def _several(u: Array) -> bool:
-    """Whether u needs more than one sinusoid."""
-    return bool(remaining_shares(u[:, None], 1, DOMINANT)[-1] > DOMINANT)
+    return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
 def check_feedback(outputs: Sequence[str], expansion: Expansion) -> list[Check]:
