@@ -9,6 +9,10 @@ Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kind
 * about the *static characteristic* ``y = (f(u) sum(b) + d) / (1 + sum(a))``, in units of the output: slope, range,
   points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge. They
   include ``1 + sum(a) > 0``, which every stable model satisfies: without it there is no static characteristic.
+
+For state-space models they act in the step that chooses B and D ("realisation"), where the static characteristic
+``C (I - A)^-1 B f(u) + D f(u) + d`` is linear in the unknowns; an output that is fed back through a nonlinearity or an
+observer gain is held at its mean there. `step_response`, `impulse_response` and `no_effect` belong to that step alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -101,26 +105,30 @@ def saturation(low: float | None = None, high: float | None = None, channel: str
     return _linear("saturation", channel, rows)
 
 
-def slope(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
+def slope(low: float | None = None, high: float | None = None, channel: str | None = None,
+          output: str | None = None) -> Rule:
     """The slope of the static characteristic lies in [low, high] (units of output per unit of input)."""
-    return _static("slope", low, high, channel, lambda basis: basis.slope_rows(), offset=False)
+    return _static("slope", low, high, channel, output, lambda basis: basis.slope_rows(), offset=False)
 
 
-def value_range(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
+def value_range(low: float | None = None, high: float | None = None, channel: str | None = None,
+                output: str | None = None) -> Rule:
     """The static characteristic lies in [low, high] over the interval of the basis (units of the output).
 
     Exact for `Triangular`, on a dense grid for the other bases.
     """
-    return _static("range", low, high, channel, _everywhere, offset=True)
+    return _static("range", low, high, channel, output, _everywhere, offset=True)
 
 
-def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None) -> Rule:
+def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None,
+            output: str | None = None) -> Rule:
     """The static characteristic passes through the points (u, y).
 
     Args:
         u: input values inside the interval of the basis.
         y: output values in steady state.
         channel: name of the input.
+        output: name of the output, where there are several.
 
     Raises:
         StructureError: different numbers of u and y.
@@ -130,14 +138,15 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
         raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
 
     def build(view: View) -> Any:
-        basis, theta = _basis(view, channel), _static_theta(view, channel)
-        return [basis.values(us) @ theta + view["offset"][0] == cp.multiply(ys, _denominator(view)), *_settles(view)]
+        basis, theta = _basis(view, channel), _static_theta(view, channel, output)
+        curve = basis.values(us) @ theta + _offset(view, output)
+        return [curve == cp.multiply(ys, _denominator(view)), *_settles(view)]
 
-    return Rule(_label("through", channel), build)
+    return Rule(_label("through", channel, output), build)
 
 
 def gain(value: float | None = None, low: float | None = None, high: float | None = None, at: float | None = None,
-         channel: str | None = None) -> Rule:
+         channel: str | None = None, output: str | None = None) -> Rule:
     """The static gain at an operating point equals ``value`` or lies in [low, high].
 
     Args:
@@ -146,6 +155,7 @@ def gain(value: float | None = None, low: float | None = None, high: float | Non
         high: upper bound instead of a value.
         at: operating point; default the middle of the interval.
         channel: name of the input.
+        output: name of the output, where there are several.
 
     Raises:
         StructureError: neither value nor bound given.
@@ -158,7 +168,7 @@ def gain(value: float | None = None, low: float | None = None, high: float | Non
 
     if value is not None:
         low = high = value
-    return _static("gain", low, high, channel, rows, offset=False)
+    return _static("gain", low, high, channel, output, rows, offset=False)
 
 
 def coefficients(name: str, low: float | None = None, high: float | None = None, index: int | None = None) -> Rule:
@@ -237,8 +247,9 @@ def _sign(word: str, positive: str, negative: str) -> float:
     return 1.0 if word == positive else -1.0
 
 
-def _label(word: str, channel: str | None) -> str:
-    return word if channel is None else f"{word}[{channel}]"
+def _label(word: str, channel: str | None, output: str | None = None) -> str:
+    named = [name for name in (channel, output) if name is not None]
+    return f"{word}[{','.join(named)}]" if named else word
 
 
 def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list[Any]:
@@ -262,7 +273,8 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
         matrix = rows(_basis(view, one))
         if view.kind in FACTORED and view.key("mu", one) in view:
             return matrix @ view[view.key("mu", one)] >= 0
-        return matrix @ _static_theta(view, one) >= 0
+        outputs = view.outputs if view.kind == "realisation" else (None,)
+        return [matrix @ _static_theta(view, one, output) >= 0 for output in outputs or (None,)]
 
     return Rule(_label(f"{word}:{direction}" if direction else word, channel),
                 lambda view: _every(view, channel, lambda one: build(view, one)))
@@ -277,7 +289,7 @@ def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -
     return Rule(_label(word, channel), lambda view: _every(view, channel, lambda one: build(view, one)))
 
 
-def _static(word: str, low: float | None, high: float | None, channel: str | None,
+def _static(word: str, low: float | None, high: float | None, channel: str | None, output: str | None,
             rows: Callable[[Any], np.ndarray], *, offset: bool) -> Rule:
     if low is None and high is None:
         raise StructureError(f"{word} needs low= and/or high=")
@@ -285,9 +297,9 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
         raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
 
     def build(view: View) -> Any:
-        curve = rows(_basis(view, channel)) @ _static_theta(view, channel)
+        curve = rows(_basis(view, channel)) @ _static_theta(view, channel, output)
         if offset:
-            curve = curve + view["offset"][0]
+            curve = curve + _offset(view, output)
         size = _denominator(view)
         if low == high:
             return [curve - low * size == 0, *_settles(view)]
@@ -297,14 +309,58 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
     return Rule(_label(word, channel), build)
 
 
-def _static_theta(view: View, channel: str | None) -> Any:
-    """Theta summed over the lags: coefficients of the static curve, times ``1 + sum(a)``."""
+def _static_theta(view: View, channel: str | None, output: str | None = None) -> Any:
+    """Coefficients of the static curve, times ``1 + sum(a)``: Theta summed over the lags, or through A, B, C and D."""
     _basis(view, channel)
+    if view.kind == "realisation":
+        a, c = view.reference["A"], view.reference["C"]
+        try:
+            row = np.linalg.solve((np.eye(len(a)) - a).T, c[output_index(view, output)])
+        except np.linalg.LinAlgError:
+            raise StructureError("the model has a pole at 1, hence no static characteristic; add 'stable'") from None
+        return view[view.key("Theta", channel)] @ through_matrices(view, channel, row, output)
     if view["offset"].size > 1:
         raise StructureError("constraints on the static characteristic are defined for one output")
     if view.key("Theta", channel) not in view:  # a linear model has b alone
         return cp.hstack([cp.sum(view[view.key("b", channel)])])
     return cp.sum(view[view.key("Theta", channel)], axis=1)
+
+
+def through_matrices(view: View, channel: str | None, row: np.ndarray, output: str | None, direct: float = 1.0
+                     ) -> np.ndarray:
+    """Return the weights w of one output with ``Theta w = (row B + direct D_output) of every function``.
+
+    Args:
+        view: of a realisation step; Theta is (functions, n) where the input has no direct feedthrough.
+        channel: name of the input.
+        row: (n,) weights of the states.
+        output: name of the output.
+        direct: weight of its feedthrough.
+    """
+    a, c = view.reference["A"], view.reference["C"]
+    weights = np.concatenate([row, np.zeros(len(c))])
+    weights[len(a) + output_index(view, output)] = direct
+    return weights[: view[view.key("Theta", channel)].shape[1]]
+
+
+def output_index(view: View, output: str | None) -> int:
+    """Position of an output; the only one where none is named.
+
+    Raises:
+        StructureError: several outputs and none named, or no such output.
+    """
+    if output is None and len(view.reference["C"]) == 1:
+        return 0
+    if output not in view.outputs:
+        wrong = "needs output=" if output is None else f"names no output {output!r}"
+        raise StructureError(f"this constraint {wrong}; the outputs are {', '.join(view.outputs)}")
+    return view.outputs.index(output)
+
+
+def _offset(view: View, output: str | None) -> Any:
+    if view.kind == "realisation":
+        return view["offset"][output_index(view, output)] if "offset" in view else 0.0
+    return view["offset"][0]
 
 
 def _denominator(view: View) -> Any:

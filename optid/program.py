@@ -23,17 +23,24 @@ class View(Mapping[str, cp.Expression]):
     """The named expressions that a constraint may speak about, and the structure it may need.
 
     Attributes:
-        kind: "exact" (variables a, b, mu, offset), "relaxed" (a, Theta, offset) or "linear" (a, b, offset).
+        kind: "exact" (variables a, b, mu, offset), "relaxed" (a, Theta, offset), "linear" (a, b, offset), "tangent"
+            (a step of an output-error fit), "shift" (P and Q = A P) or "realisation" (Theta_c = functions x [B; D] of
+            input c, and offset, with A and C held).
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
         bases: the fitted basis of every channel.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
-        reference: values of the unconstrained least-squares estimate, for constraints that need a centre.
+        reference: values of the unconstrained least-squares estimate, for constraints that need a centre; in a
+            "realisation" step the matrices ``A`` and ``C`` that are held.
+        outputs: names of the outputs, where constraints may have to choose one.
     """
 
     def __init__(self, expressions: Mapping[str, cp.Expression], *, kind: str, channels: tuple[str, ...] = (),
-                 bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None) -> None:
+                 bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None,
+                 outputs: tuple[str, ...] = ()) -> None:
         self._expressions = dict(expressions)
+        self._auxiliaries: dict[int, cp.Variable] = {}
+        self.outputs = tuple(outputs)
         self.kind = kind
         self.channels = channels
         self.bases = dict(bases or {})
@@ -56,6 +63,24 @@ class View(Mapping[str, cp.Expression]):
 
     def __len__(self) -> int:
         return len(self._expressions)
+
+    def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> cp.Variable:
+        """Return a new variable that a constraint needs for itself, such as the matrix of a Lyapunov inequality.
+
+        It becomes a variable of every programme in which the constraint stands.
+
+        Args:
+            name: its name.
+            shape: its shape.
+            attributes: CVXPY attributes, such as ``symmetric=True``.
+        """
+        variable = cp.Variable(shape, name=name, **attributes)
+        self._auxiliaries[variable.id] = variable
+        return variable
+
+    def owns(self, variable: cp.Variable) -> bool:
+        """Whether a variable came from `auxiliary`."""
+        return variable.id in self._auxiliaries
 
     def key(self, name: str, channel: str | None = None) -> str:
         """Return the key of a per-channel quantity: ``mu`` with one input, ``mu[channel]`` with several."""
@@ -202,7 +227,7 @@ class Program:
         """
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
-        constraints = dict(self.constraints)
+        constraints, variables = dict(self.constraints), dict(self.variables)
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -211,7 +236,11 @@ class Program:
                     raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
                 for member in group:
                     foreign = set(member.variables()) - known
-                    if foreign:
+                    own = {v for v in foreign if self.view.owns(v)}
+                    for variable in sorted(own, key=lambda v: v.id):
+                        _name_new(variables, variable)
+                    known |= own
+                    if foreign := foreign - own:
                         raise StructureError(
                             f"constraint {name!r} uses {', '.join(sorted(v.name() for v in foreign))}, "
                             f"which is not a variable of {self.name!r} ({', '.join(self.variables)})"
@@ -222,7 +251,7 @@ class Program:
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
                 constraints[name] = group
-        return replace(self, constraints=constraints)
+        return replace(self, constraints=constraints, variables=variables)
 
     def freeze(self, **values: Any) -> "Program":
         """Return the programme with some variables held at values, as parameters that may be changed later.
@@ -254,7 +283,7 @@ class Program:
             constraints[name] = kept
         view = View({name: self.view[name].tree_copy(swap) for name in self.view}, kind=self.view.kind,
                     channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
-                    reference=self.view.reference)
+                    reference=self.view.reference, outputs=self.view.outputs)
         left = {name: v for name, v in self.variables.items() if name not in values}
         held = {name: parameters[name] for name in values}
 
@@ -334,6 +363,13 @@ class Program:
     def size(self) -> int:
         """Number of scalar unknowns."""
         return sum(v.size for v in self.variables.values())
+
+
+def _name_new(variables: dict[str, cp.Variable], variable: cp.Variable) -> None:
+    name, count = variable.name(), 2
+    while name in variables:
+        name, count = f"{variable.name()} {count}", count + 1
+    variables[name] = variable
 
 
 _MATRIX_ATOMS = {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac", "matrix_frac", "tr_inv"}
