@@ -46,6 +46,7 @@ class Fit:
         figures: rows used, rows there are, condition number, method of the statistics; for a procedure what it measured
             on its way (singular values, number of starts, ...).
         steps: (name, solution) of every programme on the way.
+        procedure: whether a procedure of several steps judged the whole: its bound may be that of a step.
         seconds: wall time of the whole call.
     """
 
@@ -59,6 +60,7 @@ class Fit:
     findings: tuple[str, ...] = ()
     figures: Mapping[str, Any] = field(default_factory=dict, repr=False)
     steps: tuple[tuple[str, Solution], ...] = field(default=(), repr=False)
+    procedure: bool = False
     seconds: float = 0.0
 
     @cached_property
@@ -220,7 +222,8 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),
                        *price_earlier_steps(outcome.constrained, outcome.program)),
-               findings=tuple(findings), figures=figures, steps=outcome.steps, seconds=time.perf_counter() - started)
+               findings=tuple(findings), figures=figures, steps=outcome.steps, procedure=outcome.procedure,
+               seconds=time.perf_counter() - started)
 
 
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:

@@ -192,7 +192,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     Inputs whose Theta is a vector are left out.
     """
     compressed, found = fit.program.compressed, {}
-    if not (hasattr(compressed, "matrices") and hasattr(compressed, "problem") and fit.solution.has_point):
+    if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
         return found
     if fit.program.view.kind == "exact":
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear

@@ -235,6 +235,7 @@ class Outcome:
         figures: those of the procedure's `Evidence`.
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
+        procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
     """
 
     model: Any
@@ -243,6 +244,7 @@ class Outcome:
     steps: tuple[tuple[str, Solution], ...]
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
+    procedure: bool = False
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -268,9 +270,9 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         try:
             program = problem.send(solution)
         except StopIteration as stop:
-            found, figures = stop.value, {}
-            if isinstance(found, Evidence):
-                solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
-                                   reason=found.reason)
-                found, figures = found.model, found.figures
-            return Outcome(found, solution, program, tuple(steps), figures, constrained)
+            found = stop.value
+            if not isinstance(found, Evidence):
+                return Outcome(found, solution, program, tuple(steps), constrained=constrained)
+            solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
+                               reason=found.reason)
+            return Outcome(found.model, solution, program, tuple(steps), found.figures, constrained, True)

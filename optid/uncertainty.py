@@ -276,6 +276,8 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
+    if fit.model is not None and fit.model.kind != "HammersteinARX":
+        raise StructureError(f"they follow from the statistics of ARX fits; this is a {fit.model.title}")
     return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
 
 

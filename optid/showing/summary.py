@@ -43,6 +43,8 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
     because = f": {reason}" if reason else ""
     if solution.status not in (Status.LOCAL, Status.OPTIMAL):
         return "bad", word, f"The solver stopped early{because}. Read the figures below with care."
+    if fit.procedure and because:
+        return "fair", word, f"Not proved to be the best model of this structure{because}."
     if gap < 1:
         most = f"{100 * gap:.2g} %"
         return "fair", word, f"A local optimum; no model of this structure can lower the objective by more than {most}."
@@ -95,7 +97,8 @@ def certificate_facts(fit: "Fit") -> Facts:
         facts.append(("Is it proved", "no: " + (fit.program.note or "this programme has no certificate")))
     else:
         facts.append(("Is it proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
-        facts.append(("Bound", f"{number(s.bound.value, 10)} ({s.bound.method})"))
+        known = np.isfinite(s.bound.value)
+        facts.append(("Bound", f"{number(s.bound.value, 10)} ({s.bound.method})" if known else "none"))
     facts.append(("Objective", number(s.objective, 10)))
     facts.append(("Relative gap", gap_text(s.gap)))
     if r is not None:
@@ -283,7 +286,7 @@ _ROWS = ("rows", "candidates", "condition", "method")
 def _measured(value: Any) -> str:
     """Write a figure of a procedure: a number, a text, or the first entries of an array."""
     if isinstance(value, bool | str) or value is None:
-        return {True: "yes", False: "no", None: "-"}.get(value, str(value))
+        return value if isinstance(value, str) else {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_measured(entry)}" for key, entry in value.items())
     array = np.asarray(value)
