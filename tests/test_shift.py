@@ -100,7 +100,8 @@ def test_close_to_the_best_stable_matrix_of_a_search(radius):
         found = []
         for start in [shift.a, 0.5 * shift.least_squares, *(0.3 * rng.normal(size=(2, 2)) for _ in range(8))]:
             got = minimize(lambda x, u=up, d=down: float(np.sum((u @ x.reshape(2, 2) - d) ** 2)), start.ravel(),
-                           method="SLSQP", constraints={"type": "ineq", "fun": slack}, options={"maxiter": 500, "ftol": 1e-14})
+                           method="SLSQP", constraints={"type": "ineq", "fun": slack},
+                           options={"maxiter": 500, "ftol": 1e-14})
             if np.min(slack(got.x)) > -1e-7:
                 found.append(np.sqrt(got.fun))
         assert shift.bound <= min(found) + 1e-7

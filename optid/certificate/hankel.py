@@ -1,0 +1,178 @@
+"""A lower bound on the simulation error of every state-space model of a given order, from the record alone.
+
+For the simulator with measured feedback, without correction of the state (P2), any model of order n gives
+``H(yhat) = Gamma X + T H(phi)`` with ``phi = [eta(u); zeta(y)]``: projected off the rows of H(phi) and the constant,
+the block Hankel matrix of its outputs has rank n at most, whatever A, B, C, D, E, offsets and initial states. A sample
+stands in at most alpha of its columns. Hence (Eckart and Young on the projected outputs)
+
+    ‖y - yhat‖² >= (1/alpha) sum_{i>n} sigma_i²( H(y) Pi_perp )        for every number alpha of block rows.
+
+It holds for that simulator alone. Predictors that use y through an observer gain (one-step and innovation forms) reach
+errors below it, and a free run feeds its own outputs back, for which phi is not known: both are refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import RankError, StructureError
+from optid.solution import Bound, relative_gap
+from optid.subspace.hankel import Expand, hankel_statistics
+
+CRITERIA = ("measured feedback", "simulation", "one-step", "innovation", "free run")
+"""What an error may have been measured with; "simulation" is that of a model without feedback."""
+
+MOST_ROWS = 60  # block rows tried where none are given
+ROUNDING = {"qr": 1e-13, "gram": 1e-15}  # of the projected energy, the second per squared condition number
+
+
+@dataclass(frozen=True, eq=False)
+class HankelBounds:
+    """Lower bounds for several numbers of block rows and all orders.
+
+    Attributes:
+        block_rows: the alphas that were tried.
+        values: (len(block_rows), orders) squared error, in squared units of the (weighted) outputs; column n is for
+            models of order n; NaN where alpha is too small to say anything about n.
+        energy: squared norm of the weighted outputs over the samples in complete windows, the yardstick.
+        feedback: whether functions of the output are among the regressors.
+    """
+
+    block_rows: tuple[int, ...]
+    values: Array
+    energy: float
+    feedback: bool
+
+    def value(self, n: int) -> tuple[float, int]:
+        """Return the largest bound for order n and its number of block rows.
+
+        Raises:
+            StructureError: an order the record was not examined for.
+        """
+        if not 0 <= n < self.values.shape[1]:
+            raise StructureError(f"bounds exist for the orders 0 to {self.values.shape[1] - 1}; got {n!r}")
+        column = self.values[:, n]
+        if np.all(np.isnan(column)):
+            return 0.0, self.block_rows[-1]
+        best = int(np.nanargmax(column))
+        return float(column[best]), self.block_rows[best]
+
+    def smallest_order(self, error: float) -> int:
+        """Return the least order that the bounds allow for a squared error, or one more than they examine."""
+        allowed = [n for n in range(self.values.shape[1]) if self.value(n)[0] <= error]
+        return allowed[0] if allowed else self.values.shape[1]
+
+    def bound(self, n: int, error: float, criterion: str = "measured feedback") -> Bound:
+        """Return the certificate of a fit of order n.
+
+        Args:
+            n: order of the model.
+            error: squared error it reached over the whole record, in the units of the bound.
+            criterion: how that error was measured, one of `CRITERIA`.
+
+        Raises:
+            StructureError: a criterion the bound does not hold for, or a model that does better than the bound, which
+                then was measured otherwise than stated.
+        """
+        check_criterion(criterion, self.feedback)
+        value, rows = self.value(n)
+        if error < value * (1 - 1e-9) - 1e-12 * self.energy:
+            raise StructureError(f"an error of {error:.6g} lies below the bound {value:.6g} for order {n}: it was not "
+                                 f"measured by the simulator with {criterion} on this record and these functions")
+        gap = relative_gap(error, value, self.energy)
+        proved = gap < 1e-6
+        need = self.smallest_order(error)
+        reason = f"no model of order {n} with these functions simulates with a squared error below {value:.4g}"
+        if need == n and n:
+            reason += f"; order {n - 1} cannot reach what order {n} reached"
+        return Bound(value, proved, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
+
+
+def check_criterion(criterion: str, feedback: bool) -> None:
+    """Refuse errors the bound says nothing about.
+
+    Raises:
+        StructureError: an unknown criterion, one-step or innovation form, or a free run with feedback.
+    """
+    if criterion not in CRITERIA:
+        raise StructureError(f"the criterion is one of {', '.join(CRITERIA)}; got {criterion!r}")
+    if criterion in ("one-step", "innovation"):
+        raise StructureError(f"the Hankel bound does not hold for {criterion} errors: a predictor that corrects its "
+                             "state by measured outputs can do better. Give the error of the simulation with measured "
+                             "feedback")
+    if feedback and criterion in ("free run", "simulation"):
+        raise StructureError("the Hankel bound does not hold for a free run with nonlinear feedback, which feeds its "
+                             "own outputs back. Give the error of the simulation with measured feedback")
+
+
+def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Sequence[int], outputs: Sequence[int],
+                  feedback: Sequence[int] = (), largest: int = 10, block_rows: Sequence[int] | None = None,
+                  weights: Array | None = None) -> HankelBounds:
+    """Bound the simulation error of every model of order 0 to ``largest``.
+
+    Windows that touch a missing sample are left out, which keeps the bound valid: it then speaks about fewer samples.
+
+    Args:
+        records: one array (N, c) of raw channels per experiment, NaN = missing.
+        expand: raw channels -> signals, as in `optid.subspace.hankel.hankel_statistics`; None for the channels.
+        inputs: positions of the functions of the inputs among the signals.
+        outputs: positions of the outputs.
+        feedback: positions of the functions of the outputs that are fed back; a linear function of the outputs among
+            them makes the bound zero.
+        largest: largest order of interest.
+        block_rows: the alphas to try; by default up to six that the record supports.
+        weights: (l,) by which the outputs are multiplied in the error.
+
+    Raises:
+        StructureError: a number of block rows below two.
+        RankError: the record is too short for any of them.
+    """
+    signals = (expand or (lambda raw: raw))(np.asarray(records[0], dtype=float)[:1]).shape[1]
+    tried = _alphas(records, signals, largest) if block_rows is None else tuple(sorted({int(a) for a in block_rows}))
+    if not tried or tried[0] < 2:
+        raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
+    scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
+    values, energy = np.full((len(tried), largest + 1), np.nan), 0.0
+    for position, alpha in enumerate(tried):
+        statistics = hankel_statistics(records, alpha, expand, centre="mean")
+        known = np.concatenate([[0], statistics.at(inputs), statistics.at(feedback, range(alpha - 1))]).astype(int)
+        order = np.concatenate([known, statistics.at(outputs)])
+        if statistics.windows <= known.size:
+            continue
+        triangle = statistics.triangle(order)[:, known.size :] * np.tile(scales, alpha)
+        whole = float(np.sum(triangle**2)) / alpha
+        left = np.linalg.svd(triangle[known.size :], compute_uv=False) ** 2
+        slack = ROUNDING[statistics.method] * (statistics.condition**2 if statistics.method == "gram" else 1.0)
+        tails = np.concatenate([np.cumsum(left[::-1])[::-1], np.zeros(largest + 1)])[: largest + 1] / alpha
+        values[position] = np.maximum(tails - slack * max(statistics.windows, 1) ** 0.5 * whole, 0.0)
+        values[position, left.size :] = np.nan
+        energy = max(energy, whole)
+    if np.all(np.isnan(values)):
+        raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of {signals} "
+                        "signals; use a longer record or fewer functions")
+    return HankelBounds(tried, values, energy, bool(len(feedback)))
+
+
+def attach(evidence: Any, bounds: HankelBounds, n: int, error: float, criterion: str) -> Any:
+    """Return the evidence of a procedure with the Hankel bound in place of its own.
+
+    Args:
+        evidence: `optid.solving.Evidence` whose objective is that error.
+        bounds: of the same record, functions and weights.
+        n: order of its model.
+        error: squared error of the model on the record.
+        criterion: how it was measured.
+
+    Raises:
+        StructureError: as in `HankelBounds.bound`.
+    """
+    return replace(evidence, bound=bounds.bound(n, error, criterion))
+
+
+def _alphas(records: Sequence[Array], signals: int, largest: int) -> tuple[int, ...]:
+    length = max(len(record) for record in records)
+    most = max(2, min(MOST_ROWS, length // (3 * max(signals, 1))))
+    return tuple(int(a) for a in np.unique(np.round(np.geomspace(min(largest + 2, most), most, 6))))

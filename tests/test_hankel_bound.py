@@ -1,0 +1,178 @@
+"""The Hankel bound: below the error of every model of its order, and refused where it does not hold."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from optid.certificate.hankel import CRITERIA, attach, hankel_bounds
+from optid.errors import RankError, StructureError
+from optid.solution import Bound, Status
+from optid.solving import Evidence
+
+
+def simulate(a, b, c, d, phi, x0, offset_x, offset_y):
+    x, found = np.array(x0, dtype=float), np.empty((len(phi), len(c)))
+    for k, row in enumerate(phi):
+        found[k] = c @ x + d @ row + offset_y
+        x = a @ x + b @ row + offset_x
+    return found
+
+
+def random_model(rng, n, m, l, feedback=0):  # noqa: E741
+    a = rng.normal(size=(n, n))
+    a *= rng.uniform(0.3, 0.98) / max(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0), 1e-9) if n else 1.0
+    d = rng.normal(size=(l, m))
+    d[:, m - feedback :] = 0.0
+    return a, rng.normal(size=(n, m)), rng.normal(size=(l, n)), d
+
+
+@given(st.integers(0, 3), st.integers(0, 10_000), st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_no_random_model_beats_the_bound(n, seed, gaps):
+    """The data are near one model of order n; that model, and others of the order, have their errors measured."""
+    rng = np.random.default_rng(seed)
+    m, l, counts = 2, 2, (60, 45)  # noqa: E741
+    models = [random_model(rng, n, m, l) for _ in range(2)]
+    records, phis = [], []
+    for count in counts:
+        phi = rng.normal(size=(count, m))
+        y = simulate(*models[0], phi, 3 * rng.normal(size=n), rng.normal(size=n), rng.normal(size=l))
+        y += 0.3 * rng.normal(size=y.shape)
+        if gaps:
+            y[rng.integers(count, size=2), rng.integers(l, size=2)] = np.nan
+        records.append(np.hstack([phi, y]))
+        phis.append(phi)
+    bounds = hankel_bounds(records, None, inputs=range(m), outputs=range(m, m + l), largest=4, block_rows=(3, 5, 8))
+    for model in models:
+        for _ in range(3):
+            changed = [part + 0.05 * rng.normal(size=part.shape) for part in model]
+            offsets = rng.normal(size=n), rng.normal(size=l)
+            error = 0.0
+            for record, phi in zip(records, phis):
+                difference = record[:, m:] - simulate(*changed, phi, rng.normal(size=n), *offsets)
+                error += float(np.nansum(difference**2))
+            assert np.all(bounds.values[:, n] <= error + 1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_no_fitted_model_beats_the_bound(n):
+    """Every parameter, offsets and initial state included, fitted by least squares from many starts."""
+    rng = np.random.default_rng(n)
+    count = 80
+    phi = rng.normal(size=(count, 1))
+    truth = random_model(rng, 3, 1, 1)
+    y = simulate(*truth, phi, rng.normal(size=3), np.zeros(3), np.array([2.0])) + 0.1 * rng.normal(size=(count, 1))
+    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3, block_rows=range(3, 20))
+
+    def error(x):
+        a, b, c = x[: n * n].reshape(n, n), x[n * n : n * n + n][:, None], x[n * n + n : n * n + 2 * n][None]
+        d, offset, x0 = x[-n - 2 : -n - 1][None], x[-n - 1 : -n], x[-n:]
+        return np.clip(np.nan_to_num(simulate(a, b, c, d, phi, x0, np.zeros(n), offset) - y, nan=1e6), -1e6,
+                       1e6).ravel()
+
+    reached = []
+    for _ in range(25):
+        start = 0.5 * rng.normal(size=n * n + 3 * n + 2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            reached.append(2 * least_squares(error, start, max_nfev=300).cost)
+    assert bounds.value(n)[0] <= min(reached)
+    assert bounds.value(n)[0] > 0.15 * min(reached)  # and it says something
+    assert bounds.value(0)[0] >= bounds.value(1)[0] >= bounds.value(2)[0]
+    assert bounds.smallest_order(min(reached)) <= n
+
+
+def test_feedback_from_measured_outputs_is_among_the_regressors():
+    """An error of the P2 simulator obeys the bound; the last block row of the feedback cannot reach the output."""
+    rng = np.random.default_rng(0)
+    a, b, c = np.array([[0.7, 0.3], [-0.3, 0.7]]), np.array([[1.0], [0.5]]), np.array([[1.0, 0.0]])
+    e = np.array([[0.3], [-0.4]])
+    u, x, y = rng.uniform(-2, 2, (400, 1)), np.zeros(2), np.zeros((400, 1))
+    for k in range(400):
+        y[k] = c @ x + 0.1 * rng.normal()
+        x = a @ x + b @ u[k] - e @ np.tanh(y[k]) + 0.05 * rng.normal(size=2)
+    raw = np.hstack([u, y])
+
+    def expand(raw):
+        return np.hstack([raw[:, :1], np.tanh(raw[:, 1:]), raw[:, 1:]])
+
+    arguments = {"inputs": [0], "feedback": [1], "outputs": [2], "block_rows": (4, 8, 15), "largest": 3}
+    bounds = hankel_bounds([raw], expand, **arguments)
+    simulated = simulate(a, np.hstack([b, -e]), c, np.zeros((1, 2)), expand(raw)[:, :2], np.zeros(2), 0.0, 0.0)
+    error = float(np.sum((y - simulated) ** 2))
+    assert 0 < bounds.value(2)[0] <= error
+    assert bounds.value(1)[0] > 1.5 * bounds.value(2)[0]
+    without = hankel_bounds([raw], expand, **{**arguments, "feedback": []})
+    assert np.all(without.values >= bounds.values - 1e-9)
+    # a linear function of the output among the regressors leaves nothing to bound
+    assert hankel_bounds([raw], expand, **{**arguments, "feedback": [1, 2]}).value(0)[0] < 0.35 * bounds.value(0)[0]
+
+
+def ar_plus_input(count=2000):
+    """y(k) = 0.9 y(k-1) + u(k-1) + e(k): a one-step predictor of order one leaves e, a simulator e / (1 - 0.9 q)."""
+    rng = np.random.default_rng(0)
+    u, e = rng.normal(size=count), rng.normal(size=count)
+    y = np.zeros(count)
+    for k in range(1, count):
+        y[k] = 0.9 * y[k - 1] + u[k - 1] + e[k]
+    return u, y, e
+
+
+def test_one_step_errors_lie_below_the_bound_and_are_refused():
+    u, y, e = ar_plus_input()
+    bounds = hankel_bounds([np.column_stack([u, y])], None, inputs=[0], outputs=[1], block_rows=(40,), largest=2)
+    one_step = float(np.sum(e[1:] ** 2))
+    assert bounds.value(1)[0] > 1.5 * one_step  # the counterexample: it is no bound on that error
+    for criterion in ("one-step", "innovation"):
+        with pytest.raises(StructureError, match=f"does not hold for {criterion} errors"):
+            bounds.bound(1, one_step, criterion)
+    with pytest.raises(StructureError, match="was not measured by the simulator"):
+        bounds.bound(1, one_step, "measured feedback")
+    simulated = np.zeros(len(u))
+    for k in range(1, len(u)):
+        simulated[k] = 0.9 * simulated[k - 1] + u[k - 1]
+    error = float(np.sum((y - simulated) ** 2))
+    assert bounds.bound(1, error, "simulation").value <= error
+
+
+def test_attached_to_simulation_errors_alone():
+    rng = np.random.default_rng(1)
+    raw = rng.normal(size=(200, 3))
+    bounds = hankel_bounds([raw], None, inputs=[0], feedback=[1], outputs=[2], largest=2)
+    evidence = Evidence(None, 500.0, Bound(-np.inf, False, "none"), Status.LOCAL)
+    found = attach(evidence, bounds, 1, 500.0, "measured feedback")
+    assert found.bound.value == bounds.value(1)[0] and found.bound.method.startswith("Hankel")
+    for criterion in set(CRITERIA) - {"measured feedback"}:
+        with pytest.raises(StructureError, match="does not hold"):
+            attach(evidence, bounds, 1, 500.0, criterion)
+    with pytest.raises(StructureError, match="the criterion is one of"):
+        bounds.bound(1, 500.0, "multi-step")
+
+
+def test_weights_and_units():
+    rng = np.random.default_rng(2)
+    raw = rng.normal(size=(150, 3))
+    plain = hankel_bounds([raw], None, inputs=[0], outputs=[1, 2], block_rows=(5,), largest=2)
+    scaled = hankel_bounds([raw * [1, 10, 0.1] + [0, 1e3, -5]], None, inputs=[0], outputs=[1, 2], block_rows=(5,),
+                           largest=2, weights=np.array([0.1, 10.0]))
+    assert np.allclose(plain.values, scaled.values, rtol=1e-6)
+
+
+def test_exact_data_are_bounded_by_nothing():
+    rng = np.random.default_rng(3)
+    phi = rng.normal(size=(300, 1))
+    y = simulate(*random_model(rng, 2, 1, 1), phi, np.ones(2), np.ones(2), np.ones(1))
+    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3)
+    assert bounds.value(2)[0] <= 1e-9 * bounds.energy and bounds.value(1)[0] > 1e-6 * bounds.energy
+    assert bounds.smallest_order(1e-9 * bounds.energy) == 2
+
+
+@pytest.mark.parametrize("call, error, words", [
+    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], block_rows=(1,)), StructureError, "two block"),
+    (lambda raw: hankel_bounds([raw[:30]], None, inputs=[0], outputs=[1], block_rows=(20,)), RankError, "too few"),
+    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], largest=2).value(7), StructureError, "0 to 2"),
+])
+def test_bad_arguments(call, error, words):
+    with pytest.raises(error, match=words):
+        call(np.random.default_rng(0).normal(size=(100, 2)))
