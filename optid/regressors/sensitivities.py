@@ -61,11 +61,13 @@ class Unknowns:
         layout: orders and bases; one output.
         experiments: number of experiments.
         free: whether the coefficients of every nonlinearity are unknown; where not, mu is one (`Linear`).
+        constant: whether the offset is unknown; where not, it is zero.
     """
 
     layout: Layout
     experiments: int
     free: tuple[bool, ...]
+    constant: bool = True
 
     @property
     def memory(self) -> int:
@@ -79,7 +81,7 @@ class Unknowns:
         for c, (basis, nb) in enumerate(zip(self.layout.bases, self.layout.nb)):
             parts += [(f"mu{c}", basis.size if self.free[c] else 0), (f"b{c}", nb)]
         found, position = {}, 0
-        for name, size in [*parts, ("offset", 1)]:
+        for name, size in [*parts, ("offset", int(self.constant))]:
             found[name] = slice(position, position + size)
             position += size
         return found
@@ -99,14 +101,14 @@ class Unknowns:
         parts = [point.a]
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
             parts += [mu[: len(mu) if self.free[c] else 0], b]
-        return np.concatenate([*parts, [point.offset], point.x0.ravel()])
+        return np.concatenate([*parts, [point.offset][: int(self.constant)], point.x0.ravel()])
 
     def unpack(self, x: Array) -> PlantPoint:
         """Return the point of x."""
         at = self.slices
         inputs = range(self.layout.m)
         return PlantPoint(x[at["a"]], tuple(x[at[f"mu{c}"]] if self.free[c] else np.ones(1) for c in inputs),
-                          tuple(x[at[f"b{c}"]] for c in inputs), float(x[at["offset"]][0]),
+                          tuple(x[at[f"b{c}"]] for c in inputs), float(np.sum(x[at["offset"]])),
                           x[self.shared :].reshape(self.experiments, self.memory))
 
 
@@ -284,7 +286,8 @@ def _blocks(u: Array, y: Array, unknowns: Unknowns, point: PlantPoint, x0: Array
                 block[:, mus] = run.through_numerator(c)
             for j, lag in enumerate(lags):
                 block[:, head + at[f"b{c}"].start + j] = run.shifted_function(c, lag)
-        block[:, head + at["offset"].start] = run.shifted(run.step, 0)
+        if unknowns.constant:
+            block[:, head + at["offset"].start] = run.shifted(run.step, 0)
         block[:, -1] = output - target
         block[missing] = 0.0
         yield block, count - int(np.count_nonzero(missing))
