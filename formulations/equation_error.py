@@ -6,7 +6,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import cvxpy as cp
 import numpy as np
@@ -22,6 +22,13 @@ from optid.program import Program, View
 from optid.rank_one import RankOne
 from optid.regressors import Layout, Statistics, collect
 from optid.streams import Stream
+
+
+class Compressed(Protocol):
+    """A record compressed to least squares in rank-one blocks."""
+
+    @property
+    def problem(self) -> RankOne: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -254,7 +261,7 @@ def _square_root(matrix: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def residual_programme(problem: EquationError, name: str, variables: dict[str, cp.Variable],
+def residual_programme(problem: Compressed, name: str, variables: dict[str, cp.Variable],
                        residual: cp.Expression, **parts: Any) -> Program:
     """Assemble a programme ``minimise ‖r‖² + remainder (+ penalty)`` with the residual passed as a variable.
 

@@ -30,7 +30,7 @@ from optid.program import View
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
-FACTORED = ("exact", "tangent")  # kinds whose variables are mu and b
+FACTORED = ("exact", "tangent", "realisation")  # kinds whose variables are mu and b
 SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
 
 

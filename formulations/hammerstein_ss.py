@@ -1,0 +1,152 @@
+"""Subspace identification of Hammerstein state-space models, with several channels and nonlinear output feedback.
+
+    x(k+1) = A x + B f(u) + E g(y) + w,    y(k) = C x + D f(u) + d + v
+
+Three methods, each a procedure of the same steps: (A, C) from projections of block Hankel matrices, constraints on the
+poles there; then (x0, B, D, E, d) as one least-squares programme with the constraints on coefficients, rank one per
+channel and certified; then the innovation form from the residuals.
+
+* `sid`: past inputs and outputs as instruments (MOESP; Verhaegen and Dewilde 1992), for open loop.
+* `sivid`: instrumental variables with nonlinear feedback, singular regressors by pseudo-inverse (Luo and
+  Leonessa 2008).
+* `asivid`: instruments augmented by future inputs and by the feedback functions of simulated, noise-free outputs, which
+  keeps the regressors regular and the estimate consistent under coloured noise.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from formulations.subspace_procedure import NOISES, Plan, identified, one_of
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import StructureError
+from optid.solving import Procedure
+
+Bases = Basis | str | Sequence[Basis | str]
+FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
+
+
+def sid(
+    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
+    noise: str = "white", weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+    observer: str = "auto", split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
+) -> Procedure:
+    """Identify an open-loop system from projections on past inputs and outputs.
+
+    Args:
+        data: the record.
+        nx: order, or "auto".
+        block_rows: block rows of the future, and as many of the past; more than the order. None chooses.
+        basis: basis of the input nonlinearity, one per input or one for all; linear by default.
+        noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
+            alone (consistent under coloured measurement noise).
+        weighting: "moesp" or "cva".
+        offset: estimate a constant; False takes the record as it is.
+        feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
+        observer: for the step in B, D and x0: "none" minimises the simulation error, "kalman" a prediction error,
+            "auto" the first unless A is unstable.
+        split: "exact" keeps every channel rank one in that step (certified), "lumped" splits afterwards (convex).
+        stability: "auto" brings poles of an unstable estimate to modulus 0.999, "free" leaves them.
+        constraints: rules about poles and about coefficients; the variables are those of `formulations.realisation`.
+
+    Raises:
+        StructureError: words or orders that do not fit.
+        RankError: the record does not determine the model; the message names the channel.
+        DataError: a channel that is constant.
+    """
+    one_of("noise", noise, NOISES)
+    instruments = "inputs+past" if noise == "white" else "inputs"
+    plan = Plan("hammerstein_ss.sid", data, nx, block_rows, basis, None, instruments, weighting=weighting,
+                offset=offset, feedthrough=feedthrough, observer=observer, split=split, stability=stability,
+                constraints=tuple(constraints))
+    return identified(plan)
+
+
+def sivid(
+    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
+    feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection", tolerance: float = 0.05,
+    weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
+    split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
+) -> Procedure:
+    """Identify a system with nonlinear feedback by instrumental variables, singular directions left out.
+
+    With past instruments the correlation of instruments and regressors loses rank as the record grows; the directions
+    below `tolerance` are dropped (pseudo-inverse), which is what distinguishes the method from `asivid`.
+
+    Args:
+        data: the record.
+        nx: as in `sid`.
+        block_rows: as in `sid`.
+        basis: as in `sid`.
+        feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
+        instruments: "past", "inputs" or "inputs+past".
+        form: "projection" or "correlation".
+        tolerance: singular value of the projected regressors, relative to the largest, below which a direction is
+            dropped.
+        weighting: as in `sid`.
+        offset: as in `sid`.
+        feedthrough: as in `sid`.
+        observer: as in `sid`.
+        split: as in `sid`.
+        stability: as in `sid`.
+        constraints: as in `sid`.
+
+    Raises:
+        StructureError, RankError, DataError: as `sid`; RankError also where the feedback basis is linear in y.
+
+    Warns:
+        DataWarning: the feedback basis is nearly linear in y.
+    """
+    one_of("instruments", instruments, ("past", "inputs", "inputs+past"))
+    if not 0 <= tolerance < 1:
+        raise StructureError(f"tolerance={tolerance!r}: a number in [0, 1) is needed.")
+    plan = Plan("hammerstein_ss.sivid", data, nx, block_rows, basis, feedback_basis, instruments, form=form,
+                tolerance=max(tolerance, 1e-10), weighting=weighting, offset=offset, feedthrough=feedthrough,
+                observer=observer, split=split, stability=stability, constraints=tuple(constraints))
+    return identified(plan)
+
+
+def asivid(
+    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
+    feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
+    weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
+    split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
+) -> Procedure:
+    """Identify a system with nonlinear feedback with instruments augmented by simulated, noise-free feedback.
+
+    Args:
+        data: the record.
+        nx: as in `sid`.
+        block_rows: as in `sid`.
+        basis: as in `sid`.
+        feedback_basis: as in `sivid`.
+        noise: "coloured" keeps measured outputs out of the instruments; "white" adds the past of the outputs and of
+            their feedback functions.
+        iterations: simulations of the feedback with a preliminary model: the first with a model without feedback; 0
+            uses past and future inputs (and with noise="white" the past outputs) alone.
+        form: as in `sivid`.
+        weighting: as in `sid`.
+        offset: as in `sid`.
+        feedthrough: as in `sid`.
+        observer: as in `sid`.
+        split: as in `sid`.
+        stability: as in `sid`.
+        constraints: as in `sid`.
+
+    Raises:
+        StructureError, RankError, DataError: as `sivid`.
+
+    Warns:
+        DataWarning: the feedback basis is nearly linear in y.
+    """
+    one_of("noise", noise, NOISES)
+    if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 0:
+        raise StructureError(f"iterations={iterations!r}: a whole number from 0 is needed.")
+    kind = "simulated" if iterations else "inputs"
+    plan = Plan("hammerstein_ss.asivid", data, nx, block_rows, basis, feedback_basis,
+                kind + ("+past" if noise == "white" else ""), form=form, iterations=int(iterations),
+                weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
+                stability=stability, constraints=tuple(constraints))
+    return identified(plan)

@@ -1,0 +1,284 @@
+"""The steps that the subspace methods of `formulations.hammerstein_ss` share."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from formulations.equation_error import model_meta
+from formulations.realisation import Factors, realisation_programme
+from formulations.shift import constrained_shift
+from formulations.stability import stable
+from optid.bases import fitted_bases, parse
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import DataError, DataWarning, StructureError
+from optid.models import Nonlinearity
+from optid.models.hammerstein_ss import HammersteinSS
+from optid.solution import Bound, Solution, Status
+from optid.solving import Evidence, Procedure
+from optid.subspace.channels import check_channels
+from optid.subspace.expansion import Expansion, expand
+from optid.subspace.innovations import model_innovations
+from optid.subspace.methods import (
+    Projection,
+    check_order,
+    check_signal,
+    default_block_rows,
+    project,
+    simulate_clipped,
+)
+from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
+from optid.subspace.realisation import largest_gap, realise
+
+OBSERVERS = ("auto", "none", "kalman")
+NOISES = ("white", "coloured")
+SPLITS = ("exact", "lumped")
+STABILITIES = ("auto", "free")
+INSIDE = 0.999
+"""Modulus to which poles outside the unit circle are brought by ``stability="auto"``."""
+
+
+def one_of(name: str, value: str, known: Sequence[str]) -> None:
+    """Refuse a word that is not known."""
+    if value not in known:
+        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a method is asked for."""
+
+    name: str
+    data: Data
+    nx: int | str
+    block_rows: int | None
+    basis: Any
+    feedback_basis: Any
+    instruments: str
+    form: str = "projection"
+    tolerance: float | None = None
+    iterations: int = 0
+    weighting: str = "moesp"
+    offset: bool = True
+    feedthrough: Any = True
+    observer: str = "auto"
+    split: str = "exact"
+    stability: str = "auto"
+    constraints: tuple[Any, ...] = ()
+    records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("observer", self.observer, OBSERVERS), ("split", self.split, SPLITS),
+                                   ("stability", self.stability, STABILITIES)):
+            one_of(name, value, known)
+        if not isinstance(self.data, Data):
+            raise DataError(f"{self.name} needs records in memory (optid.Data), not a {type(self.data).__name__}.")
+        if not (self.nx == "auto" or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
+            raise StructureError(f"nx={self.nx!r}: a whole number from 1, or 'auto'.")
+        self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
+
+    @property
+    def order(self) -> int | None:
+        """The order asked for; None where it is to be found."""
+        return None if isinstance(self.nx, str) else int(self.nx)
+
+    def about(self, what: str) -> tuple[Any, ...]:
+        """Constraints about "poles" or about "coefficients"."""
+        return tuple(rule for rule in self.constraints
+                     if what in getattr(rule, "about", frozenset({"coefficients"})))
+
+    def direct(self) -> tuple[bool, ...]:
+        """Feedthrough of every input."""
+        m = self.data.m
+        given = [self.feedthrough] * m if isinstance(self.feedthrough, bool) else list(self.feedthrough)
+        if len(given) != m or not all(isinstance(one, bool | np.bool_) for one in given):
+            raise StructureError(f"feedthrough={self.feedthrough!r}: True or False, or one of them per input "
+                                 f"({', '.join(self.data.inputs)}).")
+        return tuple(bool(one) for one in given)
+
+
+def _feedback_bases(data: Data, given: Any) -> list[Basis | None]:
+    """Return one basis with an interval, or None, per output."""
+    several = list(given) if isinstance(given, list | tuple) else [given] * data.l
+    if len(several) != data.l:
+        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
+                             "one each, None for an output that is not fed back.")
+    found: list[Basis | None] = []
+    for o, one in enumerate(several):
+        if one is None or one == "none":
+            found.append(None)
+            continue
+        family: Any = parse(one) if isinstance(one, str) else one
+        if not hasattr(family, "fitted"):
+            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
+                                 "Polynomial(4) or its name, 'polynomial:4'")
+        y = np.concatenate([e.y[:, o] for e in data.experiments])
+        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
+    return found
+
+
+def identified(plan: Plan) -> Procedure:
+    """Run the steps of a plan: project, find the order, choose (A, C), then B, D, E and x0, then the noise model.
+
+    Yields:
+        The programmes of the steps under constraints and of the step in B, D, E and x0.
+
+    Returns:
+        The model with singular values, condition of R11 and further figures.
+    """
+    data = plan.data
+    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
+                       data.inputs, data.outputs)
+    check_channels(plan.records, data.inputs, data.outputs)
+    alpha = _block_rows(plan, expansion)
+    records, instruments = plan.records, plan.instruments
+    if instruments.startswith("simulated"):
+        if expansion.q:
+            records, expansion = _simulated(plan, expansion, alpha)
+        else:
+            instruments = instruments.replace("simulated", "inputs")
+    projection = _projected(plan, records, expansion, alpha, instruments)
+    nx, gap = _order(plan, projection)
+    gamma = projection.gamma(nx)
+    a, c = realise(gamma, data.l)
+    shift_figures: dict[str, Any] = {}
+    rules = plan.about("poles")
+    unstable = plan.stability == "auto" and float(np.max(np.abs(np.linalg.eigvals(a)))) >= 1
+    if rules or unstable:
+        shift = yield from constrained_shift(gamma[: -data.l], gamma[data.l :], rules or (stable(INSIDE),))
+        if shift.a is None:
+            return Evidence(None, float("nan"), Bound(-np.inf, False, "none", shift.reason), shift.status, shift.reason)
+        if shift.applied:
+            shift_figures = {"suboptimality of A under the pole constraints": shift.suboptimality}
+            if not rules:
+                radius = np.max(np.abs(np.linalg.eigvals(a)))
+                warnings.warn(f"the subspace estimate of A is unstable (largest modulus {radius:.4g}): its poles were "
+                              f"brought to modulus {INSIDE}. Use stability='free' for a plant that is unstable without "
+                              "its feedback.", DataWarning, stacklevel=2)
+        a = shift.a
+    step = _step(plan, records, expansion, a, c, projection.scale)
+    realisation, program = realisation_programme(step, plan.name, plan.about("coefficients"),
+                                                 factored=plan.split == "exact")
+    solution: Solution = yield program
+    if not solution.has_point:
+        return Evidence(None, float("nan"), Bound(-np.inf, False, "none", solution.reason), solution.status,
+                        solution.reason)
+    model = _model(plan, step, realisation.factors(solution.values))
+    model, remark = model_innovations(model, data)
+    figures = {"order": nx, "block rows": alpha, "instruments": instruments,
+               "singular values": projection.range.values, "gap of singular values": gap,
+               "condition of R11": projection.blocks.condition, **shift_figures, **_ratios(step)}
+    if remark:
+        figures["noise model"] = remark
+    if projection.blocks.discarded:
+        figures["regressor directions left out"] = projection.blocks.discarded
+    return Evidence(model, solution.objective, _bound(solution), _status(solution), solution.reason, figures)
+
+
+def _block_rows(plan: Plan, expansion: Expansion) -> int:
+    given, nx = plan.block_rows, plan.order
+    if given is None:
+        alpha = default_block_rows(plan.records, expansion, nx)
+    elif isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 2:
+        raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order.")
+    else:
+        alpha = int(given)
+    if nx is not None:
+        check_order(nx, alpha, plan.data.l)
+    return alpha
+
+
+def _projected(plan: Plan, records: list[np.ndarray], expansion: Expansion, alpha: int, instruments: str
+               ) -> Projection:
+    return project(records, expansion, alpha, instruments=instruments, offset=plan.offset, form=plan.form,
+                   tolerance=plan.tolerance, weighting=plan.weighting)
+
+
+def _order(plan: Plan, projection: Projection) -> tuple[int, float]:
+    """Return the order, and the ratio of the singular values on its two sides."""
+    values = projection.range.values
+    nx = plan.order
+    if nx is None:
+        nx = largest_gap(values, min(projection.block_rows - 1, values.size // 2))
+    check_signal(projection, nx)
+    following = values[nx] if nx < values.size else 0.0
+    return nx, float(values[nx - 1] / following) if following > 0 else float("inf")
+
+
+def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
+          scale: np.ndarray) -> ObserverProblem:
+    unstable = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) >= 1
+    closed = plan.observer == "kalman" or (plan.observer == "auto" and unstable)
+    gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
+    form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / scale)
+    return observer_problem(records, form, instruments=expansion.simulated)
+
+
+def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.ndarray], Expansion]:
+    """Return the records with outputs simulated by a preliminary model, and the expansion that reads them."""
+    raw, model = plan.records, expansion.without_feedback()
+    records, kind = raw, "inputs"
+    for _ in range(plan.iterations):
+        projection = _projected(plan, records, model, alpha, kind)
+        nx, _ = _order(plan, projection)
+        a, c = realise(projection.gamma(nx), plan.data.l)
+        step = _step(plan, records, model, _inside(a), c, projection.scale)
+        bu, du, ez, d, _ = step.matrices(step.least_squares())
+        outputs = simulate_clipped(raw, model, _inside(a), c, bu, du, ez, d)
+        records = [np.hstack([record, y]) for record, y in zip(raw, outputs)]
+        model, kind = expansion.with_simulated(), plan.instruments
+    return records, model
+
+
+def _inside(a: np.ndarray) -> np.ndarray:
+    """Contract an unstable preliminary A: its simulation only serves as an instrument."""
+    radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
+    return a if radius < 1 else a * (INSIDE / radius)
+
+
+def _model(plan: Plan, step: ObserverProblem, factors: Factors) -> HammersteinSS:
+    form, data = step.form, plan.data
+    n, l = form.n, form.l  # noqa: E741
+    b = np.column_stack([part[:n] for part in factors.bs])
+    d = np.column_stack([part[n:] if len(part) > n else np.zeros(l) for part in factors.bs])
+    functions = [Nonlinearity(basis, mu) for basis, mu in zip(form.expansion.inputs, factors.mus)]
+    families = form.expansion.feedback
+    feedback = [Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, factors.nus)]
+    injection, constant = np.zeros((n, l)), np.zeros(n)
+    for family, nu, e in zip(families, factors.nus, factors.es):
+        injection -= np.outer(e, nu @ family.slope)
+        constant -= e * (nu @ family.intercept)
+    model = HammersteinSS(
+        A=form.a, B=b, C=form.c, D=d, nonlinearities=tuple(functions),
+        E=np.column_stack(factors.es) if families else None, feedback=tuple(feedback),
+        output_of=tuple(family.output for family in families), L=injection, offset_x=constant, offset_y=factors.offset,
+        **model_meta(data))
+    return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
+
+
+def _ratios(step: ObserverProblem) -> dict[str, float]:
+    """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
+    x = step.form.expansion
+    z = step.least_squares()
+    names = [f"channel {name}" for name in x.input_names]
+    names += [f"feedback of {x.output_names[family.output]}" for family in x.feedback]
+    found = {}
+    for i, (name, shape) in enumerate(zip(names, step.form.blocks)):
+        if min(shape) > 1:
+            values = np.linalg.svd(z[step.form.block(i)].reshape(shape, order="F"), compute_uv=False)
+            found[f"second over first singular value, {name}"] = float(values[1] / values[0])
+    return found
+
+
+def _bound(solution: Solution) -> Bound:
+    said = "the (A, C) step minimises no criterion of the whole model"
+    if solution.proof:
+        said += "; for this (A, C) the coefficients are proved optimal"
+    return Bound(-np.inf, False, "none", said)
+
+
+def _status(solution: Solution) -> Status:
+    return Status.LOCAL if solution.status is Status.OPTIMAL else solution.status

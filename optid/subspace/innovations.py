@@ -1,0 +1,152 @@
+"""The innovation form of a subspace model: the noise model that its prediction errors call for.
+
+With F = A - L C the errors of the observer with gain L obey r = C (qI - F)^-1 (K - L) e + e, linear in K once the
+innovations e are known; these are the residuals of a long autoregression of r (Hannan and Rissanen 1982). The Riccati
+equation then gives the stabilising gain of the same spectrum.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import StructureError
+from optid.models.kalman import kalman_gain
+from optid.models.noise_covariances import NoiseCovariances
+from optid.regressors.factors import add_to_root
+from optid.subspace.observer import observer_gain
+
+if TYPE_CHECKING:
+    from optid.data import Data
+    from optid.models.hammerstein_ss import HammersteinSS
+
+LONGEST = 40
+"""Lags of the autoregression at most."""
+
+
+def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["HammersteinSS", str]:
+    """Return the model with K and the covariances of its noises, or unchanged with the reason why there are none.
+
+    Args:
+        model: a model in the units of the data.
+        data: the record it was identified on.
+    """
+    gain = observer_gain(model.A, model.C)
+    errors = []
+    for e in data.experiments:
+        for u, y in _complete(e.u, e.y):
+            drive = model.expanded(u) @ model.B.T + y @ model.L.T + model.offset_x
+            for column, g, o in zip(model.E.T, model.feedback, model.output_of):
+                drive = drive + np.outer(g(y[:, o]), column)
+            direct = model.expanded(u) @ model.D.T + model.offset_y
+            errors.append(prediction_errors(model.A, model.C, gain, drive, direct, y))
+    try:
+        k, noise = innovation_form(model.A, model.C, gain, errors)
+    except StructureError as reason:
+        return model, f"none: {reason}"
+    return replace(model, K=k, noise=noise), ""
+
+
+def _complete(u: Array, y: Array) -> list[tuple[Array, Array]]:
+    """Cut a record into stretches without missing samples."""
+    present = ~(np.isnan(u).any(axis=1) | np.isnan(y).any(axis=1))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
+    return [(u[start:stop], y[start:stop]) for start, stop in edges.reshape(-1, 2)]
+
+
+def prediction_errors(a: Array, c: Array, gain: Array, drive: Array, direct: Array, y: Array) -> Array:
+    """Return y - yhat of the observer x+ = (A - L C) x + drive + L (y - direct), its initial state fitted, (T, l).
+
+    Args:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) observer gain L with stable A - L C.
+        drive: (T, n) known terms of the state equation.
+        direct: (T, l) known terms of the output equation.
+        y: (T, l) outputs, NaN = missing (allowed with L = 0 only).
+    """
+    from optid.subspace.kernels import state_run
+
+    inner = np.ascontiguousarray(a - gain @ c)
+    known = np.ascontiguousarray(drive + (y - direct) @ gain.T if np.any(gain) else drive)
+    x = np.empty((len(y), len(a)))
+    state_run(inner, known, np.zeros(len(a)), x)
+    errors = y - x @ c.T - direct
+    count = min(len(y), _settling(inner))
+    free = np.empty((count, len(a), len(a)))
+    power = np.eye(len(a))
+    for k in range(count):
+        free[k] = power
+        power = inner @ power
+    responses = np.einsum("on,kns->kos", c, free)
+    present = ~np.isnan(errors[:count])
+    x0 = np.linalg.lstsq(responses[present], errors[:count][present], rcond=None)[0]
+    errors[:count] -= responses @ x0
+    return errors
+
+
+def _settling(inner: Array) -> int:
+    """Samples after which the initial state of an observer is forgotten, at most 2000."""
+    radius = float(np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0))
+    return 2000 if radius >= 0.99 else int(min(2000, 10 + len(inner) + np.log(1e-8) / np.log(max(radius, 0.1))))
+
+
+def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) -> tuple[Array, NoiseCovariances]:
+    """Return K (n, l) and the covariances of the noises from the errors of an observer.
+
+    Args:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) gain L of the observer.
+        errors: (T, l) its prediction errors, one array per complete run of samples.
+
+    Raises:
+        StructureError: errors that determine no gain: too few, zero, or on the stability limit.
+    """
+    from optid.subspace.kernels import adjoint_responses
+
+    (n, l), total = gain.shape, sum(map(len, errors))  # noqa: E741
+    lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))
+    errors = [part for part in errors if len(part) > 2 * lags]
+    if not errors or total < 10 * (lags + n) * l:
+        raise StructureError(f"{total} prediction errors are too few for a noise model.")
+    root = np.zeros((lags * l + l, lags * l + l))
+    for part in errors:
+        root = add_to_root(root, _lagged(part, lags))
+    regressive = np.linalg.lstsq(root[: lags * l, : lags * l], root[: lags * l, lags * l :], rcond=None)[0]
+    size = n * l
+    normal = np.zeros((size + 1, size + 1))
+    innovations = [np.concatenate([part[:lags], rows[:, lags * l :] - rows[:, : lags * l] @ regressive])
+                   for part in errors for rows in [_lagged(part, lags)]]
+    spread = np.sqrt(np.mean(np.concatenate([part[lags:] for part in innovations]) ** 2, axis=0))
+    if not np.all(spread > 0):
+        raise StructureError("the prediction errors vanish: there is no noise to model.")
+    inner = np.ascontiguousarray((a - gain @ c).T)
+    for part, e in zip(errors, innovations):
+        out = np.empty((len(part), l, size))
+        adjoint_responses(inner, c, np.ascontiguousarray(e), np.zeros((l, n, l)), out)
+        for o in range(l):
+            rows = np.concatenate([out[lags:, o], (part - e)[lags:, o, None]], axis=1) / spread[o]
+            normal = add_to_root(normal, rows)
+    change = np.linalg.lstsq(normal[:size, :size], normal[:size, size], rcond=None)[0].reshape(n, l)
+    k, rest = gain + change, np.zeros((l, l))
+    count = 0
+    for part, e in zip(errors, innovations):
+        out = np.empty((len(part), l, size))
+        adjoint_responses(inner, c, np.ascontiguousarray(e), np.zeros((l, n, l)), out)
+        final = (part - out @ change.ravel())[lags:]
+        rest += final.T @ final
+        count += len(final)
+    covariance = rest / count
+    found = kalman_gain(a, c, k @ covariance @ k.T, covariance, k @ covariance)
+    noise = NoiseCovariances(k @ covariance @ k.T, covariance, k @ covariance, found.innovation)
+    return found.K, noise
+
+
+def _lagged(errors: Array, lags: int) -> Array:
+    """Return rows [r(k-1) .. r(k-lags) | r(k)]."""
+    windows = np.lib.stride_tricks.sliding_window_view(errors, lags + 1, axis=0)  # (T - lags, l, lags + 1)
+    past = windows[:, :, -2::-1].transpose(0, 2, 1).reshape(len(windows), -1)
+    return np.concatenate([past, windows[:, :, -1]], axis=1)

@@ -1,0 +1,102 @@
+"""Compiled recursions of the subspace steps."""
+
+import numpy as np
+from numba import njit
+
+from optid.bases.basis import Array
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def adjoint_responses(transposed: Array, outputs: Array, signals: Array, state: Array, out: Array) -> None:
+    """Write the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
+
+    The regressor of output o is the matrix X_o(k) (n, d) with X_o(k + 1) = F^T X_o(k) + C_o^T s(k)^T.
+
+    Args:
+        transposed: (n, n) F^T.
+        outputs: (l, n) C.
+        signals: (T, d) s.
+        state: (l, n, d) X at the first sample; left at the sample after the last.
+        out: (T, l, n d), states outermost, written.
+    """
+    l, n, d = state.shape  # noqa: E741
+    following = np.empty((n, d))
+    for t in range(signals.shape[0]):
+        for o in range(l):
+            for i in range(n):
+                for j in range(d):
+                    out[t, o, i * d + j] = state[o, i, j]
+            for i in range(n):
+                for j in range(d):
+                    following[i, j] = outputs[o, i] * signals[t, j]
+                for h in range(n):
+                    weight = transposed[i, h]
+                    for j in range(d):
+                        following[i, j] += weight * state[o, h, j]
+            state[o] = following
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clipped_run(
+    a: Array, c: Array, drive: Array, direct: Array, tables: Array, injection: Array, low: Array, high: Array,
+    x: Array, out: Array
+) -> None:
+    """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
+
+    Args:
+        a: (n, n).
+        c: (l, n).
+        drive: (T, n) what the inputs add to the state.
+        direct: (T, l) what they add to the outputs.
+        tables: (l, G, n) feedback of output o at G points spread evenly over [low, high]; read with straight lines.
+        injection: (n, l).
+        low: (l,).
+        high: (l,).
+        x: (n,) state at the first sample; left at the sample after the last.
+        out: (T, l) clipped outputs, written.
+    """
+    n, l, last = x.size, low.size, tables.shape[1] - 1  # noqa: E741
+    following = np.empty(n)
+    for t in range(drive.shape[0]):
+        for i in range(n):
+            following[i] = drive[t, i]
+            for h in range(n):
+                following[i] += a[i, h] * x[h]
+        for o in range(l):
+            y = direct[t, o]
+            for i in range(n):
+                y += c[o, i] * x[i]
+            y = min(max(y, low[o]), high[o])
+            out[t, o] = y
+            place = (y - low[o]) / (high[o] - low[o]) * last
+            cell = min(int(place), last - 1)
+            share = place - cell
+            for i in range(n):
+                following[i] += (1 - share) * tables[o, cell, i] + share * tables[o, cell + 1, i] + injection[i, o] * y
+        size = 0.0
+        for i in range(n):
+            size = max(size, abs(following[i]))
+        scale = 1.0 if size < 1e12 else 1e12 / size  # a diverging run stays finite; its outputs sit at the limits
+        for i in range(n):
+            x[i] = following[i] * scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def state_run(a: Array, drive: Array, x: Array, out: Array) -> None:
+    """Write the states of x+ = A x + drive.
+
+    Args:
+        a: (n, n).
+        drive: (T, n).
+        x: (n,) state at the first sample; left at the sample after the last.
+        out: (T, n), written.
+    """
+    n = x.size
+    following = np.empty(n)
+    for t in range(drive.shape[0]):
+        for i in range(n):
+            out[t, i] = x[i]
+            following[i] = drive[t, i]
+            for h in range(n):
+                following[i] += a[i, h] * x[h]
+        x[:] = following

@@ -1,0 +1,335 @@
+"""The least-squares step for (B, D, E, offset, x0) with A and C known, in observer form.
+
+With an observer gain L and F = A - L C the outputs
+
+    y(k) = C F^k x0 + sum_{i<k} C F^(k-1-i) ((B - L D) eta(i) + E zeta(i) + L (y(i) - d)) + D eta(k) + d
+
+are linear in the unknowns, whatever the poles of A. L = 0 minimises the simulation error with measured feedback;
+a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Every complete run
+of samples has its own initial state; those of runs that begin in the middle of an experiment are eliminated.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.bases.basis import Array
+from optid.errors import RankError
+from optid.rank_one import RankOne
+from optid.regressors.factors import add_to_root, conditioning
+from optid.subspace.expansion import Expansion
+
+CHUNK = 4096
+"""Samples whose regressors are formed at once."""
+
+INSTRUMENTED = 2.0
+"""Instruments at least, per unknown, that a two-stage least-squares step needs rows for."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverForm:
+    """What is known and how the unknowns are laid out.
+
+    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
+    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
+
+    Attributes:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) observer gain L.
+        expansion: the signals.
+        experiments: number of experiments.
+        feedthrough: whether every input acts on the outputs at once.
+        offset: whether there is a constant d.
+        weights: (l,) by which the residuals are multiplied.
+    """
+
+    a: Array
+    c: Array
+    gain: Array
+    expansion: Expansion
+    experiments: int
+    feedthrough: tuple[bool, ...]
+    offset: bool
+    weights: Array
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.c)
+
+    @property
+    def linear(self) -> int:
+        """Number of unknowns outside the blocks: initial states and offset."""
+        return self.experiments * self.n + self.l * self.offset
+
+    @property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
+        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
+        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
+
+    def block(self, i: int) -> slice:
+        """Positions of vec Theta_i in z."""
+        sizes = [p * b for p, b in self.blocks]
+        start = self.linear + sum(sizes[:i])
+        return slice(start, start + sizes[i])
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.linear + sum(p * b for p, b in self.blocks)
+
+    def names(self) -> list[str]:
+        """Name the unknowns in words for messages."""
+        x = self.expansion
+        channels = [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+        named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
+        named += ["the offset"] * (self.l * self.offset)
+        for channel, (p, b) in zip(channels, self.blocks):
+            named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
+        return named
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverProblem:
+    """The compressed step.
+
+    Attributes:
+        form: the layout.
+        problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
+        rows: equations used.
+        candidates: equations there would be, were no sample missing.
+        instrumented: whether the normal equations are those of instruments.
+        scale: energy of the weighted outputs about their means.
+    """
+
+    form: ObserverForm
+    problem: RankOne
+    rows: int
+    candidates: int
+    instrumented: bool = False
+    energy: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def condition(self) -> float:
+        """Estimate of the condition number of the scaled regressors."""
+        return conditioning(np.asarray(self.problem.root, dtype=float))
+
+    def least_squares(self) -> Array:
+        """Return the unrestricted minimiser z.
+
+        Raises:
+            RankError: the record does not determine it; names the first unknown that is lost.
+        """
+        root, norms = self.problem.root, np.linalg.norm(self.problem.root, axis=0)
+        lost = np.abs(np.diag(root)) <= 1e-10 * np.where(norms > 0, norms, 1.0)
+        if lost.any():
+            raise RankError(f"The record does not determine {self.form.names()[int(np.argmax(lost))]}: the regressors "
+                            "before it explain its effect. Use a longer or richer record, fewer functions, a lower "
+                            "order, or leave the channel out.")
+        return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
+
+    def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
+        form = self.form
+        x, n, l = form.expansion, form.n, form.l  # noqa: E741
+        bu, du, ez = np.zeros((n, x.p)), np.zeros((l, x.p)), np.zeros((n, x.q))
+        starts = np.cumsum([0, *(p for p, _ in form.blocks)])
+        for i, (p, b) in enumerate(form.blocks):
+            theta = z[form.block(i)].reshape(b, p)
+            if i < x.m:
+                bu[:, starts[i] : starts[i] + p] = theta[:n]
+                if b > n:
+                    du[:, starts[i] : starts[i] + p] = theta[n:]
+            else:
+                ez[:, starts[i] - x.p : starts[i] - x.p + p] = theta
+        x0 = z[: form.experiments * n].reshape(form.experiments, n)
+        return bu, du, ez, z[form.experiments * n : form.linear] if form.offset else np.zeros(l), x0
+
+
+def observer_problem(
+    records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK
+) -> ObserverProblem:
+    """Compress the step.
+
+    Args:
+        records: raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one per experiment; NaN = missing.
+        form: what is known.
+        instruments: take the feedback functions of the simulated outputs as instruments for those of the measured ones
+            (two-stage least squares); the expansion must contain both. For noise that is fed back and not white.
+        chunk: samples whose regressors are formed at once.
+
+    Raises:
+        RankError: fewer equations than unknowns.
+    """
+    regressors = _Regressors(form, instruments, chunk)
+    extra = regressors.extra
+    total = form.experiments * form.n + regressors.common + extra  # [x0 | eta, d | zeta simulated | zeta] and y
+    root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, np.zeros((3, form.l))
+    own = slice(form.experiments * form.n, total + 1)
+    for e, record in enumerate(records):
+        y = record[:, regressors.y]
+        candidates += y.size
+        for start, run in _runs(record, regressors.needed):
+            part, used, sums = regressors.compress(run)
+            rows += used
+            energy += sums
+            if start == 0:
+                wide = np.zeros((len(part), total + 1))
+                wide[:, e * form.n : (e + 1) * form.n] = part[:, : form.n]
+                wide[:, own] = part[:, form.n :]
+                root = add_to_root(root, wide)
+            else:  # a state nobody asks for
+                root[own, own] = add_to_root(root[own, own], part[form.n :, form.n :])
+    if rows < form.size + extra:
+        raise RankError(f"{rows} equations for {form.size + extra} unknowns of the step for B, D and x0: use a longer "
+                        "record, fewer basis functions or a lower order.")
+    feeds, states = regressors.feeds, form.experiments * form.n
+    if extra:  # the equations seen through the instruments: what lies outside them is dropped
+        seen = total - feeds
+        keep = np.r_[: seen - feeds, seen:total, total]
+        system = root[:seen][:, keep]
+    else:
+        system = root
+    turned = system[:, :-1] @ regressors.turn(states)
+    triangle = np.triu(np.linalg.qr(np.column_stack([turned, system[:, -1]]), mode="r"))
+    size = form.size
+    remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
+    spread = energy[2] - energy[1] ** 2 / np.maximum(energy[0], 1)
+    problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear,
+                      float(np.sum(energy[2] * form.weights**2)))
+    return ObserverProblem(form, problem, rows, candidates, bool(extra), spread)
+
+
+def _runs(record: Array, needed: NDArray[np.bool_]) -> Iterator[tuple[int, Array]]:
+    """Yield the start and the samples of every stretch in which the channels needed are complete."""
+    present = ~np.isnan(record[:, needed]).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
+    for start, stop in edges.reshape(-1, 2):
+        yield int(start), record[start:stop]
+
+
+class _Regressors:
+    """Rows of the regression for one run: [x0 | d | D | B | E simulated | E] and the target."""
+
+    def __init__(self, form: ObserverForm, instruments: bool, chunk: int) -> None:
+        self.form, self.chunk = form, chunk
+        x = form.expansion
+        self.injected = bool(np.any(form.gain))
+        self.y = slice(x.m, x.m + x.l)
+        self.feeds = form.n * x.q
+        self.extra = self.feeds if instruments else 0
+        self.common = form.l * form.offset + form.l * x.p + form.n * x.p + self.feeds
+        self.needed = np.zeros(x.m + x.l * (1 + x.simulated), dtype=bool)
+        self.needed[: x.m] = True
+        if x.q or self.injected:
+            self.needed[self.y] = True
+        if instruments:
+            self.needed[x.m + x.l :] = True
+
+    def compress(self, run: Array) -> tuple[Array, int, Array]:
+        """Return the triangular factor of the rows of a run with its target, the rows used, and sums of the outputs."""
+        from optid.subspace.kernels import adjoint_responses
+
+        form, x = self.form, self.form.expansion
+        n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
+        width = p + q * (2 if self.extra else 1) + 1 + (l if self.injected else 0)
+        state = np.zeros((l, n, width))
+        free = form.c[:, :, None].copy()  # (F^T)^k C_o^T, the effect of x0
+        transposed = np.ascontiguousarray((form.a - form.gain @ form.c).T)
+        size = n + self.common + self.extra + 1
+        root, used, sums = np.zeros((size, size)), 0, np.zeros((3, l))
+        for start in range(0, len(run), self.chunk):
+            raw = run[start : start + self.chunk]
+            y = raw[:, self.y]
+            signals, count = self._signals(raw), len(raw)
+            out, initial = np.empty((count, l, n * width)), np.empty((count, l, n))
+            adjoint_responses(transposed, form.c, signals, state, out)
+            adjoint_responses(transposed, np.zeros_like(form.c), np.zeros((count, 1)), free, initial)
+            out = out.reshape(count, l, n, width)
+            present = ~np.isnan(y)
+            values = np.where(present, y, 0.0)
+            sums += [present.sum(axis=0), values.sum(axis=0), (values**2).sum(axis=0)]
+            for o in range(l):
+                rows = self._rows(o, signals, initial[:, o], out[:, o], y[:, o])[present[:, o]]
+                used += len(rows)
+                root = add_to_root(root, form.weights[o] * rows)
+        return root, used, sums
+
+    def _signals(self, raw: Array) -> Array:
+        """Return [eta | (zeta simulated |) zeta | 1 (| y)]."""
+        x = self.form.expansion
+        found = x(raw)
+        parts = [found[:, list(x.eta)]]
+        if self.extra:
+            parts.append(found[:, list(x.zeta_simulated)])
+        parts += [found[:, list(x.zeta)], np.ones((len(raw), 1))]
+        if self.injected:
+            parts.append(found[:, list(x.y)])
+        return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+    def _rows(self, o: int, signals: Array, initial: Array, out: Array, y: Array) -> Array:
+        """Rows of output o: [x0 | d | D | B | E simulated | E | y], matrices with their rows outermost."""
+        form, x = self.form, self.form.expansion
+        l, p, q, count = form.l, x.p, x.q, len(signals)  # noqa: E741
+        feeds = 2 * q if self.extra else q
+        direct = np.zeros((count, l, p))
+        if self.injected:
+            direct -= np.einsum("kij,io->koj", out[:, :, :p], form.gain)
+        direct[:, o] += signals[:, :p]
+        parts = [initial]
+        if form.offset:
+            constant = -out[:, :, p + feeds] @ form.gain if self.injected else np.zeros((count, l))
+            constant[:, o] += 1.0
+            parts.append(constant)
+        parts += [direct.reshape(count, -1), out[:, :, :p].reshape(count, -1)]
+        if self.extra:
+            parts.append(out[:, :, p : p + q].reshape(count, -1))
+        parts.append(out[:, :, p + feeds - q : p + feeds].reshape(count, -1))
+        target = y.copy()
+        if self.injected:
+            target -= np.einsum("kij,ij->k", out[:, :, p + feeds + 1 :], form.gain)
+        return np.concatenate([*parts, target[:, None]], axis=1)
+
+    def turn(self, states: int) -> Array:
+        """Return the matrix that carries z to the order [x0 | d | D | B | E] of the rows."""
+        form, x = self.form, self.form.expansion
+        n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
+        direct = states + l * form.offset
+        inner, feed = direct + l * p, direct + l * p + n * p
+        turn = np.zeros((feed + n * q, form.size))
+        turn[: form.linear, : form.linear] = np.eye(form.linear)
+        starts = np.cumsum([0, *(functions for functions, _ in form.blocks)])
+        for i, (functions, entries) in enumerate(form.blocks):
+            columns = np.arange(form.size)[form.block(i)].reshape(entries, functions)
+            for b in range(entries):
+                if i >= x.m:
+                    where = feed + b * q + starts[i] - p
+                elif b < n:
+                    where = inner + b * p + starts[i]
+                else:
+                    where = direct + (b - n) * p + starts[i]
+                turn[where + np.arange(functions), columns[b]] = 1.0
+        return turn
+
+
+def observer_gain(a: Array, c: Array, noise: float = 1.0) -> Array:
+    """Return the steady Kalman gain (n, l) for unit process noise in balanced coordinates: A - L C is stable.
+
+    Args:
+        a: (n, n).
+        c: (l, n).
+        noise: variance of the measurement noise relative to the mean energy of the rows of C.
+    """
+    from optid.models.kalman import kalman_gain
+
+    level = noise * float(np.mean(np.sum(c**2, axis=1)))
+    return kalman_gain(a, c, np.eye(len(a)), level * np.eye(len(c))).K
