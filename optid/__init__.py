@@ -23,6 +23,8 @@ _HOME = {
     "UserFunctions": "bases",
     "Nonlinearity": "models",
     "HammersteinARX": "models",
+    "HammersteinSS": "models",
+    "NoiseCovariances": "models",
     "HammersteinTF": "models",
     "Program": "program",
     "Status": "solution",
@@ -38,6 +40,8 @@ _HOME = {
     "load": "io",
     "RecursiveARX": "recursion",
     "bootstrap": "resampling",
+    "design": "experiment",
+    "frequency_response": "experiment",
 }
 _MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants"}
 

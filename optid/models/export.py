@@ -13,6 +13,7 @@ from optid.models.nonlinearity import Nonlinearity
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_arx import HammersteinARX
+    from optid.models.hammerstein_ss import HammersteinSS
 
 
 def to_dlti(model: "HammersteinARX", output: int | str = 0, input: int | str = 0) -> Any:
@@ -47,14 +48,24 @@ def to_control(model: "HammersteinARX") -> Any:
     Raises:
         OptidError: python-control is not installed.
     """
-    try:
-        import control
-    except ImportError as error:
-        raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
+    control = control_package()
     if model.l > 1:
         return control.ss(*state_space(model), model.dt)
     pairs = [_polynomials(model, c) for c in range(model.m)]
     return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt)
+
+
+def control_package() -> Any:
+    """Import python-control.
+
+    Raises:
+        OptidError: it is not installed.
+    """
+    try:
+        import control
+    except ImportError as error:
+        raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
+    return control
 
 
 def to_casadi(model: "HammersteinARX") -> Any:
@@ -83,6 +94,23 @@ def to_casadi(model: "HammersteinARX") -> Any:
     for i, a in enumerate(simulation.matrices_of(model)):
         following[i] -= ca.DM(a) @ y
     return ca.Function("hammerstein_arx", [x, u], [ca.vertcat(*following), y], ["x", "u"], ["x_next", "y"])
+
+
+def state_space_to_casadi(model: "HammersteinSS") -> Any:
+    """Return a state-space model as a `casadi.Function` (x, u) -> (x_next, y), the free run without noise.
+
+    Raises:
+        StructureError: a basis of UserFunctions, which has no symbolic form.
+    """
+    import casadi as ca
+
+    x, u = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.m)
+    f = ca.vertcat(*(symbolic(f, u[c]) for f, c in zip(model.nonlinearities, model.input_of)))
+    y = ca.DM(model.C) @ x + ca.DM(model.D) @ f + ca.DM(model.offset_y)
+    following = ca.DM(model.A) @ x + ca.DM(model.B) @ f + ca.DM(model.L) @ y + ca.DM(model.offset_x)
+    for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
+        following += ca.DM(model.E[:, j]) * symbolic(g, y[o])
+    return ca.Function("hammerstein_ss", [x, u], [following, y], ["x", "u"], ["x_next", "y"])
 
 
 def state_space(model: "HammersteinARX") -> tuple[Array, Array, Array, Array]:

@@ -1,0 +1,369 @@
+"""The three simulators of a state-space model, and the initial state of each by least squares.
+
+P1 predicts with the innovation form, P2 feeds the measured outputs to g without correcting the state, P3 runs freely.
+Inputs are expanded stretch by stretch, so nothing of the size samples x functions is formed for the whole record.
+"""
+
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, DataWarning, StructureError
+from optid.models.feedback_tables import Tables
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_ss import HammersteinSS
+
+STRETCH = 16384
+"""Samples expanded at a time."""
+
+FAR = 100.0
+"""A simulation that leaves this many times the range of the data has diverged."""
+
+FORGOTTEN = 1e-12
+"""A derivative with respect to the initial state below this share of its largest value no longer informs."""
+
+STEPS = 50
+SETTLED = 1e-20
+"""A step that promises less than this share of the squared error is the last one."""
+
+ROUNDING = 1e-14
+SIMULATORS = ("predict", "measured_feedback", "free")
+
+
+class Parts(NamedTuple):
+    """Matrices of x+ = A x + ... + E g(y) + L y + K e, y = C x + ... as the kernels read them."""
+
+    A: Array
+    C: Array
+    E: Array
+    L: Array
+    K: Array
+    output_of: np.ndarray
+    tables: Tables
+
+
+class Stretch(NamedTuple):
+    """A stretch of samples as the kernels read it.
+
+    Attributes:
+        drive: (T, n) what the inputs and the constant add to the next state.
+        direct: (T, l) what they add to the output.
+        feedback: (T, s) g of the measured outputs, NaN where the model's output is to be fed back.
+        y: (T, l) measured outputs, NaN where there is none.
+        low: (l,) lower end of the range that the outputs must not leave.
+        high: (l,) upper end.
+    """
+
+    drive: Array
+    direct: Array
+    feedback: Array
+    y: Array
+    low: Array
+    high: Array
+
+
+class Run(NamedTuple):
+    """One record under one simulator.
+
+    Attributes:
+        model: the model.
+        u: (N, m) inputs.
+        known: (N, l) outputs that the simulator may see, NaN elsewhere; None for a free run.
+        gain: (n, l) gain of the correction.
+        low: (l,) lower end of the range allowed.
+        high: (l,) upper end.
+        label: words that name the experiment in a message.
+    """
+
+    model: "HammersteinSS"
+    u: Array
+    known: Array | None
+    gain: Array
+    low: Array
+    high: Array
+    label: str
+
+
+def prepared(model: "HammersteinSS", simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
+    """Return what a simulator runs over.
+
+    Args:
+        model: the model.
+        simulator: "predict" (P1), "measured_feedback" (P2) or "free" (P3).
+        u: (N, m) inputs.
+        y: (N, l) outputs; None for P3 only.
+        limits: (low, high), each (l,), from `allowed_range`, or None for the range of numbers.
+        label: words that name the experiment in a message.
+
+    Raises:
+        DataError: a missing input.
+    """
+    check_inputs(model, u, label)
+    none = np.zeros_like(model.K)
+    low, high = limits if limits is not None else (np.full(model.l, -np.finfo(float).max), np.finfo(float).max)
+    low, high = (np.array(np.broadcast_to(end, model.l), dtype=float) for end in (low, high))
+    known = None if simulator == "free" else y
+    return Run(model, u, known, model.K if simulator == "predict" else none, low, high, label)
+
+
+def run(job: Run, x0: Array) -> Array:
+    """Compute the outputs (N, l) from the initial state (n,).
+
+    Raises:
+        DataError: an output that leaves the range allowed, named by channel and sample.
+    """
+    outputs = np.empty((len(job.u), job.model.l))
+    x = np.array(x0, dtype=float)
+    for first, last, stretch in _stretches(job):
+        none = np.zeros((x.size, 0)), np.zeros((last - first, job.model.l, 0))
+        _checked(job, first, *_march(job, stretch, x, none[0], outputs[first:last], none[1]))
+    return outputs
+
+
+def ahead(job: Run, x0: Array, horizon: int) -> Array:
+    """Predict (N, l) several samples ahead with the innovation form; NaN in the first horizon - 1 samples.
+
+    Raises:
+        DataError: a prediction that leaves the range of numbers, named by channel and sample.
+    """
+    if horizon == 1:
+        return run(job, x0)
+    predictions = np.full((len(job.u), job.model.l), np.nan)
+    x = np.array(x0, dtype=float)
+    for first, last, stretch in _stretches(job, overlap=horizon - 1):
+        starts = min(STRETCH, last - first)
+        target = np.full((last - first, job.model.l), np.nan)
+        _checked(job, first, *_ahead(job, stretch, x, horizon, starts, target))
+        begin = min(first + horizon - 1, last)
+        predictions[begin:last] = target[begin - first :]
+    return predictions
+
+
+def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
+    """Estimate the initial state (n,) by least squares of the outputs of a simulator on the measured ones.
+
+    The errors of each output count in units of its standard deviation. P1 and P2 are linear in the state (where an
+    output is missing, its feedback is not), a free run with feedback is not: Gauss-Newton steps, halved until the
+    error falls. Directions that the record does not determine are left as they are.
+
+    Args:
+        job: the run.
+        y: (N, l) measured outputs, NaN = missing.
+        x0: (n,) where to start; zero by default.
+
+    Raises:
+        DataError: the run leaves the range allowed from every start tried.
+    """
+    n = job.model.nx
+    x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
+    if n == 0 or not np.isfinite(y).any():
+        return x
+    unit = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
+    unit[unit == 0] = 1.0
+    affine = not job.model.feedback or (job.known is not None and not np.isnan(job.known).any())
+    root, cost = _linearised(job, y, unit, x)
+    for _ in range(STEPS):
+        sizes = np.linalg.norm(root[:, :n], axis=0)
+        sizes[sizes == 0] = 1.0
+        step = np.linalg.lstsq(root[:, :n] / sizes, root[:, n])[0] / sizes
+        if affine:
+            return x + step
+        expected = float(np.sum((root[:, :n] @ step) ** 2))
+        found = _descended(job, y, unit, x, step, cost)
+        if found is None:
+            return x
+        x, root, cost = found
+        if expected <= SETTLED * cost:
+            return x
+    return x
+
+
+def _descended(job: Run, y: Array, unit: Array, x: Array, step: Array, cost: float) -> Any:
+    for halving in range(20):
+        trial = x + step / 2**halving
+        try:
+            root, lower = _linearised(job, y, unit, trial)
+        except DataError:
+            continue
+        if lower <= cost * (1 + ROUNDING):
+            return trial, root, lower
+    return None
+
+
+def _linearised(job: Run, y: Array, unit: Array, x0: Array) -> tuple[Array, float]:
+    """Return the triangular root (n + 1, n + 1) of [derivative, error] over the samples present, and the error^2."""
+    n, outputs = x0.size, job.model.l
+    root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
+    x, turn = np.array(x0, dtype=float), np.eye(n)
+    for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
+        simulated = np.empty((last - first, outputs))
+        if not informs:
+            turn = np.zeros((n, 0))
+        jacobian = np.empty((last - first, outputs, turn.shape[1]))
+        _checked(job, first, *_march(job, stretch, x, turn, simulated, jacobian))
+        error = (y[first:last] - simulated) / unit
+        present = ~np.isnan(error)
+        cost += float(np.sum(error[present] ** 2))
+        if informs:
+            rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
+            if not np.all(np.isfinite(rows)):
+                raise DataError(
+                    f"{job.label}The effect of the initial state leaves the range of numbers: {radius(job.model)}"
+                )
+            root = np.linalg.qr(np.vstack([root, rows]), mode="r")
+            largest = max(largest, float(np.abs(turn).max()))
+            informs = float(np.abs(turn).max()) > FORGOTTEN * largest
+    return root, cost
+
+
+def allowed_range(data: Any) -> Any:
+    """Return (low, high), each (l,): `FAR` times the range of every output about its middle, over all experiments.
+
+    None where the outputs are not known; no bound for an output without two different values.
+    """
+    outputs = [y for y in data if y is not None]
+    if not outputs:
+        return None
+    low = np.fmin.reduce([np.fmin.reduce(y, axis=0) for y in outputs])
+    high = np.fmax.reduce([np.fmax.reduce(y, axis=0) for y in outputs])
+    width = np.where(high > low, high - low, np.maximum(np.abs(low), np.abs(high)))
+    reach = np.where(width > 0, FAR * width, np.finfo(float).max)
+    middle = np.where(np.isfinite(low), (low + high) / 2, 0.0)
+    reach = np.where(np.isfinite(low), reach, np.finfo(float).max)
+    return middle - reach, middle + reach
+
+
+def check_inputs(model: "HammersteinSS", u: Array, label: str) -> None:
+    """Refuse missing and infinite inputs, which a state cannot pass over."""
+    bad = ~np.isfinite(u)
+    if bad.any():
+        k, c = np.argwhere(bad)[0]
+        raise DataError(
+            f"{label}Input {model.inputs[c]!r} is missing at sample {k} ({int(bad[:, c].sum())} in all): the state "
+            "needs every input. Interpolate it, or split the record there."
+        )
+
+
+def warn_unstable(model: "HammersteinSS") -> None:
+    """Say that a simulation without feedback will grow without bound.
+
+    Warns:
+        DataWarning: with the pole radius.
+    """
+    if not model.is_stable and not model.feedback and not np.any(model.L):
+        warnings.warn(
+            f"The model is unstable: {radius(model)} Its simulation grows and tells little about the fit; "
+            "use one-step prediction, or identify with a stability constraint.",
+            DataWarning,
+            stacklevel=3,
+        )
+
+
+def state_like(model: "HammersteinSS", x0: Any) -> Array:
+    """Read an initial state (n,) given by the user."""
+    state = np.atleast_1d(np.asarray(x0, dtype=float))
+    if state.shape != (model.nx,):
+        raise StructureError(f"x0 has shape {np.shape(x0)}; the state of this model is ({model.nx},).")
+    if not np.all(np.isfinite(state)):
+        raise DataError("x0 contains a value that is not finite.")
+    return state
+
+
+def radius(model: "HammersteinSS") -> str:
+    """Say where the largest pole is."""
+    return f"its largest pole has radius {np.max(np.abs(model.poles), initial=0.0):.6g}."
+
+
+def _stretches(job: Run, length: int = 0, overlap: int = 0) -> Iterator[tuple[int, int, Stretch]]:
+    model, length = job.model, length or STRETCH
+    for first in range(0, len(job.u), length):
+        last = min(first + length + overlap, len(job.u))
+        f = model.expanded(job.u[first:last])
+        y = np.full((last - first, model.l), np.nan) if job.known is None else job.known[first:last]
+        g = np.empty((last - first, len(model.feedback)))
+        for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
+            g[:, j] = np.nan if job.known is None else function(y[:, o])
+        yield first, last, Stretch(
+            np.ascontiguousarray(f @ model.B.T + model.offset_x), np.ascontiguousarray(f @ model.D.T + model.offset_y),
+            g, np.ascontiguousarray(y), job.low, job.high,
+        )
+
+
+def _march(job: Run, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array) -> tuple[int, int]:
+    parts = job.model.parts._replace(K=job.gain)
+    if not parts.tables.compiled and np.isnan(stretch.feedback).any():
+        return _march_in_python(job.model, parts, stretch, x, turn, outputs, jacobian)
+    from optid.models.state_kernels import march
+
+    return march(parts, stretch, x, turn, outputs, jacobian)
+
+
+def _ahead(job: Run, stretch: Stretch, x: Array, horizon: int, starts: int, target: Array) -> tuple[int, int]:
+    parts = job.model.parts
+    if parts.tables.compiled:
+        from optid.models.state_kernels import look_ahead
+
+        return look_ahead(parts, stretch, x, horizon, starts, target)
+    from optid.models.state_kernels import INSIDE
+
+    nothing = np.zeros((x.size, 0)), np.zeros((horizon, job.model.l, 0))
+    for k in range(starts):
+        state, count = x.copy(), min(horizon, len(stretch.y) - k)
+        one = Stretch(*(part[k : k + 1] for part in stretch[:4]), *stretch[4:])
+        _march_in_python(job.model, parts, one, x, nothing[0], np.empty((1, job.model.l)), nothing[1])
+        free = Stretch(*(part[k : k + count] for part in stretch[:4]), *stretch[4:])
+        free = free._replace(feedback=np.full_like(free.feedback, np.nan), y=np.full_like(free.y, np.nan))
+        found = np.empty((count, job.model.l))
+        ended, at = _march_in_python(job.model, parts, free, state, nothing[0], found, nothing[1])
+        if ended != INSIDE:
+            return ended, k + at
+        if count == horizon:
+            target[k + horizon - 1] = found[-1]
+    return INSIDE, len(stretch.y)
+
+
+def _march_in_python(
+    model: "HammersteinSS", parts: Parts, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array
+) -> tuple[int, int]:
+    """Run the recursion of `optid.models.state_kernels.march` for functions that cannot be compiled."""
+    from optid.models.state_kernels import INSIDE, LEFT
+
+    where = np.array(model.output_of, dtype=int)
+    for k, given in enumerate(stretch.y):
+        y = stretch.direct[k] + parts.C @ x
+        if not np.all((stretch.low <= y) & (y <= stretch.high)):
+            return LEFT, k
+        outputs[k] = y
+        moved = parts.C @ turn
+        jacobian[k] = moved
+        free = np.isnan(given)
+        error = np.where(free, 0.0, given - y)
+        g, slopes = stretch.feedback[k].copy(), np.zeros(where.size)
+        for j in np.flatnonzero(np.isnan(g)):
+            g[j], slopes[j] = model.feedback[j](y[where[j]]), model.feedback[j].slope(y[where[j]])
+        pulled = parts.L * free - parts.K * ~free
+        turn[:] = parts.A @ turn + pulled @ moved + (parts.E * slopes) @ moved[where]
+        x[:] = parts.A @ x + stretch.drive[k] + parts.E @ g + parts.L @ np.where(free, y, given) + parts.K @ error
+    return INSIDE, len(stretch.y)
+
+
+def _checked(job: Run, first: int, ended: int, at: int) -> None:
+    from optid.models.state_kernels import INSIDE, REFUSED
+
+    if ended == INSIDE:
+        return
+    if ended == REFUSED:
+        raise DataError(
+            f"{job.label}At sample {first + at} the simulated output leaves the interval of a feedback basis with "
+            "outside='error'. Use outside='clamp' or 'extrapolate', or a longer interval."
+        )
+    finite = bool(np.all(job.high < np.finfo(float).max))
+    what = f"{FAR:g} times the range of the data" if finite else "the range of numbers"
+    raise DataError(
+        f"{job.label}The simulated output leaves {what} at sample {first + at}: {radius(job.model)} Identify the model "
+        "with a stability constraint, predict one step ahead, or simulate fewer samples."
+    )
