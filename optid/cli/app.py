@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from optid.cli.derived import DEFAULT, FittingCommand
+from optid.cli.designing import design
 from optid.cli.options import (
     MODEL,
     RECORD,
@@ -55,7 +57,7 @@ def main(
     """Identify Hammerstein systems by optimisation with constraints, with a proof of global optimality."""
 
 
-@app.command(cls=Command)
+@app.command(cls=FittingCommand)
 def fit(
     data: Files = None,
     example: Annotated[
@@ -90,7 +92,7 @@ def fit(
     ] = None,
     formulation: Annotated[
         str, typer.Option("--formulation", "-f", metavar="NAME", rich_help_panel=MODEL, help="See optid formulations.")
-    ] = "hammerstein_arx.exact",
+    ] = DEFAULT,
     na: Annotated[int | None, typer.Option("--na", rich_help_panel=MODEL, help="Number of past outputs in A.")] = None,
     nb: Annotated[
         list[str] | None,
@@ -339,3 +341,6 @@ def examples() -> None:
     from optid.cli.listings import examples as table
 
     table()()
+
+
+app.command(cls=Command)(design)
