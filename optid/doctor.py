@@ -14,6 +14,7 @@ from optid.experiment.rules import Check, check_condition, check_levels, check_l
 
 OUTLIER = 10.0  # robust standard deviations
 LEAST_KEPT = 0.5
+BLOCK_ROWS = 10  # of a subspace method that chooses them itself
 
 
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
@@ -22,8 +23,8 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
     Args:
         data: the record.
         bases: one fitted basis per input.
-        arguments: of the formulation; its lags (nb, or rows of a subspace method) are held against the spectral lines
-            of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
+        arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are held against the spectral
+            lines of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
 
     Returns:
         What weakens the answer, one sentence each; every sentence is also issued as a `DataWarning`.
@@ -85,10 +86,15 @@ def _told(check: Check) -> list[str]:
 
 def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
     """Number of lags at which the functions of input c are regressors, as far as the arguments tell."""
-    given = arguments.get("rows", arguments.get("nb"))
+    if "block_rows" in arguments:
+        nx = arguments.get("nx")
+        chosen = max(BLOCK_ROWS, 2 * nx if isinstance(nx, int) else 0)
+        given = chosen if arguments["block_rows"] is None else arguments["block_rows"]
+    else:
+        given = arguments.get("nb")
     if isinstance(given, list | tuple):
         given = given[c] if c < len(given) else None
-    return int(given) if isinstance(given, int | np.integer) else None
+    return int(given) if isinstance(given, int | np.integer) and given > 0 else None
 
 
 def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:

@@ -24,7 +24,7 @@ from optid.errors import (
 from optid.models.functions import has_feedback
 from optid.prices import Price, price_constraints, price_earlier_steps
 from optid.program import Program
-from optid.registry import check_arguments, formulation, named_constraint
+from optid.registry import check_arguments, defaults, formulation, named_constraint
 from optid.solution import Solution, Status
 from optid.solving import Outcome, Procedure, run
 from optid.streams import Stream
@@ -163,7 +163,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
-    findings = _examined(data, arguments)
+    findings = _examined(data, {**defaults(pose), **arguments})
     problem = pose(data, **arguments)
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate, "prove": prove,
                 **(solver_options or {})}

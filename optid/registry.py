@@ -76,6 +76,12 @@ def check_arguments(name: str, function: Callable[..., Any], arguments: Mapping[
         raise StructureError(f"formulation {name!r} needs {', '.join(missing)}")
 
 
+def defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the arguments of a formulation that may be left out, with their values then."""
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is not p.empty}
+
+
 def _number(text: str) -> Any:
     try:
         return float(text)

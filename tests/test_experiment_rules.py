@@ -117,5 +117,5 @@ def test_fit_names_a_single_sinusoid():
     with pytest.raises(DataError, match="'u' is a single sinusoid.*excite 9 regressors; 20 are to be determined"):
         optid.fit(data, na=1, nb=5, basis="polynomial:4")
     with pytest.warns(DataWarning, match="single sinusoid"):  # who sets a tolerance asks for a singular regressor
-        examine(data, [QUARTIC], {"rows": 10, "tolerance": 1e-6})
+        examine(data, [QUARTIC], {"block_rows": None, "tolerance": 1e-6})
     assert examine(data, [QUARTIC], {"nb": [2]}) == [] == examine(data, [QUARTIC], {"nb": []})

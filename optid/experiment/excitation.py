@@ -11,7 +11,7 @@ from optid import signals
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
-from optid.experiment.expansion import Bases
+from optid.experiment.expansion import Bases, FeedbackBases
 from optid.experiment.promises import Promise, promised
 from optid.experiment.response import FrequencyResponse, frequency_response
 from optid.experiment.rules import FEW_LEVELS
@@ -69,7 +69,7 @@ class Excitation:
 
 def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels: int | None = None,
            band: tuple[float, float] | None = None, amplitude: Any = None, shaped: bool = False,
-           basis: Bases = "polynomial:4", feedback_basis: Bases | None = None, rows: int = 10, hold: int = 5,
+           basis: Bases = "polynomial:4", feedback_basis: FeedbackBases = None, rows: int = 10, hold: int = 5,
            periods: int = 1, candidates: int = 8, seed: int = 0) -> Excitation:
     """Design an excitation for the plant of a record.
 
@@ -104,11 +104,12 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     Warns:
         DataWarning: an excitation that weakens the answer.
     """
-    _check(kind, shaped, candidates, rows, levels)
+    _check(kind, band, shaped, candidates, rows, levels)
     n = max(e.n_samples for e in like.experiments) if n is None else n
     ranges = _ranges(like, amplitude)
     measured = frequency_response(like)
-    limits = _band(band, measured)
+    # held levels have the spectrum that holding gives them
+    limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
     few = FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
     best: tuple[Array, Promise] | None = None
     for draw in range(1 if kind == "chirp" else candidates):
@@ -134,11 +135,13 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     return Excitation(u, like.dt, like.inputs, like.input_units, kind, promise)
 
 
-def _check(kind: str, shaped: bool, candidates: int, rows: int, levels: int | None) -> None:
+def _check(kind: str, band: Any, shaped: bool, candidates: int, rows: int, levels: int | None) -> None:
     if kind in REFUSED:
         raise StructureError(f"kind {kind!r} is refused: {REFUSED[kind]}. Use one of {', '.join(KINDS)}.")
     if kind not in KINDS:
         raise StructureError(f"no excitation {kind!r}. {nearest(kind, KINDS)}")
+    if band is not None and kind == "levels":
+        raise StructureError("levels have the band that holding gives them; set hold, or use kind 'noise'.")
     if shaped and kind not in ("multisine", "chirp"):
         raise StructureError(f"shaping changes the spectrum of a multisine or the envelope of a chirp, not {kind!r}.")
     for name, value, least in (("candidates", candidates, 1), ("rows", rows, 1), ("levels", levels, 2)):

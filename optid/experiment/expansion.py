@@ -1,107 +1,86 @@
-"""The expanded regressor: functions of the inputs, and the part of functions of the outputs that is not linear in them.
+"""The expanded regressor of a record: functions of the inputs, and functions of the outputs orthogonal to 1 and y."""
 
-The linear part of the feedback cannot be told from the dynamics: (A, B, linear part of E g) and (A - L C, B - L D, that
-part + L y) behave alike for every L, so functions of y enter orthogonal to 1 and y on the record.
-"""
-
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from optid.bases import Linear, fitted_bases
-from optid.bases.basis import Array, Basis
+from optid.bases import fitted_bases, parse
+from optid.bases.basis import Basis
 from optid.data import Data
-
-LINEAR = 1e-6
-"""A direction of functions of y is linear in y when no more than this share of its size is orthogonal to 1 and y."""
+from optid.errors import DataWarning, StructureError
+from optid.subspace.expansion import Expansion, expand
+from optid.subspace.hankel import hankel_statistics
 
 Bases = Basis | str | Sequence[Basis | str]
+FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
 
 
-@dataclass(frozen=True, eq=False)
-class Expansion:
-    """The signals that drive the linear part of a Hammerstein system with nonlinear feedback.
+def feedback_bases(data: Data, given: FeedbackBases) -> list[Basis | None]:
+    """Return one basis with an interval, or None, per output; a basis without one takes the range of its output.
 
-    Attributes:
-        inputs: one basis per input.
-        feedback: one basis per output; empty without feedback.
-        linear: (1 + l, q) coefficients of 1 and y that are subtracted from the q functions of y.
-        directions: (q, r) combinations of what is left that are not linear in y, of unit standard deviation.
-        nonlinear: per output, the largest ratio over its functions of the standard deviation of the part orthogonal to
-            1 and y to the standard deviation of the function itself.
-        names: of the P + r signals.
+    Args:
+        data: the record.
+        given: one basis (or its name) for all outputs, or one per output; None or "none" where nothing is fed back.
+
+    Raises:
+        StructureError: a wrong number of bases, or what is not a basis.
+        DataError: a constant output.
     """
-
-    inputs: tuple[Basis, ...]
-    feedback: tuple[Basis, ...]
-    linear: Array
-    directions: Array
-    nonlinear: tuple[float, ...]
-    names: tuple[str, ...]
-
-    def __call__(self, samples: Array) -> Array:
-        """Return the signals (T, P + r) of raw channels (T, m + l), inputs first."""
-        m = len(self.inputs)
-        eta = [basis.values(samples[:, c]) for c, basis in enumerate(self.inputs)]
-        if not self.directions.shape[1]:
-            return np.hstack(eta)
-        y = samples[:, m:]
-        zeta = functions_of(y, self.feedback) - np.column_stack([np.ones(len(y)), y]) @ self.linear
-        return np.hstack([*eta, zeta @ self.directions])
-
-    @property
-    def eta_sizes(self) -> tuple[int, ...]:
-        """Number of functions of each input."""
-        return tuple(basis.size for basis in self.inputs)
+    several: list[Any] = list(given) if isinstance(given, list | tuple) else [given] * data.l
+    if len(several) != data.l:
+        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
+                             "one each, None for an output that is not fed back.")
+    found: list[Basis | None] = []
+    for o, one in enumerate(several):
+        if one is None or one == "none":
+            found.append(None)
+            continue
+        family: Any = parse(one) if isinstance(one, str) else one
+        if not hasattr(family, "fitted"):
+            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
+                                 "Polynomial(4) or its name, 'polynomial:4'")
+        y = np.concatenate([e.y[:, o] for e in data.experiments])
+        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
+    return found
 
 
-def functions_of(samples: Array, bases: Sequence[Basis]) -> Array:
-    """Return the functions of all channels (T, c) side by side."""
-    return np.hstack([basis.values(samples[:, c]) for c, basis in enumerate(bases)])
-
-
-def expansion(data: Data, basis: Bases, feedback: Bases | None = None) -> Expansion:
-    """Fit the bases to a record and orthogonalise the functions of the outputs.
+def expansion_of(data: Data, basis: Bases, feedback_basis: FeedbackBases = None) -> Expansion:
+    """Fit the bases to a record; whether the functions of outputs are nearly linear is for `check_feedback` to say.
 
     Args:
         data: the record.
         basis: of the inputs, one for all or one per input.
-        feedback: of the outputs, one for all or one per output; None without feedback.
+        feedback_basis: of the outputs, as in `feedback_bases`.
 
     Raises:
         StructureError: a wrong number of bases.
         DataError: a constant channel.
+        RankError: functions of an output that are linear on the record.
     """
-    inputs = fitted_bases(data, basis)
-    eta_names = [f"{basis_name(b, i)} of {channel}" for channel, b in zip(data.inputs, inputs) for i in range(b.size)]
-    if feedback is None:
-        return Expansion(inputs, (), np.zeros((1 + data.l, 0)), np.zeros((0, 0)), (), tuple(eta_names))
-    outputs = fitted_bases(outputs_as_inputs(data), feedback)
-    y = np.concatenate([e.y for e in data.experiments])
-    y = y[~np.isnan(y).any(axis=1)]
-    zeta = functions_of(y, outputs)
-    regressors = np.column_stack([np.ones(len(y)), y])
-    linear: Array = np.asarray(np.linalg.lstsq(regressors, zeta, rcond=None)[0], dtype=np.float64)
-    rest = zeta - regressors @ linear
-    size = zeta.std(axis=0)
-    size[size == 0] = 1.0
-    ratios = rest.std(axis=0) / size
-    starts = np.cumsum([0, *(b.size for b in outputs)])
-    nonlinear = tuple(float(ratios[a:b].max()) for a, b in zip(starts[:-1], starts[1:]))
-    _, values, right = np.linalg.svd(np.linalg.qr(rest / size, mode="r"))
-    kept = values > LINEAR * np.sqrt(len(y))
-    directions = (right[kept] / size).T / values[kept] * np.sqrt(len(y))
-    names = [f"feedback direction {i + 1}" for i in range(directions.shape[1])]
-    return Expansion(inputs, outputs, linear, directions, nonlinear, (*eta_names, *names))
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return expand(records, fitted_bases(data, basis), feedback_bases(data, feedback_basis), data.inputs,
+                      data.outputs)
 
 
-def outputs_as_inputs(data: Data) -> Data:
-    """Return the record with its outputs in the place of its inputs, for what is written for inputs."""
-    return Data([e.y for e in data.experiments], [e.y for e in data.experiments], data.dt, inputs=list(data.outputs),
-                outputs=[f"{name} again" for name in data.outputs])
+def expanded_condition(data: Data, expansion: Expansion, rows: int) -> float:
+    """Return the condition number of all windows of the expanded signals about their means, columns scaled.
 
+    Args:
+        data: the record.
+        expansion: of it.
+        rows: block rows, the samples of a window.
 
-def basis_name(basis: Basis, i: int) -> str:
-    """Return the name of function i of a basis, as messages have it."""
-    return "the value" if isinstance(basis, Linear) else f"function {i + 1}"
+    Returns:
+        An estimate in the 1-norm; inf when the windows are singular.
+
+    Raises:
+        RankError: no complete window.
+    """
+    count = expansion.p + expansion.q
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    return hankel_statistics(records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
+                             centre="mean").condition

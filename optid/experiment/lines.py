@@ -86,7 +86,7 @@ def remaining_shares(signals: Array, most: int, enough: float) -> Array:
 
 
 def _strongest(x: Array) -> float:
-    """Return the frequency (per sample) of the highest common peak of signals (N, s), between the bins by a parabola."""
+    """Return the frequency (1/sample) of the highest common peak of signals (N, s), by a parabola between the bins."""
     n = 4 * len(x)
     spectrum = np.sum(np.abs(np.fft.rfft(x, n, axis=0)) ** 2, axis=1)
     spectrum[:2] = 0.0  # a fraction of a period is the mean

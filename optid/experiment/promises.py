@@ -7,7 +7,7 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.channels import count_levels
 from optid.data import Data
-from optid.experiment.expansion import Bases, expansion
+from optid.experiment.expansion import Bases, FeedbackBases, expanded_condition, expansion_of
 from optid.experiment.response import FrequencyResponse
 from optid.experiment.rules import (
     Check,
@@ -15,7 +15,6 @@ from optid.experiment.rules import (
     check_feedback,
     check_levels,
     check_lines,
-    expanded_condition,
 )
 
 
@@ -62,7 +61,7 @@ class Promise:
 
 
 def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
-             feedback_basis: Bases | None, rows: int, few: int, seed: int) -> Promise:
+             feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Promise:
     """Predict what a record taken with u would be like and hold it against the rules.
 
     Without functions of the outputs the condition number is that of the designed signal itself, so it holds for every
@@ -86,19 +85,18 @@ def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[floa
 
     y = predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
-    expand = expansion(record, basis, feedback_basis)
-    condition = expanded_condition([np.hstack([u, y])], expand, rows)
-    checks = [check_levels(name, u[:, c], expand.inputs[c], few) for c, name in enumerate(like.inputs)]
-    checks += [check_lines(name, [u[:, c]], expand.inputs[c], rows) for c, name in enumerate(like.inputs)]
-    if feedback_basis is not None:
-        checks += check_feedback(like.outputs, expand)
+    expansion = expansion_of(record, basis, feedback_basis)
+    condition = expanded_condition(record, expansion, rows)
+    checks = [check_levels(name, u[:, c], expansion.inputs[c], few) for c, name in enumerate(like.inputs)]
+    checks += [check_lines(name, [u[:, c]], expansion.inputs[c], rows) for c, name in enumerate(like.inputs)]
+    checks += [check_feedback(like.outputs[family.output], family.share) for family in expansion.feedback]
     checks.append(check_condition(condition))
     how = "from the designed signal itself, which the plant does not change"
-    if feedback_basis is not None:
+    if expansion.feedback:
         how = (f"from the designed signal and outputs predicted through the frequency response of "
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
-    return Promise(condition, rows, len(expand.names), tuple(count_levels(x) for x in u.T), band,
+    return Promise(condition, rows, expansion.p + expansion.q, tuple(count_levels(x) for x in u.T), band,
                    tuple((float(x.min()), float(x.max())) for x in u.T), tuple(crest_factor(x) for x in u.T),
                    tuple(float(s) for s in y.std(axis=0)), tuple(checks), how)
 

@@ -59,14 +59,15 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
 
     Args:
         data: the record.
-        segment: samples of a segment; an eighth of the longest experiment when not given, and at least 32.
+        segment: samples of a segment; when not given a quarter of the longest experiment (less with four inputs or
+            more), and at least 32. Resonances narrower than its inverse are flattened, and leave disturbance behind.
 
     Raises:
         StructureError: a segment of fewer than 8 samples.
         DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
     """
     longest = max(e.n_samples for e in data.experiments)
-    size = max(32, longest // 8) if segment is None else segment
+    size = max(32, longest // max(4, data.m + 1)) if segment is None else segment
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 8:
         raise StructureError(f"segment = {segment!r}: a whole number of samples, at least 8, is needed.")
     window = np.hanning(size + 1)[:-1]

@@ -12,8 +12,8 @@ import numpy as np
 
 from optid.bases.basis import Array, Basis
 from optid.channels import count_levels
-from optid.experiment.expansion import LINEAR, Expansion
 from optid.experiment.lines import longest_run, many_lines, remaining_shares
+from optid.subspace.expansion import LINEAR, NEARLY_LINEAR
 
 Severity = Literal["fine", "warning", "error"]
 
@@ -23,8 +23,6 @@ HIDDEN, DOMINANT = 1e-3, 1e-2
 """Share of the variance beside a few sinusoids that is noise on a singular record, or a weak excitation."""
 WORST_CONDITION = 1e7
 """Condition number beyond which the estimates keep less than half of their digits."""
-NEARLY_LINEAR = 0.05
-"""Nonlinear share of the feedback functions below which noise decides them."""
 
 
 @dataclass(frozen=True)
@@ -123,22 +121,24 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
-def check_feedback(outputs: Sequence[str], expansion: Expansion) -> list[Check]:
-    """Hold the part of the feedback functions that is not linear in y against the functions themselves, per output."""
-    checks = []
-    for name, ratio in zip(outputs, expansion.nonlinear):
-        measured = f"the functions of output {name!r} differ from a straight line by {100 * ratio:.2g} % of their size"
-        if ratio <= LINEAR:
-            severity, more = "error", (" on this record. A linear feedback cannot be told from the dynamics (A - L C "
-                                       "with any L behaves alike): leave the feedback basis out, use a nonlinear one, "
-                                       "or excite larger amplitudes")
-        elif ratio < NEARLY_LINEAR:
-            severity, more = "warning", (" on this record: what is left of them is small beside the noise. Excite "
-                                         "larger amplitudes, or leave the feedback basis out")
-        else:
-            severity, more = "fine", ""
-        checks.append(Check("feedback", name, ratio, NEARLY_LINEAR, severity, measured + more))
-    return checks
+def check_feedback(name: str, share: float) -> Check:
+    """Hold the spread of feedback functions that is orthogonal to 1 and y against their whole spread.
+
+    A linear feedback cannot be told from the dynamics: (A, B, linear part of E g) and (A - L C, B - L D, that part
+    + L y) behave alike for every L.
+
+    Args:
+        name: of the output.
+        share: spread outside 1 and y over the spread of the functions (`optid.subspace.expansion.Feedback.share`).
+    """
+    sentence = f"{100 * share:.2g} % of the spread of the functions of output {name!r} is not linear in the outputs"
+    if share >= NEARLY_LINEAR:
+        return Check("feedback", name, share, NEARLY_LINEAR, "fine", sentence)
+    if share < LINEAR:
+        more = ": no feedback can be told from the dynamics. Leave the feedback basis out, or excite larger amplitudes"
+        return Check("feedback", name, share, LINEAR, "error", sentence + more)
+    more = ": little beside the noise. Excite larger amplitudes, or leave the feedback basis out"
+    return Check("feedback", name, share, NEARLY_LINEAR, "warning", sentence + more)
 
 
 def check_condition(number: float, what: str = "the expanded regressor") -> Check:
@@ -167,22 +167,3 @@ def check_instruments(number: float) -> Check:
                     "(hammerstein_ss.asivid), fewer block rows or functions, or an input with more lines and levels")
         return Check("instruments", "", number, WORST_CONDITION, "warning", sentence)
     return Check("instruments", "", number, WORST_CONDITION, "fine", f"cond(R11) = {number:.2g}")
-
-
-def expanded_condition(records: Sequence[Array], expand: Expansion, rows: int) -> float:
-    """Return the condition number of all windows of the expanded signals about their means, columns scaled.
-
-    Args:
-        records: raw channels (N, m + l) per experiment, inputs first; the outputs may be left out without feedback.
-        expand: the expansion.
-        rows: block rows, the samples of a window.
-
-    Returns:
-        inf when the windows are singular.
-
-    Raises:
-        RankError: no complete window.
-    """
-    from optid.subspace.hankel import hankel_statistics
-
-    return hankel_statistics(records, rows, expand, names=expand.names, centre="mean").condition
