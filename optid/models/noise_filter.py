@@ -78,9 +78,13 @@ def reflected(coefficients: Array, limit: float = 1.0) -> Array:
     roots = np.roots(np.concatenate([[1.0], coefficients])).astype(complex)
     outside = np.abs(roots) > limit
     roots[outside] = limit**2 / np.conj(roots[outside])
-    found = np.zeros(len(coefficients))
-    product = np.real(np.poly(roots))[1:]
-    found[: product.size] = product
+    return with_roots(roots, len(coefficients))
+
+
+def with_roots(roots: Array, size: int) -> Array:
+    """Return the coefficients (size,) of the polynomial 1 + c_1 q^-1 + .. with these roots, and others at zero."""
+    found = np.zeros(size)
+    found[: len(roots)] = np.real(np.atleast_1d(np.poly(roots)))[1:]
     return found
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.models import noise_filter
 from optid.models.nonlinearity import Nonlinearity
+from optid.regressors.layout import Layout
 from optid.regressors.sensitivities import (
     CONDITION_LIMIT,
     Linearised,
@@ -69,6 +70,26 @@ class NoiseUnknowns:
     plant: Unknowns
     nc: int
     nd: int | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """Orders and bases of the plant."""
+        return self.plant.layout
+
+    @property
+    def experiments(self) -> int:
+        """Number of experiments."""
+        return self.plant.experiments
+
+    @property
+    def free(self) -> tuple[bool, ...]:
+        """Whether the coefficients of every nonlinearity are unknown."""
+        return self.plant.free
+
+    @property
+    def constant(self) -> bool:
+        """Whether the offset is unknown; where not, it is zero."""
+        return self.plant.constant
 
     @property
     def apart(self) -> bool:
@@ -130,7 +151,7 @@ class Predicted:
     x: Array
     s: Array
     innovations: Array
-    state: Array
+    state: Any
 
     @property
     def value(self) -> float:
@@ -244,7 +265,8 @@ def _direct(u: Array, found: Predicted, unknowns: NoiseUnknowns, point: NoisePoi
             f = signals.table[:, signals.spans[c]] @ plant.mus[c]
             for j, lag in enumerate(lags):
                 rows[:, head + at[f"b{c}"].start + j] = f[n - lag : n - lag + count]
-        rows[:, head + at["offset"].start] = signals.delayed(signals.step, 0)
+        if unknowns.constant:
+            rows[:, head + at["offset"].start] = signals.delayed(signals.step, 0)
         for i in range(unknowns.nc):
             rows[:, head + at["c"].start + i] = _delayed(found.innovations, part, i + 1)
         for i in range(unknowns.nd or 0):

@@ -1,0 +1,101 @@
+"""ARMAX: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + C(q) e``, the sum of squared innovations minimised.
+
+`exact` is the Hammerstein model, `linear` (registered as ``armax.exact``) the linear one. Both are procedures of the
+prediction-error method (Ljung 1999, section 7.2): starts from ARX and extended least squares, Gauss-Newton with
+sensitivities filtered by 1/C, and convex programmes in the tangent of the iterate, in which any constraint and any
+conic or quadratic back end may take part. Named variables: ``a``, ``b``, ``mu`` (not in the linear model),
+``offset``, ``c``, and ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` about the iterate (mu0, b0). With several inputs the
+per-channel names carry the input, as in ``mu[valve]``.
+
+The first innovations of every experiment, whose lags reach before it, count as zero (the conditional method). So does
+an innovation that cannot be computed: where the output is missing its prediction takes its place, and where a missing
+input leaves no prediction the recursion starts anew. The estimate is that of the stationary predictor, a little less
+efficient with gaps than the full likelihood (a Kalman filter's gain would grow in a gap), and consistent.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from formulations.equation_error import per_channel
+from formulations.hammerstein_arx import GAUGES
+from formulations.noise_models import (
+    PredictionErrors,
+    extended_least_squares,
+    one_output,
+    other_zeros,
+    procedure,
+    whole_number,
+)
+from optid.bases import Linear, fitted_bases
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import StructureError
+from optid.regressors import Layout
+from optid.regressors.noise_sensitivities import NoiseUnknowns
+from optid.regressors.sensitivities import Unknowns
+from optid.solving import Procedure
+
+
+def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nk: int | Sequence[int] = 0,
+           constraints: Sequence[Any] = (), offset: bool = True, starts: int = 3, seed: int = 0) -> Procedure:
+    """Minimise the innovations of a linear ARMAX model.
+
+    Args:
+        data: the record; one output; samples may be missing.
+        na: order of A.
+        nb: number of coefficients of B, one per input or one for all.
+        nc: order of C.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``, ``c``.
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        starts: number of starts that are compared.
+        seed: of the random ones.
+
+    Raises:
+        StructureError: impossible orders, several outputs.
+        RankError: too few samples for the unknowns.
+    """
+    return _posed("armax.exact", data, Linear(), False, "none", na, nb, nc, nk, constraints, offset, starts, seed)
+
+
+def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, basis: Basis | str | Sequence[Basis | str],
+          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True,
+          starts: int = 3, seed: int = 0) -> Procedure:
+    """Minimise the innovations of a Hammerstein ARMAX model.
+
+    Args:
+        data: the record; one output; samples may be missing.
+        na: order of A.
+        nb: number of coefficients of B, one per input or one for all.
+        nc: order of C.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        starts: number of starts that are compared.
+        seed: of the random ones.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge, several outputs.
+        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+    """
+    if gauge not in GAUGES:
+        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    return _posed("hammerstein_armax.exact", data, basis, True, gauge, na, nb, nc, nk, constraints, offset, starts,
+                  seed)
+
+
+def _posed(name: str, data: Data, basis: Any, free: bool, gauge: str, na: int, nb: Any, nc: int, nk: Any,
+           constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
+    record = one_output(data)
+    inputs = record.inputs
+    layout = Layout(whole_number("na", na), per_channel("nb", nb, inputs, low=1), per_channel("nk", nk, inputs, low=0),
+                    fitted_bases(record, basis), record.outputs, inputs)
+    if whole_number("starts", starts) < 1:
+        raise StructureError("starts is the number of starts, a whole number from 1; got 0")
+    plant = Unknowns(layout, record.n_experiments, (free,) * layout.m, bool(offset))
+    unknowns = NoiseUnknowns(plant, whole_number("nc", nc))
+    criterion = PredictionErrors(record, unknowns, "norm" if free else "none")
+    found = other_zeros(extended_least_squares(criterion), unknowns, starts, seed)
+    return procedure(name, criterion, found, constraints, gauge)

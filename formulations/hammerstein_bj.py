@@ -1,0 +1,157 @@
+"""Box-Jenkins: ``y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + C(q)/D(q) e``, the sum of squared innovations minimised.
+
+`exact` is the Hammerstein model, `linear` (registered as ``bj.exact``) the linear one. Both are procedures of the
+prediction-error method (Ljung 1999, section 4.2): starts from the output-error fit and from ARMAX, with the noise model
+of the output left over (Hannan and Rissanen 1982), Gauss-Newton, and convex programmes in the tangent of the iterate,
+in which any constraint and any conic or quadratic back end may take part. Named variables: ``a``, ``b``, ``mu`` (not
+in the linear model), ``offset``, ``c``, ``d``, ``x0`` ((n,), or (n, experiments)), and
+``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` about the iterate (mu0, b0). With several inputs the per-channel names carry the
+input, as in ``mu[valve]``.
+
+Every experiment has its own initial state of the plant; the noise starts from rest. Where the output is missing the
+innovation counts as zero and the prediction takes its place; every input is needed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from formulations.equation_error import compress
+from formulations.hammerstein_arx import GAUGES
+from formulations.hammerstein_oe import OutputError, check_excited, check_rows, checked_record, plant_layout, search
+from formulations.noise_models import (
+    PredictionErrors,
+    arma,
+    extended_least_squares,
+    one_output,
+    other_zeros,
+    procedure,
+    whole_number,
+)
+from formulations.output_error_starts import stable_poles, with_poles
+from optid.bases import Linear, fitted_bases
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import OptidError, StructureError
+from optid.regressors import Layout
+from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns
+from optid.regressors.sensitivities import Unknowns, simulate
+from optid.solving import Procedure
+
+Array = np.ndarray
+
+ROWS_PER_COLUMN = 1.1
+
+
+def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk: int | Sequence[int] = 0,
+           constraints: Sequence[Any] = (), offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
+    """Minimise the innovations of a linear Box-Jenkins model.
+
+    Args:
+        data: the record: every input sample present, outputs may be missing; one output.
+        na: number of poles of the plant.
+        nb: number of coefficients of B, one per input or one for all.
+        nc: order of C.
+        nd: order of D.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``, ``c``, ``d``, ``x0``.
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        starts: number of starts that are compared.
+        seed: of the random ones.
+
+    Raises:
+        StructureError: impossible orders, several outputs.
+        DataError: a missing input sample.
+        RankError: too few samples for the unknowns.
+    """
+    record = checked_record(one_output(data))
+    layout = plant_layout(record, na, nb, nk, fitted_bases(record, Linear()))
+    return _posed("bj.exact", record, layout, False, "none", nc, nd, constraints, offset, starts, seed)
+
+
+def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
+          basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (),
+          gauge: str = "norm", offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
+    """Minimise the innovations of a Hammerstein Box-Jenkins model.
+
+    Args:
+        data: the record: every input sample present, outputs may be missing; one output.
+        na: number of poles of the plant.
+        nb: number of coefficients of B, one per input or one for all.
+        nc: order of C.
+        nd: order of D.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        starts: number of starts that are compared.
+        seed: of the random ones.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge, several outputs.
+        DataError: a missing input sample.
+        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+    """
+    if gauge not in GAUGES:
+        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    record = checked_record(one_output(data))
+    layout = plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+    check_excited(record, layout)
+    return _posed("hammerstein_bj.exact", record, layout, True, gauge, nc, nd, constraints, offset, starts, seed)
+
+
+def _posed(name: str, data: Data, layout: Layout, free: bool, gauge: str, nc: int, nd: int,
+           constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
+    if whole_number("starts", starts) < 1:
+        raise StructureError("starts is the number of starts, a whole number from 1; got 0")
+    plant = Unknowns(layout, data.n_experiments, (free,) * layout.m, bool(offset))
+    unknowns = NoiseUnknowns(plant, whole_number("nc", nc), whole_number("nd", nd))
+    check_rows(data, plant)
+    check_inputs_differ(data, layout)
+    criterion = PredictionErrors(data, unknowns, "norm" if free else "none")
+    return procedure(name, criterion, _starts(criterion, starts, seed), constraints, gauge)
+
+
+def check_inputs_differ(data: Data, layout: Layout) -> None:
+    """Refuse inputs that the record does not tell apart.
+
+    Raises:
+        RankError: naming two columns of the expanded inputs of which one depends on the other.
+    """
+    columns = 1 + sum(nb * basis.size for nb, basis in zip(layout.nb, layout.bases))
+    if layout.m > 1 and sum(e.n_samples - layout.first_row for e in data.experiments) >= ROWS_PER_COLUMN * columns:
+        complete = Data([e.u for e in data.experiments], [e.u[:, :1] for e in data.experiments], data.dt,
+                        list(data.inputs), list(data.outputs))
+        compress(complete, na=0, nb=layout.nb, nk=layout.nk, basis=layout.bases)
+
+
+def _starts(criterion: PredictionErrors, count: int, seed: int) -> dict[str, Array]:
+    """Plants of an output-error and of an ARMAX fit, each with the noise model of what they leave of the output."""
+    data, unknowns = criterion.data, criterion.unknowns
+    plain = OutputError(data, unknowns.plant, criterion.gauge)
+    plants = {"output error": search(plain, min(count, 4), seed)[0].x}
+    if count > 1 and unknowns.layout.na:
+        armax = _armax_plant(criterion, plain)
+        plants |= {} if armax is None else {"ARMAX": armax}
+    found = {}
+    for name, x in plants.items():
+        point = unknowns.plant.unpack(x)
+        rest = [e.y[:, 0] - y for e, y in zip(data.experiments, simulate(data, unknowns.plant, point))]
+        found[name] = unknowns.pack(NoisePoint(point, *arma(rest, unknowns.nc, unknowns.nd or 0)))
+    return other_zeros(found, unknowns, count, seed)
+
+
+def _armax_plant(criterion: PredictionErrors, plain: OutputError) -> Array | None:
+    """Return the plant of extended least squares with as many zeros of C as poles, its states fitted."""
+    unknowns = criterion.unknowns
+    alike = NoiseUnknowns(unknowns.plant, max(unknowns.nc, unknowns.layout.na))
+    try:
+        x = next(iter(extended_least_squares(replace(criterion, unknowns=alike)).values()))
+    except OptidError:  # a plant that least squares of the equation error does not determine has the other start
+        return None
+    x = unknowns.plant.pack(alike.unpack(x).plant)
+    at = unknowns.plant.slices["a"]
+    return with_poles(plain, unknowns.plant, plain.normalised(x), stable_poles(x[at]), "ARMAX").x
