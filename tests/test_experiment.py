@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 import optid
 from optid import plants
 from optid.cli.app import app
-from optid.errors import DataError, LookupFailed, StructureError
+from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.experiment import design, frequency_response
 from optid.experiment.expansion import expanded_condition, expansion_of, feedback_bases
 from optid.experiment.rules import check_feedback
@@ -136,6 +136,14 @@ def test_levels_are_counted_and_those_asked_for_draw_no_warning():
     found = design(PENDULUM, levels=12)
     assert found.promise.levels == (12,) == (np.unique(found.u).size,)
     assert np.ptp(np.diff(np.unique(found.u))) < 1e-12
+
+
+def test_a_band_that_was_not_asked_for_grows_until_the_lags_differ():
+    slow = plants.van_der_pol(np.random.default_rng(1).uniform(-2, 2, 6000), measurement=0.02)
+    found = design(slow)
+    assert found.promise.condition < 1e4 and found.promise.band[1] > 1.5
+    with pytest.warns(DataWarning, match="poorly excited"):  # who asks for a band gets it, and is told
+        assert design(slow, band=(0.0, 0.6)).promise.band == (0.0, 0.6)
 
 
 def test_the_best_of_several_realisations_is_kept():

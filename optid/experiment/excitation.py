@@ -31,6 +31,9 @@ FAINT = 0.05
 TRUSTED = 0.5
 """Coherence below which the measured gain says more of the disturbance than of the plant."""
 
+WANTED, WIDER = 1e4, 1.3
+"""A band that was not asked for grows by this factor until the condition number is no larger."""
+
 BOOST = 10.0
 """Shaping raises no frequency by more than this factor over the strongest."""
 
@@ -83,7 +86,8 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         n: samples; as many as the longest experiment of the record when not given.
         levels: number of equally spaced values that each input takes; any value when not given.
         band: lowest and highest frequency (1/unit of dt); when not given, from the lowest line to the last one with a
-            measured gain above 5 % of its largest and a coherence above one half.
+            measured gain above 5 % of its largest and a coherence above one half, and further where the lags of slow
+            signals would be too much alike (condition number above 10,000).
         amplitude: (low, high) for all inputs or one pair per input; the ranges of the record when not given.
         shaped: weight the spectrum (multisine) or the envelope (chirp) by the inverse of the measured gain, so that the
             outputs move alike at every frequency.
@@ -111,21 +115,25 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     # held levels have the spectrum that holding gives them
     limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
     few = FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
-    best: tuple[Array, Promise] | None = None
-    for draw in range(1 if kind == "chirp" else candidates):
+    top = 0.9 * float(measured.frequency[-1])
+
+    def realised(draw: int) -> tuple[Array, Promise]:
         columns = []
         for c, span in enumerate(ranges):
-            weight = (lambda f, c=c: _inverse_gain(measured, c, f)) if shaped else None
+            weight = (lambda f: _inverse_gain(measured, c, f)) if shaped else None  # noqa: B023 - used at once
             x = _signal(kind, n, span, like.dt, limits, weight, hold, periods, seed + draw * like.m + c)
             if kind == "chirp":
                 x = np.roll(x, c * n // (SWEEPS * like.m))  # inputs that sweep in step could not be told apart
             columns.append(x if levels is None else _quantised(x, *span, levels))
         u = np.column_stack(columns)
-        trial = promised(u, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
-        if best is None or trial.condition < best[1].condition:
-            best = u, trial
-    assert best is not None  # there is at least one candidate
-    u, promise = best
+        return u, promised(u, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
+
+    while True:
+        draws = map(realised, range(1 if kind == "chirp" else candidates))
+        u, promise = min(draws, key=lambda pair: pair[1].condition)
+        if promise.condition <= WANTED or band is not None or kind == "levels" or limits[1] >= top:
+            break
+        limits = limits[0], min(WIDER * limits[1], top)
     for check in promise.checks:
         if check.severity == "error":
             raise StructureError(f"this {kind} breaks a rule of design: {check.sentence}")
