@@ -110,6 +110,11 @@ class EquationError:
             found.append(np.reshape(theta, shape))
         return found
 
+    def lifted(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return z of named values, whatever variables the formulation uses."""
+        parts = [values[name] for name in ("a", "offset") if name in values]
+        return np.concatenate([np.ravel(part, order="F") for part in [*parts, *self.matrices(values)]])
+
     def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the coefficients (n_columns, l) of the regressor's columns in the order of the layout."""
         ny, na = self.outputs, self.layout.na

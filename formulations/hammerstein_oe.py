@@ -30,7 +30,7 @@ from optid.models.gauges import gauge_factor, leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.program import Program, Values, View
 from optid.regressors import Layout
-from optid.regressors.sensitivities import Linearised, PlantPoint, Unknowns, linearise
+from optid.regressors.sensitivities import Linearised, Unknowns, linearise
 from optid.solving import Procedure
 
 Array = np.ndarray
@@ -131,6 +131,12 @@ def checked_record(data: Any) -> Data:
 
 
 def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]) -> Layout:
+    """Return the checked orders of the plant.
+
+    Raises:
+        StructureError: impossible orders.
+        RankError: an experiment that its initial state would explain.
+    """
     if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
         raise StructureError(f"na is the number of poles, a whole number from 0; got {na!r}")
     layout = Layout(int(na), per_channel("nb", nb, data.inputs, low=1), per_channel("nk", nk, data.inputs, low=0),
@@ -144,6 +150,7 @@ def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]
 
 
 def check_rows(data: Data, unknowns: Unknowns) -> None:
+    """Refuse a record with fewer than 1.1 outputs per unknown (`RankError`)."""
     rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
     if rows < ROWS_PER_UNKNOWN * unknowns.size:
         raise RankError(f"{rows} output samples for {unknowns.size} unknowns (initial states included): at least "
@@ -275,12 +282,12 @@ def _searched(criterion: OutputError, count: int, seed: int) -> tuple[Descent, l
     found = best_of(part, _starts(part, count, seed))
     if not found:
         raise RankError("no start has a stable simulation; use other orders")
-    agreed, sentence = agreement(found, 1e-12 * part.energy)
+    _, sentence = agreement(found, 1e-12 * part.energy)
     best = found[0]
     x = np.zeros(criterion.unknowns.size)
     x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
     final = descend(criterion, best.x if part is criterion else x, start=best.start)
-    figures = {"starts": sentence, "starts that agree": agreed,
+    figures = {"starts": sentence,
                "simulation errors of the starts": np.array(sorted((one.value for one in found), reverse=True))}
     others = [one for one in found[1:] if abs(one.value - best.value) > 1e-3 * best.value] if part is criterion else []
     return replace(final, steps=final.steps + best.steps), others, figures
@@ -464,7 +471,7 @@ class Posing:
                                   - np.outer(values[mu], values[b]))
             gauges.append(self._gauge(variables[b], values[b], variables.get("a")))
         energy = np.array([self.criterion.energy])
-        compressed = Simulated(at, tuple(self.places), x, energy, unknowns.layout, at.rows)
+        compressed = Simulated(at, tuple(self.places), x, energy, unknowns.layout, self.criterion.data.n_samples)
         stacked = cp.hstack([flat(v) for v in variables.values()])
         residual = compressed.problem.root @ stacked - compressed.problem.target
         r = cp.Variable(x.size, name="residual")
@@ -523,29 +530,33 @@ class Posing:
         return measure_violation(program)[0] <= 1e-9
 
     def signed(self, x: Array) -> Array:
-        """Turn the signs of (mu, b) to where the constraints are violated least.
+        """Turn the signs of mu and b to where the constraints are violated least.
 
-        A monotone f or a sign of the gain says which of the two equal descriptions is meant.
+        A monotone f or a sign of the gain says which of the two equal descriptions is meant; where it asks for the
+        opposite characteristic, mu or b alone is turned, since no tangent step leads through zero.
         """
         x = self.criterion.normalised(x)
         at, unknowns = self.criterion.unknowns.slices, self.criterion.unknowns
+        errors = self.criterion.linearise(x) if self.constraints else None
         for c, free in enumerate(unknowns.free if self.criterion.gauge == "norm" else ()):
             if not free:
                 continue
-            turned = np.array(x)
-            turned[at[f"mu{c}"]] *= -1.0
-            turned[at[f"b{c}"]] *= -1.0
-            if not self.constraints:
-                x = turned if leading_sign(x[at[f"b{c}"]]) < 0 else x
-                continue
-            at_x = self.criterion.linearise(x)
-            sizes = []
-            for one in (x, turned):
-                program = self.pose(one, at_x, 0.0)
-                program.assign(program.start)
-                sizes.append(measure_violation(program)[0])
-            x = turned if sizes[1] < sizes[0] or (
-                sizes[1] == sizes[0] and leading_sign(x[at[f"b{c}"]]) < 0) else x
+            first = leading_sign(x[at[f"b{c}"]])
+            best = np.inf
+            for mu_sign, b_sign in ((first, first), (-first, -first), (-first, first), (first, -first)):
+                turned = np.array(x)
+                turned[at[f"mu{c}"]] *= mu_sign
+                turned[at[f"b{c}"]] *= b_sign
+                outside = 0.0
+                if errors is not None:
+                    program = self.pose(turned, errors, 0.0)
+                    program.assign(program.start)
+                    outside = measure_violation(program)[0]
+                if outside < (best if mu_sign == b_sign else 0.5 * best):
+                    best, chosen = outside, turned
+                if best <= 1e-9:
+                    break
+            x = chosen
         return x
 
     def model(self, x: Array) -> HammersteinTF:
@@ -562,6 +573,6 @@ class Posing:
             bs.append(np.asarray(values[self.key("b", c)], dtype=float))
         plant = HammersteinARX(a=np.asarray(values.get("a", np.zeros(0)), dtype=float), b=tuple(bs),
                                nonlinearities=tuple(nonlinearities), nk=unknowns.layout.nk,
-                               offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float), gauge=self.criterion.gauge,
-                               **model_meta(self.criterion.data))
+                               offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
+                               gauge=self.criterion.gauge, **model_meta(self.criterion.data))
         return self.criterion.with_noise(plant, values)

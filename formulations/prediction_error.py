@@ -31,6 +31,9 @@ CONFIRMED = 1e-8
 EXACT = 1e-24
 """Sum of squared errors, as a share of the energy of the record, that counts as zero."""
 
+STALLED = 1e-6
+"""Share that counts as nothing where programme after programme gains as little: a curved boundary is followed."""
+
 INSIDE = 1e-8
 """Relative violation up to which a point satisfies the constraints."""
 
@@ -239,22 +242,26 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
     criterion, floor = posed.criterion, criterion_floor(posed.criterion)
     previous: _Iterate | None = None
-    damping, growth, weight = 0.0, 4.0, 0.0
+    damping, growth, weight, last = 0.0, 4.0, 0.0, np.inf
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, STEPS + 1):
         solution = yield here.program if not damping else posed.pose(here.x, here.at, damping)
         if not solution.has_point:
-            if previous is None or solution.status is not Status.INFEASIBLE:
+            if (solution.status is Status.INFEASIBLE and previous is None) or damping > 1e3:
                 return None
-            here, previous, damping = previous, None, max(100.0 * damping, 1e-3)
+            if solution.status is Status.INFEASIBLE and previous is not None:
+                here, previous = previous, None
+            damping = max(100.0 * damping, 1e-6)  # a nearer point, and a better conditioned programme
             continue
         reached = posed.pack(solution.values)
         gain = here.at.value - _quadratic(here.at, reached - here.x)
         weight = max(weight, 2.0 * _largest_dual(here.program, solution))
         reached = criterion.normalised(reached)
         new = _Iterate.of(posed, reached) if criterion.admissible(reached) else None
-        if not damping and abs(gain) <= CONFIRMED * here.at.value + floor and here.outside <= INSIDE:
-            status, reason = _judged(solution, gain, here.at.value, floor)
+        share = CONFIRMED if abs(gain) < 0.5 * last else STALLED
+        last = abs(gain) if not damping else last
+        if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:
+            status, reason = _judged(solution, gain, here.at.value, floor, share)
             best = here if new is None or new.outside > INSIDE else new
             return _evidence(posed, best, status, reason, {**figures, "programmes": count})
         expected = gain + weight * here.amount
@@ -267,7 +274,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
                 return _evidence(posed, here, Status.LIMIT, "no step descends", {**figures, "programmes": count})
-        if damping < 1e-10 or (fall >= 0 and gain <= 1e2 * CONFIRMED * here.at.value):
+        if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
     reason = f"{STEPS} programmes did not suffice"
     return _evidence(posed, here, Status.LIMIT, reason, {**figures, "programmes": STEPS})
@@ -278,18 +285,20 @@ def criterion_floor(criterion: Criterion) -> float:
     return 1e-14 * criterion.energy
 
 
-def _judged(solution: Solution, gain: float, value: float, floor: float) -> tuple[Status, str]:
+def _judged(solution: Solution, gain: float, value: float, floor: float, share: float = CONFIRMED
+            ) -> tuple[Status, str]:
     """What a back end's answer to the last programme makes of its reference: it must have been solved, and stay."""
     if solution.status not in (Status.OPTIMAL, Status.LOCAL):
         return solution.status, solution.reason
-    if abs(gain) > CONFIRMED * value + floor:
+    if abs(gain) > share * value + floor:
         return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
                                    f"{abs(gain) / max(value, 1e-300):.0e} of its value")
     return Status.LOCAL, NO_BOUND
 
 
 def _evidence(posed: Posed, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
-    return Evidence(posed.model(here.x), here.at.value, Bound(-np.inf, False, "none", NO_BOUND), status, reason, figures)
+    bound = Bound(-np.inf, False, "none", NO_BOUND)
+    return Evidence(posed.model(here.x), here.at.value, bound, status, reason, figures)
 
 
 def _quadratic(at: Linearised, step: Array) -> float:

@@ -103,7 +103,9 @@ def _positive_real(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
     values = 1 + lags @ scaled
     size = np.abs(values) ** 2
     rows = np.real(np.conj(values)[:, None] * lags * powers) / size[:, None]
-    return rows, GAP - np.real(values) / size
+    levels = GAP - np.real(values) / size
+    unit = np.maximum(np.max(np.abs(rows), axis=1), np.abs(levels))  # near a root of C rows are larger by decades
+    return rows / unit[:, None], levels / unit
 
 
 def frequencies(roots: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ gauge and the user's equalities leave free, in coordinates where the information
 depend on the gauge, such as ``mu bᵀ`` or a prediction, then has a covariance that does not depend on it either.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -88,7 +87,7 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     program.assign(found)
     equalities, inequalities, slack = _constraint_rows(program, names)
 
-    lift, lifted = _differences(lambda x: _lifted(compressed, unpacked(names, shapes, x)), x)
+    lift, lifted = _differences(lambda x: compressed.lifted(unpacked(names, shapes, x)), x)
     coefficients, regression = _differences(lambda x: compressed.regression(unpacked(names, shapes, x)).ravel(), x)
     problem, statistics = compressed.problem, compressed.statistics
     effect = problem.root @ lift
@@ -127,7 +126,7 @@ def unpacked(names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], x: Arr
 def _refuse(fit: Any) -> None:
     if not fit.solution.has_point:
         raise StructureError("the fit has no point, so there is nothing to put intervals around")
-    if not all(hasattr(fit.program.compressed, part) for part in ("problem", "statistics", "regression", "matrices")):
+    if not all(hasattr(fit.program.compressed, part) for part in ("problem", "statistics", "regression", "lifted")):
         raise StructureError(f"{fit.formulation!r} is no compressed least-squares problem; use optid.bootstrap")
     loss = str(fit.arguments.get("loss", "squares"))
     if loss != "squares":
@@ -137,11 +136,6 @@ def _refuse(fit: Any) -> None:
     if weight is not None and np.any(np.asarray(weight.value) > 0):
         raise StructureError("the nuclear norm shrinks Theta by an amount that no interval accounts for; refit with "
                              "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
-
-
-def _lifted(compressed: Any, values: Mapping[str, Array]) -> Array:
-    parts = [values[name] for name in ("a", "offset") if name in values]
-    return np.concatenate([np.ravel(part, order="F") for part in [*parts, *compressed.matrices(values)]])
 
 
 def _differences(function: Any, x: Array) -> tuple[Array, Array]:

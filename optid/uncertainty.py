@@ -10,7 +10,7 @@ from refits.
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -265,7 +265,8 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0
     """Linearise a fit and return its standard errors, intervals and bands.
 
     Args:
-        fit: a least-squares fit (``arx``, ``hammerstein_arx.exact`` or ``.overparametrised``); with ``ridge`` or
+        fit: a least-squares fit (``arx``, ``hammerstein_arx.exact`` or ``.overparametrised``), or one of prediction
+            errors (``oe.exact``, ``hammerstein_oe.exact``), whose errors count as white; with ``ridge`` or
             ``curvature`` the intervals are those of the posterior whose prior is the penalty.
         level: probability that an interval contains the truth, in (0, 1).
         draws: random draws for intervals under inequality constraints, at least 100.
@@ -276,13 +277,16 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    if fit.model is not None and fit.model.kind != "HammersteinARX":
-        raise StructureError(f"they follow from the statistics of ARX fits; this is a {fit.model.title}")
+    if not hasattr(fit.program.compressed, "lifted"):
+        raise StructureError(f"they follow from compressed least squares, which {fit.formulation!r} does not keep; "
+                             "use optid.bootstrap")
     return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
 
 
-def aligned(model: "HammersteinARX", reference: "HammersteinARX") -> "HammersteinARX":
+def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
+    if hasattr(model, "plant"):  # transfer-function models keep their noise
+        return replace(model, plant=aligned(model.plant, reference.plant))
     signs = [-1.0 if float(np.sum(b * other)) < 0 else 1.0 for b, other in zip(model.b, reference.b)]
     if all(sign > 0 for sign in signs):
         return model

@@ -10,14 +10,13 @@ chunk to the next. The initial states of an experiment are eliminated within it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.errors import StructureError
 from optid.regressors.factors import add_to_root, conditioning
 from optid.regressors.layout import Layout
 
@@ -205,7 +204,7 @@ def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None
 
 
 def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK) -> Array:
-    """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors], initial states eliminated.
+    """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors] without initial states.
 
     It holds the normal equations of Steiglitz-McBride and of the refined instrumental variable: in both the measured
     output takes the place of the simulated one in the columns of a. Missing outputs are replaced by simulated ones.
@@ -400,22 +399,3 @@ def _weighted(gauge: Array | None, rest: Sequence[Array], p: int) -> list[Array]
     energy = np.sqrt(sum(np.sum(part[:, :p] ** 2, axis=0) for part in rest))
     lengths = np.abs(gauge) @ energy / np.maximum(np.sum(np.abs(gauge), axis=1), 1e-300)
     return [np.hstack([gauge * np.where(lengths > 0, lengths, 1.0)[:, None], np.zeros((len(gauge), 1))])]
-
-
-def checked(layout: Layout) -> Layout:
-    """Refuse what a simulation with sensitivities cannot have.
-
-    Raises:
-        StructureError: several outputs.
-    """
-    if layout.l > 1:
-        raise StructureError(
-            f"An output-error model has one output; there are {layout.l} ({', '.join(layout.outputs)}). Fit each one "
-            "by itself with data.select(outputs=...), or all together with hammerstein_ss.exact."
-        )
-    return layout
-
-
-def moved(point: PlantPoint, **changes: Any) -> PlantPoint:
-    """Return a point with some parts replaced."""
-    return replace(point, **changes)
