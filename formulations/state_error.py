@@ -1,0 +1,196 @@
+"""The error of a state-space model as a function of its unknowns: simulation (K = 0) or innovation form.
+
+Unknowns live in the full matrices; the directions along which a change of states moves them, and the scale between mu
+and b, are projected out at every iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from formulations.equation_error import model_meta
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.models import HammersteinSS, Nonlinearity
+from optid.regressors.sensitivities import Linearised
+from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
+
+Array = np.ndarray
+
+STABLE = 1 - 1e-9
+FLOOR = 1e-7
+"""Smallest standard deviation of an error that weights may rest on, as a share of that of its output."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateError:
+    """A `formulations.prediction_error.Criterion`: the weighted sum of squared errors of all outputs.
+
+    Attributes:
+        data: the record.
+        unknowns: their order; with innovations the errors are those of one-step prediction, otherwise of simulation
+            with measured feedback.
+        weight: (l, l) weight of the errors.
+        checks: constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is.
+    """
+
+    data: Data
+    unknowns: StateUnknowns
+    weight: Array
+    checks: tuple[Callable[[Any], str], ...] = ()
+
+    @cached_property
+    def energy(self) -> float:
+        """Weighted sum of squares of the outputs about their means."""
+        y = np.vstack([e.y for e in self.data.experiments])
+        y = np.nan_to_num(y - np.nanmean(y, axis=0))
+        return float(np.sum((y @ self.weight) * y))
+
+    def linearise(self, x: Array) -> Linearised:
+        """Return the errors near x."""
+        return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x))
+
+    def admissible(self, x: Array) -> bool:
+        """Whether the matrix that carries the state is stable, and the constraints on poles hold."""
+        if not np.all(np.isfinite(x)):
+            return False
+        point = self.unknowns.unpack(x)
+        inner = point.A - point.K @ point.C
+        if np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0) >= STABLE:
+            return False
+        return not self.checks or not any(check(self.at(point)) for check in self.checks)
+
+    def normalised(self, x: Array) -> Array:
+        """Return the same model with [b; d] of every free input, and e of every family, of norm one."""
+        x, at = np.array(x), self.unknowns.slices
+        for outer, inner in (("b", "mu"), ("e", "nu")):
+            for name in [name for name in at if name.startswith(inner)]:
+                column = outer + name[len(inner) :]
+                size = float(np.linalg.norm(x[at[column]]))
+                if size:
+                    x[at[name]], x[at[column]] = x[at[name]] * size, x[at[column]] / size
+                else:  # a channel without effect: any direction will do
+                    x[at[name]], x[at[column]] = 0.0, 1 / np.sqrt(x[at[column]].size)
+        return x
+
+    def gauge_rows(self, x: Array) -> Array:
+        """Orthonormal directions (rows, shared) of theta that a step does not take, since they change no output."""
+        at, rows = self.unknowns.slices, list(self.unknowns.similarity(x))
+        for outer, inner in (("b", "mu"), ("e", "nu")):
+            for name in [name for name in at if name.startswith(inner)]:
+                row, column = np.zeros(self.unknowns.shared), outer + name[len(inner) :]
+                row[at[name]], row[at[column]] = x[at[name]], -x[at[column]]
+                rows.append(row)
+        if not rows:
+            return np.zeros((0, self.unknowns.shared))
+        values, vectors = np.linalg.svd(np.array(rows), full_matrices=False)[1:]
+        return vectors[values > 1e-12 * values[0]]
+
+    def residuals(self, x: Array) -> list[Array]:
+        """Return the errors (N, l) of every experiment."""
+        return residuals(self.data, self.unknowns, x, self.at)
+
+    def reweighted(self, x: Array, full: bool) -> "StateError":
+        """Return the criterion weighted by the inverse (co)variance of the errors at x.
+
+        A fixed point of this iteration is stationary for the determinant of the covariance (``full``), or the product
+        of the variances, of the errors.
+        """
+        errors = np.vstack(self.residuals(x))
+        floor = FLOOR * np.nanstd(np.vstack([e.y for e in self.data.experiments]), axis=0)
+        complete = errors[~np.isnan(errors).any(axis=1)]
+        variances = np.maximum(np.nanmean(errors**2, axis=0), floor**2)
+        covariance = np.diag(variances)
+        if full and len(complete) > 10 * errors.shape[1]:
+            covariance = complete.T @ complete / len(complete) + np.diag(floor**2)
+        return replace(self, weight=np.linalg.inv(covariance))
+
+    def level(self, x: Array) -> float:
+        """Return the sum of log variances of the errors, by which points of different weights are compared."""
+        errors = np.vstack(self.residuals(x))
+        floor = FLOOR * np.nanstd(np.vstack([e.y for e in self.data.experiments]), axis=0)
+        return float(np.sum(np.log(np.maximum(np.nanmean(errors**2, axis=0), floor**2))))
+
+    def at(self, point: StatePoint) -> HammersteinSS:
+        """Build the model of a point."""
+        expansion, n, outputs = self.unknowns.expansion, self.unknowns.n, self.unknowns.l
+        families = expansion.feedback
+        injection, constant = np.zeros((n, outputs)), np.zeros(n)
+        for family, nu, e in zip(families, point.nus, point.e.T):
+            injection -= np.outer(e, nu @ family.slope)
+            constant -= e * (nu @ family.intercept)
+        return HammersteinSS(
+            A=point.A, B=point.b, C=point.C, D=point.d, K=point.K, E=point.e if families else None, L=injection,
+            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, point.mus)),
+            feedback=tuple(Nonlinearity(g.basis, g.vectors @ nu) for g, nu in zip(families, point.nus)),
+            output_of=tuple(g.output for g in families), offset_x=constant, offset_y=point.offset,
+            **model_meta(self.data))
+
+    def point_of(self, model: HammersteinSS) -> StatePoint:
+        """Return the point of a model of the same structure, its initial states zero.
+
+        Raises:
+            StructureError: another number of states, or functions other than the criterion's.
+        """
+        unknowns, x = self.unknowns, self.unknowns.expansion
+        if model.nx != unknowns.n or model.m != x.m or model.l != x.l or len(model.nonlinearities) != x.m:
+            raise StructureError(f"a start has {model.nx} states, {model.m} inputs and {model.l} outputs; "
+                                 f"{unknowns.n}, {x.m} and {x.l} are needed")
+        same = [f.basis.to_dict() == basis.to_dict() for f, basis in zip(model.nonlinearities, x.inputs)]
+        same += [g.basis.to_dict() == family.basis.to_dict() for g, family in zip(model.feedback, x.feedback)]
+        if not all(same) or len(model.feedback) > len(x.feedback):
+            raise StructureError("a start has other basis functions than the fit: give it the same bases")
+        mus = [np.ones(1) if not free else f.mu for f, free in zip(model.nonlinearities, unknowns.free)]
+        scale = [1.0 if free else float(f.mu[0]) for f, free in zip(model.nonlinearities, unknowns.free)]
+        nus, columns = [np.ones(family.size) for family in x.feedback], np.zeros((unknowns.n, len(x.feedback)))
+        constant, injection = np.array(model.offset_x), np.array(model.L)
+        for f, (g, family) in enumerate(zip(model.feedback, x.feedback)):
+            nu = np.linalg.lstsq(family.vectors, g.mu)[0]
+            constant += model.E[:, f] * (nu @ family.intercept)
+            injection += np.outer(model.E[:, f], nu @ family.slope)
+            nus[f], columns[:, f] = (nu, model.E[:, f]) if family.size > 1 else (np.ones(1), model.E[:, f] * nu[0])
+        # what is left of L goes into A; the constant of the state into that of the output
+        A, b = model.A + injection @ model.C, (model.B + injection @ model.D) * scale
+        constant = constant + injection @ model.offset_y
+        shift = np.linalg.lstsq(np.eye(unknowns.n) - A, constant)[0]
+        gain = model.K + injection if unknowns.innovations else np.zeros_like(model.K)
+        d = model.D * scale * np.array(unknowns.feedthrough)
+        offset = model.offset_y + model.C @ shift if unknowns.constant else np.zeros(unknowns.l)
+        x0 = np.zeros((unknowns.experiments, unknowns.n))
+        return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0)
+
+
+def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
+            ) -> Array | None:
+    """Return an admissible vector of unknowns near a model, in balanced states where it has them; None without one.
+
+    A model whose state is not carried stably is contracted; the initial states are those that fit best.
+    """
+    if model.is_stable:
+        try:
+            model = model.balanced()
+        except StructureError:
+            pass
+    point = criterion.point_of(model)
+    candidates = [point]
+    if criterion.unknowns.innovations:
+        candidates.append(replace(point, K=np.zeros_like(point.K)))
+    largest = float(np.max(np.abs(np.linalg.eigvals(point.A)), initial=0.0))
+    candidates += [replace(point, A=point.A * (radius / max(largest, radius)), K=np.zeros_like(point.K))
+                   for radius in radii]
+    for candidate in candidates:
+        x = criterion.normalised(criterion.unknowns.pack(candidate))
+        if not criterion.admissible(x):
+            continue
+        try:
+            at = criterion.linearise(x)
+        except (DataError, np.linalg.LinAlgError):
+            continue
+        if np.isfinite(at.value):
+            p = criterion.unknowns.shared
+            x[p:] += at.follow(np.zeros(p))
+            return x
+    return None
