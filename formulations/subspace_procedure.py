@@ -120,6 +120,15 @@ def _feedback_bases(data: Data, given: Any) -> list[Basis | None]:
     return found
 
 
+def prepared(plan: Plan) -> tuple[Expansion, int]:
+    """Return the signals of a plan and its number of block rows, after the checks of its channels."""
+    data = plan.data
+    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
+                       data.inputs, data.outputs)
+    check_channels(plan.records, data.inputs, data.outputs)
+    return expansion, _block_rows(plan, expansion)
+
+
 def identified(plan: Plan) -> Procedure:
     """Run the steps of a plan: project, find the order, choose (A, C), then B, D, E and x0, then the noise model.
 
@@ -129,11 +138,7 @@ def identified(plan: Plan) -> Procedure:
     Returns:
         The model with singular values, condition of R11 and further figures.
     """
-    data = plan.data
-    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
-                       data.inputs, data.outputs)
-    check_channels(plan.records, data.inputs, data.outputs)
-    alpha = _block_rows(plan, expansion)
+    expansion, alpha = prepared(plan)
     records, instruments = plan.records, plan.instruments
     if instruments.startswith("simulated"):
         if expansion.q:
@@ -142,9 +147,35 @@ def identified(plan: Plan) -> Procedure:
             instruments = instruments.replace("simulated", "inputs")
     projection = _projected(plan, records, expansion, alpha, instruments)
     nx, gap = _order(plan, projection)
-    gamma = projection.gamma(nx)
+    figures = {"order": nx, "block rows": alpha, "instruments": instruments,
+               "singular values": projection.range.values, "gap of singular values": gap,
+               "condition of R11": projection.blocks.condition}
+    if projection.blocks.discarded:
+        figures["regressor directions left out"] = projection.blocks.discarded
+    return (yield from completed(plan, records, expansion, projection.gamma(nx), projection.scale, figures))
+
+
+def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma: np.ndarray, scale: np.ndarray,
+              figures: dict[str, Any]) -> Procedure:
+    """Run the steps after the observability matrix: (A, C), then B, D, E and x0, then the noise model.
+
+    Args:
+        plan: what was asked for.
+        records: raw channels, with simulated outputs where the expansion reads them.
+        expansion: the signals.
+        gamma: (rows l, n) observability matrix.
+        scale: (l,) sizes of the outputs, by which residuals are divided.
+        figures: what was measured before.
+
+    Yields:
+        The programmes of the steps.
+
+    Returns:
+        The evidence, with figures added.
+    """
+    data, figures = plan.data, dict(figures)
     a, c = realise(gamma, data.l)
-    shift_figures: dict[str, Any] = {}
+    doubt = ""
     rules = plan.about("poles")
     unstable = plan.stability == "auto" and float(np.max(np.abs(np.linalg.eigvals(a)))) >= 1
     if rules or unstable:
@@ -152,14 +183,14 @@ def identified(plan: Plan) -> Procedure:
         if shift.a is None:
             return Evidence(None, float("nan"), Bound(-np.inf, False, "none", shift.reason), shift.status, shift.reason)
         if shift.applied:
-            shift_figures = {"suboptimality of A under the pole constraints": shift.suboptimality}
+            figures["suboptimality of A under the pole constraints"] = shift.suboptimality
             if not rules:
                 radius = np.max(np.abs(np.linalg.eigvals(a)))
                 warnings.warn(f"the subspace estimate of A is unstable (largest modulus {radius:.4g}): its poles were "
                               f"brought to modulus {INSIDE}. Use stability='free' for a plant that is unstable without "
                               "its feedback.", DataWarning, stacklevel=2)
-        a = shift.a
-    step = _step(plan, records, expansion, a, c, projection.scale)
+        a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
+    step = _step(plan, records, expansion, a, c, scale)
     realisation, program = realisation_programme(step, plan.name, plan.about("coefficients"),
                                                  factored=plan.split == "exact")
     solution: Solution = yield program
@@ -168,14 +199,11 @@ def identified(plan: Plan) -> Procedure:
                         solution.reason)
     model = _model(plan, step, realisation.factors(solution.values))
     model, remark = model_innovations(model, data)
-    figures = {"order": nx, "block rows": alpha, "instruments": instruments,
-               "singular values": projection.range.values, "gap of singular values": gap,
-               "condition of R11": projection.blocks.condition, **shift_figures, **_ratios(step)}
+    figures |= _ratios(step)
     if remark:
         figures["noise model"] = remark
-    if projection.blocks.discarded:
-        figures["regressor directions left out"] = projection.blocks.discarded
-    return Evidence(model, solution.objective, _bound(solution), _status(solution), solution.reason, figures)
+    status, reason = (Status.INACCURATE, doubt) if doubt else (_status(solution), solution.reason)
+    return Evidence(model, solution.objective, _bound(solution), status, reason, figures)
 
 
 def _block_rows(plan: Plan, expansion: Expansion) -> int:
