@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 LONGEST = 40
 """Lags of the autoregression at most."""
 
+EXACT = 1e-8
+"""Prediction errors relative to the outputs below which they are rounding."""
+
 
 def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["HammersteinSS", str]:
     """Return the model with K and the covariances of its noises, or unchanged with the reason why there are none.
@@ -34,7 +37,7 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         data: the record it was identified on.
     """
     gain = observer_gain(model.A, model.C)
-    errors = []
+    errors, outputs = [], []
     for e in data.experiments:
         for u, y in _complete(e.u, e.y):
             drive = model.expanded(u) @ model.B.T + y @ model.L.T + model.offset_x
@@ -42,6 +45,9 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
                 drive = drive + np.outer(g(y[:, o]), column)
             direct = model.expanded(u) @ model.D.T + model.offset_y
             errors.append(prediction_errors(model.A, model.C, gain, drive, direct, y))
+            outputs.append(y)
+    if not errors or np.all(np.std(np.concatenate(errors), axis=0) <= EXACT * np.std(np.concatenate(outputs), axis=0)):
+        return model, "none: the prediction errors vanish, there is no noise to model"
     try:
         k, noise = innovation_form(model.A, model.C, gain, errors)
     except StructureError as reason:
@@ -122,7 +128,7 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
                    for part in errors for rows in [_lagged(part, lags)]]
     spread = np.sqrt(np.mean(np.concatenate([part[lags:] for part in innovations]) ** 2, axis=0))
     if not np.all(spread > 0):
-        raise StructureError("the prediction errors vanish: there is no noise to model.")
+        raise StructureError("an output is predicted exactly: the covariance of the innovations is singular.")
     inner = np.ascontiguousarray((a - gain @ c).T)
     for part, e in zip(errors, innovations):
         out = np.empty((len(part), l, size))
