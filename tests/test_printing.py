@@ -1,8 +1,9 @@
 import re
+import warnings
 
 import numpy as np
 import pytest
-from sample_fits import example_fit, linear_fit, mimo_fit
+from sample_fits import example_fit, linear_fit, mimo_fit, two_by_two
 
 import optid
 from optid.showing.printing import describe, describe_validation
@@ -127,8 +128,19 @@ def test_a_fit_without_a_point_is_described():
 
 def test_validation_text_has_the_fit_that_the_formula_gives():
     fit = linear_fit()
-    text = describe_validation(fit.model, fit.data)
-    assert re.search(r"y +one step +100\.00", text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)  # too short for the structure test
+        text = describe_validation(fit.model, fit.data)
+    assert re.search(r"y, one step +100\.00", text)
+
+
+def test_no_line_of_a_validation_is_wider_than_80_columns():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)
+        text = str(optid.validate(mimo_fit().model, two_by_two(seed=5), horizon=4))
+    assert max(map(len, text.splitlines())) <= 80
+    for words in ("level_a, 4 steps", "level_a, experiment 3", 'temp "b": independent of level_a', "white"):
+        assert words in text
 
 
 @pytest.mark.parametrize(

@@ -50,13 +50,16 @@ def formulations() -> Show:
 
     rows = []
     for name, point in sorted(registered(FORMULATIONS).items()):
-        function = point.load()
+        try:
+            function = point.load()
+        except ImportError as error:  # a broken plug-in takes nothing away
+            rows.append((Text(name, "dim"), Text(f"cannot be loaded: {error}", "dim")))
+            continue
         about = Text.assemble(
             _summary(function),
             ("\narguments: ", "dim"),
             _arguments(function),
-            ("\nvariables: ", "dim"),
-            " ".join(_variables(function)),
+            *((("\nvariables: ", "dim"), " ".join(variables)) if (variables := _variables(function)) else ()),
             "\n",
         )
         rows.append((Text(name, "bold"), about))
@@ -75,7 +78,11 @@ def constraints() -> Show:
 
     rows = []
     for name, point in sorted(registered(CONSTRAINTS).items()):
-        function = point.load()
+        try:
+            function = point.load()
+        except ImportError as error:
+            rows.append((Text(name, "dim"), Text(""), Text(f"cannot be loaded: {error}", "dim")))
+            continue
         rows.append((Text(name, "bold"), _arguments(function), _summary(function)))
     return _table(
         "Constraints",
@@ -140,7 +147,7 @@ def _variables(function: Any) -> list[str]:
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, 60)
     data = Data(u, np.convolve(u + u**2, [1.0, 0.5])[:60] + 0.1 * rng.standard_normal(60))
-    offered = {"na": 1, "nb": 2, "nk": 0, "basis": "polynomial:2"}
+    offered = {"na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "polynomial:2"}
     takes = inspect.signature(function).parameters
     try:
         problem = function(data, **{key: value for key, value in offered.items() if key in takes})

@@ -11,8 +11,12 @@ from optid.showing.wording import Table
 if TYPE_CHECKING:
     from optid.data import Data
     from optid.fitting import Fit
+    from optid.validation import Validation
 
 WIDTH, LEFT = 80, 36
+
+MOST_NAME = 44
+"""First cells of a table wider than this stand on lines of their own."""
 
 
 def describe(fit: "Fit") -> str:
@@ -53,9 +57,9 @@ def describe(fit: "Fit") -> str:
     if evidence := summary.evidence_facts(fit):
         lines += [_rule("-"), *_facts(evidence)]
     for table in (estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)):
-        lines += [_rule("-"), *_table(table)]
+        lines += [_rule("-"), *set_table(table)]
     if fit.prices:
-        lines += [_rule("-"), *_table(summary.constraint_table(fit))]
+        lines += [_rule("-"), *set_table(summary.constraint_table(fit))]
     lines += [_rule("-"), *_wrapped(sentence)]
     lines += _wrapped(
         "Solver: " + "; ".join(f"{name.lower()} {value}" for name, value in summary.solver_facts(fit)[1:])
@@ -69,6 +73,14 @@ def describe_validation(model: Any, data: "Data") -> str:
     from optid.validation import validate
 
     return str(validate(model, data))
+
+
+def describe_checks(checked: "Validation") -> str:
+    """Return what a validation found as text, at most 80 columns wide."""
+    lines = [f"Validation on {checked.data}" if checked.data else "Validation"]
+    for table in summary.validation_tables(checked):
+        lines += [*set_table(table), ""]
+    return "\n".join([*lines[:-1], *(line for note in checked.notes for line in _wrapped(f"Note: {note}"))])
 
 
 _SHORT = ("Objective", "Bound", "Relative gap")
@@ -117,10 +129,11 @@ def _columns(left: Facts, right: Facts) -> list[str]:
     return [f"{a:<{LEFT}}  {b}".rstrip() for a, b in zip_longest(*fits, fillvalue="")] + _facts(wide)
 
 
-def _table(table: Table) -> list[str]:
-    """Set a table: first column left, numbers right, a long first cell on a line of its own."""
-    names = min(max(len(row[0]) for row in [table.head, *table.rows]), 30)
+def set_table(table: Table) -> list[str]:
+    """Set a table in 80 columns: first column left, numbers right, a long first cell on a line of its own."""
     widths = [max(len(row[c]) for row in [table.head, *table.rows]) for c in range(1, len(table.head))]
+    room = WIDTH - sum(widths) - len(widths)
+    names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))
     gap = 2 if names + sum(widths) + 2 * len(widths) <= WIDTH else 1
     lines = _wrapped(table.title)
     for row in (table.head, *table.rows):

@@ -19,7 +19,7 @@ class Correlation:
 
     Attributes:
         output: name of the output.
-        input: name of the input, or None for the autocorrelation.
+        input: name of the input, or of the other output; None for the autocorrelation.
         lags: (L,) lags; positive ones correlate the residual with the past.
         values: (L,) correlation coefficients, from the pairs of samples that are present.
         band: (L,) half width of the 99 % band of an ideal model.
@@ -86,6 +86,28 @@ def cross_correlation(
         score = axes.T[informed] @ (np.sqrt(counts[causal]) * values[causal])
         p_value = float(chdtrc(int(informed.sum()), float(np.sum(score**2 / scale[informed]))))
     return Correlation(output, channel, around, values, _band(counts), p_value)
+
+
+def between_outputs(
+    residuals: Sequence[Array], others: Sequence[Array], output: str, other: str, lags: int = 25
+) -> Correlation:
+    """Test whether the residual of an output depends on the past of the residual of another one, at lags 1 .. lags.
+
+    Samples of the same instant may be correlated: the noises of two outputs often are. Both residuals are taken to be
+    white, which their own tests decide.
+
+    Args:
+        residuals: (N,) per experiment, NaN = missing.
+        others: (N,) per experiment, of the other output.
+        output: name of the output.
+        other: name of the other output.
+        lags: largest lag.
+    """
+    from scipy.special import chdtrc
+
+    values, counts = _products(_standardised(residuals), _standardised(others), range(1, lags + 1))
+    statistic = float(np.sum(counts * values**2))
+    return Correlation(output, other, np.arange(1, lags + 1), values, _band(counts), float(chdtrc(lags, statistic)))
 
 
 def _band(counts: Array) -> Array:
