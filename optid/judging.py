@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
 from cvxpy.constraints.psd import PSD
@@ -123,11 +124,11 @@ def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> f
     for variable, jacobian in member.expr.grad.items():
         if jacobian is None:
             return largest
-        jacobian = np.atleast_2d(jacobian.toarray() if hasattr(jacobian, "toarray") else jacobian)
-        jacobian = np.reshape(jacobian, (variable.size, member.size))
+        entries = sp.csc_array(jacobian if sp.issparse(jacobian) else np.atleast_2d(jacobian))
+        entries = entries.reshape((variable.size, member.size))
         size = max(float(np.max(np.abs(_flat(variable)), initial=0.0)), (usual or {}).get(variable.id, 0.0))
-        total += np.sum(np.abs(jacobian), axis=0) * size
-        inner += jacobian.T @ _flat(variable)
+        total += np.asarray(abs(entries).sum(axis=0)).ravel() * size
+        inner += entries.T @ _flat(variable)
     size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of the constraint
     return size if size > ZERO**2 else largest
 
