@@ -262,6 +262,7 @@ def _run(name: str, criterion: OutputError, constraints: Sequence[Any], gauge: s
          ) -> Procedure:
     found, others, figures = _searched(criterion, starts, seed)
     posing = Posing(name, replace(criterion, gauge=gauge), tuple(constraints))
+    posing = replace(posing, usual=posing.values(replace(criterion, gauge=gauge).normalised(found.x)))
     x = posing.entry([found, *others])
     evidence = yield from refine(posing.posed(), replace(found, x=x), figures, x)
     return evidence
@@ -409,11 +410,20 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class Posing:
-    """Writes programmes in the tangent of an iterate, and reads their values."""
+    """Writes programmes in the tangent of an iterate, and reads their values.
+
+    Attributes:
+        name: of the formulation.
+        criterion: the errors, in the gauge of the programmes.
+        constraints: of the user.
+        usual: values of usual size, of the unconstrained optimum: what violations are relative to where a constraint
+            makes a variable vanish.
+    """
 
     name: str
     criterion: OutputError
     constraints: tuple[Any, ...]
+    usual: Mapping[str, Array] | None = None
 
     def posed(self) -> Posed:
         """Return what the constrained iteration needs."""
@@ -483,7 +493,7 @@ class Posing:
         view = View(expressions, kind="tangent", channels=unknowns.layout.inputs,
                     bases=dict(zip(unknowns.layout.inputs, unknowns.layout.bases)), gauge=self.criterion.gauge,
                     reference=values)
-        start = {**values, "residual": at.whole[1]}
+        start = {**(self.usual or values), "residual": at.whole[1]}
         program = Program(name=self.name, objective=cp.Minimize(objective), constraints=structural,
                           variables={**variables, "residual": r}, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived={"residual": residual},
@@ -526,7 +536,7 @@ class Posing:
         alone = [name for name, group in program.user_constraints.items()
                  if any({v.id for v in c.variables()} != {program.variables["a"].id} for c in group)] if a.size else []
         program = program.without(*alone, "residual", "gauge")
-        program.assign(program.start)
+        program.assign(program.view.reference)
         return measure_violation(program)[0] <= 1e-9
 
     def signed(self, x: Array) -> Array:
@@ -550,7 +560,7 @@ class Posing:
                 outside = 0.0
                 if errors is not None:
                     program = self.pose(turned, errors, 0.0)
-                    program.assign(program.start)
+                    program.assign(program.view.reference)
                     outside = measure_violation(program)[0]
                 if outside < (best if mu_sign == b_sign else 0.5 * best):
                     best, chosen = outside, turned

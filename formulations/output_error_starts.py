@@ -4,12 +4,14 @@ All of them give coefficients of a stable A; poles outside the unit circle are r
 nonlinearities that belong to a given A follow by a few steps in which A is held.
 """
 
+import warnings
+
 import numpy as np
 
 from formulations.equation_error import compress
 from formulations.prediction_error import Descent, descend
 from optid.data import Data
-from optid.errors import OptidError
+from optid.errors import DataWarning, OptidError
 from optid.rank_one.bilinear import minimise
 from optid.regressors.sensitivities import PlantPoint, Unknowns, instruments
 
@@ -26,7 +28,9 @@ def equation_error(data: Data, unknowns: Unknowns) -> Array | None:
     """Return the rank-one least squares of the equation error (ARX) as a start; None where the rows do not suffice."""
     layout = unknowns.layout
     try:
-        problem = compress(data, na=layout.na, nb=layout.nb, nk=layout.nk, basis=layout.bases)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # rows lost here are not lost to the simulation error
+            problem = compress(data, na=layout.na, nb=layout.nb, nk=layout.nk, basis=layout.bases)
         point = minimise(problem.problem, count=4).point
     except OptidError:
         return None
@@ -47,12 +51,14 @@ def blank(data: Data, unknowns: Unknowns) -> Array:
         mus.append(line if free else np.ones(1))
     bs = tuple(np.full(nb, 1 / np.sqrt(nb)) for nb in layout.nb)
     x0 = np.zeros((unknowns.experiments, unknowns.memory))
-    return unknowns.pack(PlantPoint(np.poly(np.full(layout.na, 0.5))[1:], tuple(mus), bs, 0.0, x0))
+    return unknowns.pack(PlantPoint(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], tuple(mus), bs, 0.0, x0))
 
 
 def stable_poles(a: Array, radius: float = RADIUS) -> Array:
     """Return the coefficients with poles outside the unit circle reflected, and none outside a radius."""
     roots = np.roots(np.concatenate([[1.0], a]))
+    if not roots.size:
+        return np.zeros(0)
     size = np.abs(roots)
     roots = np.where(size > 1, roots / np.maximum(size, 1e-300) ** 2, roots)
     size = np.abs(roots)

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from optid.errors import StructureError
 from optid.judging import measure_violation
 from optid.program import Program
 from optid.regressors.sensitivities import Linearised
@@ -31,10 +32,10 @@ CONFIRMED = 1e-8
 EXACT = 1e-24
 """Sum of squared errors, as a share of the energy of the record, that counts as zero."""
 
-STALLED = 1e-6
-"""Share that counts as nothing where programme after programme gains as little: a curved boundary is followed."""
+STALLED = 1e-5
+"""Share that counts as nothing where programme after programme promises as little: a curved boundary is followed."""
 
-INSIDE = 1e-8
+INSIDE = 1e-6
 """Relative violation up to which a point satisfies the constraints."""
 
 STEPS = 100
@@ -228,13 +229,22 @@ class _Iterate:
         x = posed.criterion.normalised(x)
         at = posed.criterion.linearise(x)
         program = posed.pose(x, at, 0.0)
-        program.assign(program.start)
+        program.assign(program.view.reference)
+        outside = measure_violation(program)[0]
         amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
                      for group in program.user_constraints.values() for member in group)
-        return cls(x, at, program, measure_violation(program)[0], amount)
+        return cls(x, at, program, outside, amount if outside > INSIDE else 0.0)
 
     def merit(self, weight: float) -> float:
         return self.at.value + weight * self.amount
+
+
+def _reached(posed: Posed, x: Array) -> _Iterate | None:
+    """Return the iterate at x, None where it is inadmissible or its gauge cannot be reached."""
+    try:
+        return _Iterate.of(posed, x) if posed.criterion.admissible(x) else None
+    except StructureError:
+        return None
 
 
 def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
@@ -256,8 +266,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         reached = posed.pack(solution.values)
         gain = here.at.value - _quadratic(here.at, reached - here.x)
         weight = max(weight, 2.0 * _largest_dual(here.program, solution))
-        reached = criterion.normalised(reached)
-        new = _Iterate.of(posed, reached) if criterion.admissible(reached) else None
+        new = _reached(posed, reached)
         share = CONFIRMED if abs(gain) < 0.5 * last else STALLED
         last = abs(gain) if not damping else last
         if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:

@@ -1,0 +1,391 @@
+"""Output-error fits: recovery, optima equal to those of other routes, constraints, missing samples, bad input."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from systems import by_hand, nonlinearity, siso
+
+import optid
+from formulations import hammerstein_oe, shape
+from formulations.output_error_starts import stable_poles
+from formulations.prediction_error import descend
+from optid.bases import Linear, Polynomial, Triangular
+from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
+from optid.models import HammersteinARX, Nonlinearity
+from optid.regressors.sensitivities import PlantPoint, Unknowns, simulate
+from optid.solution import Status
+
+BASIS = Triangular(4).fitted(-0.7, 1.3)
+
+
+def record(model=None, count=400, noise=0.2, seed=1):
+    model = model or siso(basis=BASIS)
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-0.7, 1.3, (count, model.m))
+    return optid.Data(u=u, y=by_hand(model, u) + noise * rng.normal(size=(count, model.l)), dt=model.dt)
+
+
+def distance(found, true):
+    parts = [found.a - true.a, found.offset - true.offset] + [found.theta(c) - true.theta(c) for c in range(true.m)]
+    return max(float(np.max(np.abs(part), initial=0.0)) for part in parts)
+
+
+def squares(fit, data):
+    found = fit.model.simulate(data, x0="fit")
+    several = [found] if data.n_experiments == 1 else found
+    return sum(float(np.nansum((e.y - y) ** 2)) for e, y in zip(data.experiments, several))
+
+
+# -- recovery --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("a, b, nk", [([-1.5, 0.7], [16 / 15, 0.8], 0), ([-0.8], [1.0], 1), ([], [0.5, 0.2, -0.3], 2)],
+                         ids=["na2-nb2", "na1-nb1-nk1", "na0-nb3-nk2"])
+@pytest.mark.parametrize("basis", [BASIS, Polynomial(3).fitted(-0.7, 1.3)], ids=["triangular", "polynomial"])
+def test_noise_free_systems_are_recovered(basis, a, b, nk):
+    true = siso(basis=basis, a=a, b=(b,), nk=nk, offset=0.05)
+    fit = optid.fit(record(true, noise=0.0), "hammerstein_oe.exact", na=len(a), nb=len(b), nk=nk, basis=basis)
+    assert distance(fit.model, true) < 1e-7
+    assert fit.solution.status is Status.LOCAL
+    assert fit.solution.objective < 1e-14 * fit.solution.scale
+
+
+def test_linear_model_of_several_inputs_is_recovered():
+    linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
+    true = HammersteinARX([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), (linear, linear), (0, 2), 0.2)
+    fit = optid.fit(record(true, noise=0.0), "oe.exact", na=2, nb=[2, 3], nk=[0, 2])
+    assert distance(fit.model, true) < 1e-8
+    assert fit.model.title == "Linear output-error model"
+
+
+def test_hammerstein_model_of_several_inputs_is_recovered():
+    functions = (nonlinearity(BASIS, 1), nonlinearity(Polynomial(3), 2))
+    true = HammersteinARX([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), functions, (0, 1), 0.2)
+    fit = optid.fit(record(true, noise=0.0), "hammerstein_oe.exact", na=2, nb=[2, 3], nk=[0, 1],
+                    basis=[f.basis for f in functions])
+    assert distance(fit.model, true) < 1e-7
+
+
+def test_experiments_of_unequal_length_with_states_of_their_own_and_missing_outputs():
+    true, rng = siso(basis=BASIS), np.random.default_rng(4)
+    us, ys = [], []
+    for count in (60, 150, 90):
+        u = rng.uniform(-0.7, 1.3, (count + 20, 1))
+        y = by_hand(true, u)[20:]  # every experiment begins in motion
+        y[rng.random(count) < 0.2] = np.nan
+        us.append(u[20:])
+        ys.append(y)
+    fit = optid.fit(optid.Data(us, ys, dt=true.dt), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    assert distance(fit.model, true) < 1e-7
+    assert fit.solution.values["x0"].shape == (2, 3)
+    assert fit.figures["rows"] == sum(int(np.count_nonzero(~np.isnan(y))) for y in ys)
+
+
+def test_half_of_the_outputs_missing():
+    data = record(count=800)
+    y = data.y.copy()
+    y[np.random.default_rng(0).random(len(y)) < 0.5] = np.nan
+    fit = optid.fit(optid.Data(data.u, y, dt=data.dt), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    assert np.max(np.abs(fit.model.a - [-1.5, 0.7])) < 0.02
+    assert fit.solution.status is Status.LOCAL
+
+
+# -- the same optimum by other routes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
+    rng = np.random.default_rng(seed)
+    poles = np.concatenate([rng.uniform(-0.5, 0.9, 1), 0.8 * np.exp(1j * rng.uniform(0.3, 2.0)) * np.array([1.0])])
+    a = np.real(np.poly(np.concatenate([poles, np.conj(poles[1:])])))[1:]
+    true = siso(basis=BASIS, a=a, b=(rng.normal(size=3),), nk=seed % 2)
+    data = record(true, count=250, noise=0.3, seed=seed)
+    layout = hammerstein_oe.plant_layout(data, 3, 3, seed % 2, (BASIS,))
+    unknowns = Unknowns(layout, 1, (True,))
+    criterion = hammerstein_oe.OutputError(data, unknowns, "norm")
+    start = criterion.normalised(unknowns.pack(PlantPoint(
+        stable_poles(a + 0.05 * rng.normal(size=3)), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
+        (true.b[0] + 0.1 * rng.normal(size=3),), 0.0, np.zeros((1, unknowns.memory)))))
+    ours = descend(criterion, start)
+
+    def residual(x):
+        return simulate(data, unknowns, unknowns.unpack(x))[0] - data.y[:, 0]
+
+    theirs = least_squares(residual, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=400)
+    assert ours.converged
+    assert ours.value <= 2 * theirs.cost * (1 + 1e-9)
+    if 2 * theirs.cost <= ours.value * (1 + 1e-6):
+        again = unknowns.unpack(criterion.normalised(theirs.x))
+        here = unknowns.unpack(ours.x)
+        assert np.allclose(here.a, again.a, atol=1e-5)
+        assert np.allclose(np.outer(here.mus[0], here.bs[0]), np.outer(again.mus[0], again.bs[0]), atol=1e-4)
+
+
+def simulated_in_casadi(data, basis, a, b, mu, offset, x0):
+    """Write out the difference equation of na = nb = 2, nk = 0."""
+    f = ca.mtimes(ca.DM(basis.values(data.u[:, 0])), mu)
+    y = []
+    for k in range(len(data.u)):
+        value = offset + b[0] * f[k] + (b[1] * f[k - 1] if k else 0) + (x0[k] if k < 2 else 0)
+        for i in range(2):
+            value -= a[i] * y[k - 1 - i] if k > i else 0
+        y.append(value)
+    return ca.vertcat(*y)
+
+
+def test_constrained_optimum_equals_that_of_ipopt_on_the_same_problem():
+    true = siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.05, 0.9])),))
+    data = record(true, count=150, noise=0.4, seed=3)
+    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS,
+                    constraints=["monotone:increasing", "gain:4.0,at=0.6", "stable:0.8"])
+    assert fit.solution.status is Status.LOCAL
+
+    a, b, mu, offset, x0 = (ca.MX.sym("v", n) for n in (2, 2, 4, 1, 2))
+    z = ca.vertcat(a, b, mu, offset, x0)
+    errors = simulated_in_casadi(data, BASIS, a, b, mu, offset, x0) - data.y[:, 0]
+    radius = 0.8 * (1 - 1e-6)
+    one, two = a[0] / radius, a[1] / radius**2
+    slope = ca.mtimes(ca.DM(BASIS.slopes(np.array([0.6]))), mu) * ca.sum1(b)
+    held = ca.vertcat(ca.mtimes(ca.DM(BASIS.increments()), mu), 1 + one + two, 1 - one + two, 1 - two,
+                      ca.sumsqr(b) - 1, slope - 4.0 * (1 + ca.sum1(a)))
+    count = BASIS.increments().shape[0] + 3
+    solver = ca.nlpsol("s", "ipopt", {"x": z, "f": ca.sumsqr(errors), "g": held},
+                       {"print_time": False, "ipopt": {"print_level": 0, "tol": 1e-12, "sb": "yes"}})
+    found = fit.solution.values
+    best = np.inf
+    for seed in range(4):
+        start = np.concatenate([found[name] for name in ("a", "b", "mu", "offset", "x0")])
+        start = start + 0.1 * seed * np.random.default_rng(seed).normal(size=start.size)
+        answer = solver(x0=start, lbg=[0.0] * (count + 2), ubg=[np.inf] * count + [0.0, 0.0])
+        if solver.stats()["success"]:
+            best = min(best, float(answer["f"]))
+    assert fit.solution.objective == pytest.approx(best, rel=1e-6)
+    assert fit.model.static_gain(0.6) == pytest.approx(4.0, rel=1e-7)
+    assert np.max(np.abs(fit.model.poles)) <= 0.8
+    assert np.all(BASIS.increments() @ fit.model.nonlinearities[0].mu > -1e-8)
+    prices = {price.name: price for price in fit.prices}
+    assert prices["gain"].binding and prices["gain"].fit_points > 0
+    assert prices["stable:0.8"].binding and prices["stable:0.8"].fit_points > 0
+
+
+@pytest.mark.parametrize("solver", ["osqp", "piqp", "ipopt", "scs"])
+def test_any_back_end_for_the_class_solves_the_programmes(solver):
+    data = record(count=200)
+    words = {"constraints": ["monotone:increasing"]} if solver != "scs" else {}
+    one = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, **words)
+    other = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, solver=solver, **words)
+    assert other.solution.solver == solver
+    assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-6)
+
+
+def test_a_back_end_of_another_class_is_refused():
+    with pytest.raises(StructureError, match="gauss_newton solves.*class QP"):
+        optid.fit(record(), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, solver="gauss_newton")
+
+
+# -- what is reported ------------------------------------------------------------------------------------------------
+
+
+def test_objective_is_the_sum_of_squared_simulation_errors():
+    data = record()
+    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    assert fit.solution.objective == pytest.approx(squares(fit, data), rel=1e-9)
+    assert fit.one_step_fit[0] == pytest.approx(fit.simulation_fit[0], abs=1e-6)
+    assert fit.solution.bound.value == -np.inf and not fit.solution.proof
+    assert "no lower bound" in fit.solution.reason
+    assert "starts arrive there" in fit.figures["starts"]
+    assert fit.figures["programmes"] == 1
+    assert "output-error" in str(fit)
+
+
+@pytest.mark.parametrize("gauge", ["gain", "b0"])
+@pytest.mark.parametrize("words", [[], ["monotone:increasing"]], ids=["free", "constrained"])
+def test_simulations_do_not_depend_on_the_gauge(gauge, words):
+    data = record(siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.05, 0.9])),)), noise=0.5)
+    arguments = {"na": 2, "nb": 2, "basis": BASIS, "constraints": words}
+    one = optid.fit(data, "hammerstein_oe.exact", **arguments)
+    other = optid.fit(data, "hammerstein_oe.exact", gauge=gauge, **arguments)
+    assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-6)
+    assert np.max(np.abs(one.model.simulate(data.u) - other.model.simulate(data.u))) < 2e-3
+    value = other.model.b[0].sum() - 1 - other.model.a.sum() if gauge == "gain" else other.model.b[0][0] - 1
+    assert abs(value) < 1e-8
+
+
+@pytest.mark.parametrize("change", [lambda d: d.detrend(), lambda d: d.scale(), lambda d: d.detrend().scale()])
+def test_units_are_undone(change):
+    data = record()
+    raw = optid.Data(u=30 + 4 * data.u, y=-7 + 0.01 * data.y, dt=0.5)
+    one = optid.fit(raw, "hammerstein_oe.exact", na=2, nb=2, basis=Triangular(4))
+    other = optid.fit(change(raw), "hammerstein_oe.exact", na=2, nb=2, basis=Triangular(4))
+    p, q = one.model.simulate(raw, x0="fit"), other.model.simulate(raw, x0="fit")
+    assert np.max(np.abs(p - q)) < 1e-4 * np.std(p)
+
+
+def test_offset_can_be_held_at_zero():
+    data = record(siso(basis=BASIS, offset=0.0))
+    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, offset=False)
+    assert fit.model.offset[0] == 0.0 and "offset" not in fit.program.variables
+    same = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, constraints=[shape.fixed("offset", [0.0])])
+    assert same.solution.objective == pytest.approx(fit.solution.objective, rel=1e-7)
+
+
+def test_standard_errors_agree_with_the_scatter():
+    true = siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.4, 0.9])),))
+    scores = []
+    for seed in range(40):
+        fit = optid.fit(record(true, noise=0.3, seed=seed), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, starts=2)
+        scores.append((fit.model.a - true.a) / fit.uncertainty.a.error)
+    size = np.sqrt(np.mean(np.square(scores), axis=0))  # one, with a standard error of 0.11
+    assert np.all((size > 0.65) & (size < 1.35))
+
+
+# -- constraints and stability ---------------------------------------------------------------------------------------
+
+
+def test_an_optimum_beyond_stability_is_named_and_a_constraint_is_the_remedy():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=300)
+    y = by_hand(siso(basis=Linear().fitted(-1, 1), a=[-1.01], b=([1.0],)), u[:, None])  # grows without bound
+    data = optid.Data(u, y + 0.1 * rng.normal(size=y.shape))
+    with pytest.warns(DataWarning, match="unit circle"):
+        fit = optid.fit(data, "oe.exact", na=1, nb=1)
+    assert fit.model.is_stable and fit.solution.status is Status.LIMIT
+    safe = optid.fit(data, "oe.exact", na=1, nb=1, constraints=["stable:0.99"])
+    assert safe.model.a[0] == pytest.approx(-0.99, abs=1e-5)
+    assert safe.solution.status is Status.LOCAL and safe.prices[0].binding
+
+
+def test_every_point_of_a_descent_is_stable():
+    data = record(siso(basis=BASIS, a=[-1.9, 0.95]), noise=2.0)
+    unknowns = Unknowns(hammerstein_oe.plant_layout(data, 2, 2, 0, (BASIS,)), 1, (True,))
+
+    class Watched(hammerstein_oe.OutputError):
+        def linearise(self, x):
+            assert hammerstein_oe.largest_pole(x[self.unknowns.slices["a"]]) < 1
+            return super().linearise(x)
+
+    hammerstein_oe.search(Watched(data, unknowns, "norm"), 8, 0)
+
+
+@pytest.mark.parametrize("radius", [0.95, 0.8, 0.6])
+def test_stability_of_higher_orders_holds_for_the_model(radius):
+    true = siso(basis=BASIS, a=np.real(np.poly([0.9, 0.75 + 0.37j, 0.75 - 0.37j]))[1:])
+    fit = optid.fit(record(true), "hammerstein_oe.exact", na=3, nb=2, basis=BASIS, constraints=[f"stable:{radius}"])
+    assert np.max(np.abs(fit.model.poles)) <= radius
+    assert fit.solution.status is Status.LOCAL
+    free = optid.fit(record(true), "hammerstein_oe.exact", na=3, nb=2, basis=BASIS)
+    assert fit.solution.objective >= free.solution.objective * (1 - 1e-8)
+
+
+def test_constraints_of_the_user_in_named_variables():
+    data = record()
+    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS,
+                    constraints=[lambda v: {"first": v["a"][0] >= -1.4}, lambda v: {"rest": v["x0"] == 0}])
+    assert fit.model.a[0] >= -1.4 - 1e-7
+    assert np.max(np.abs(fit.solution.values["x0"])) < 1e-8
+    assert {price.name for price in fit.prices} == {"first", "rest"}
+
+
+def test_constraints_that_hold_anyway_cost_nothing():
+    data = record()
+    one = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    other = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, constraints=["stable:0.99"])
+    assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-8)
+    assert not other.prices[0].binding
+
+
+def test_the_opposite_gain_is_reached_by_turning_a_sign():
+    linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
+    data = record(HammersteinARX([-0.8], ([1.0],), (linear,), (0,), 0.0), noise=0.5)
+    fit = optid.fit(data, "hammerstein_oe.exact", na=1, nb=1, basis="triangular:2",
+                    constraints=["monotone:increasing", "gain:high=-0.1"])
+    assert fit.model.static_gain(0.3) <= -0.1 + 1e-6
+
+
+def test_more_starts_never_give_a_worse_optimum():
+    data = record(siso(basis=BASIS, a=np.real(np.poly([0.9, 0.2 + 0.7j, 0.2 - 0.7j]))[1:]), noise=1.5, count=150)
+    values = [optid.fit(data, "hammerstein_oe.exact", na=3, nb=3, basis=BASIS, starts=n).solution.objective
+              for n in (1, 4, 10)]
+    assert values[1] <= values[0] * (1 + 1e-9) and values[2] <= values[1] * (1 + 1e-9)
+
+
+def test_long_records_are_searched_in_part():
+    true = siso(basis=BASIS)
+    data = record(true, count=60_000, noise=0.2)
+    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    assert fit.figures["rows"] == 60_000
+    assert np.max(np.abs(fit.model.a - true.a)) < 5e-3
+    many = optid.Data([data.u[k : k + 600] for k in range(0, 60_000, 600)],
+                      [data.y[k : k + 600] for k in range(0, 60_000, 600)], dt=data.dt)
+    again = optid.fit(many, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    assert np.max(np.abs(again.model.a - true.a)) < 5e-3
+    assert again.solution.status is Status.LOCAL
+
+
+# -- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change, error, words", [
+    ({"na": -1}, StructureError, "na is the number of poles"),
+    ({"na": 2.0}, StructureError, "na is the number of poles"),
+    ({"nb": 0}, StructureError, "nb of input 'u'.*from 1"),
+    ({"nb": [1, 2]}, StructureError, "2 entries for 1 inputs"),
+    ({"nk": -1}, StructureError, "nk of input 'u'.*from 0"),
+    ({"gauge": "nrom"}, StructureError, "norm, gain, b0"),
+    ({"starts": 0}, StructureError, "starts is the number"),
+    ({"na": 70}, RankError, "150 output samples for 14. unknowns"),
+    ({"na": 200}, RankError, "150 samples, but the lags reach back 200"),
+    ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "function . of the basis of input 'u' is never excited"),
+    ({"constraints": ["stable:1.5"]}, StructureError, "radius lies in"),
+    ({"constraints": ["stable:0.5", lambda v: {"slow": v["a"][0] <= -1.5}]}, InfeasibleError, "stable:0.5.*slow"),
+    ({"constraints": [lambda v: {"odd": v["A"] >= 0}]}, StructureError, "asks for 'A'"),
+])
+def test_bad_structure_names_the_argument_and_the_remedy(change, error, words):
+    with pytest.raises(error, match=words):
+        optid.fit(record(count=150), "hammerstein_oe.exact", **({"na": 2, "nb": 2, "basis": BASIS} | change))
+
+
+def test_a_missing_input_is_named():
+    data = record()
+    u = data.u.copy()
+    u[17] = np.nan
+    with pytest.raises(DataError, match="input 'u' is missing at sample 17.*hammerstein_arx.exact"):
+        optid.fit(optid.Data(u, data.y), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    with pytest.raises(DataError, match="'u' is missing at sample 17 of experiment 2"):
+        optid.fit(optid.Data([data.u, u], [data.y, data.y]), "oe.exact", na=2, nb=2)
+
+
+def test_several_outputs_are_refused_with_the_remedy():
+    data = record()
+    with pytest.raises(StructureError, match="one output.*hammerstein_ss.exact"):
+        optid.fit(optid.Data(data.u, np.hstack([data.y, -data.y])), "oe.exact", na=2, nb=2)
+
+
+def test_a_short_experiment_is_named():
+    data = record()
+    with pytest.raises(RankError, match="experiment 2: 3 samples, but the lags reach back 3"):
+        optid.fit(optid.Data([data.u, data.u[:3]], [data.y, data.y[:3]]), "oe.exact", na=3, nb=3)
+
+
+@pytest.mark.parametrize("u, words", [(np.ones(200), "constant"), (np.where(np.sin(np.arange(200.0) ** 2) > 0, 1.0, -1.0), "binary")])
+def test_inputs_that_say_nothing_about_a_nonlinearity(u, words):
+    y = np.random.default_rng(0).normal(size=200)
+    with pytest.raises(DataError, match=words):
+        optid.fit(optid.Data(u, y), "hammerstein_oe.exact", na=1, nb=1, basis="triangular:4")
+
+
+# -- real records ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, count, lag, low, high", [
+    ("robotarm", 716, 4, 96.52, 96.56), ("heating", 560, 2, 76.05, 76.09), ("hairdryer", 700, 5, 90.87, 100.0)])
+def test_published_output_error_fits(real_data, name, count, lag, low, high):
+    centred = optid.read(real_data / f"daisy_{name}.csv", dt=1.0).detrend()
+    train, test = centred.split(count)
+    fit = optid.fit(train, "oe.exact", na=lag, nb=lag + 1, offset=False)
+    raw = test.raw()
+    error = raw.y - fit.model.simulate(raw, x0="fit")
+    score = 100 * (1 - np.linalg.norm(error) / np.linalg.norm(raw.y - raw.y.mean()))
+    assert low <= score <= high
+    assert fit.model.is_stable and fit.solution.status is Status.LOCAL
