@@ -163,16 +163,24 @@ def _factored(realisation: Realisation, name: str, linear: Mapping[str, cp.Varia
 def _lumped(realisation: Realisation, name: str, linear: Mapping[str, cp.Variable]) -> Program:
     step = realisation.step
     variables, thetas = dict(linear), []
-    z = step.least_squares()
-    start = _linear_start(step, z[: step.problem.linear])
+    start = least_squares_values(realisation)
     for i, shape in enumerate(step.form.blocks):
         whole = realisation.names(i)[2]
         variables[whole] = cp.Variable(shape, name=whole)
-        start[whole] = z[step.form.block(i)].reshape(shape, order="F")
         thetas.append(variables[whole])
     return residual_programme(
         step, name, variables, _residual(step, linear, thetas), start=start, recover=realisation.factors,
         view=_view(realisation, {**variables}, thetas))
+
+
+def least_squares_values(realisation: Realisation) -> dict[str, np.ndarray]:
+    """Return the unrestricted minimiser by the names of the lumped form."""
+    step = realisation.step
+    z = step.least_squares()
+    found = _linear_start(step, z[: step.problem.linear])
+    for i, shape in enumerate(step.form.blocks):
+        found[realisation.names(i)[2]] = z[step.form.block(i)].reshape(shape, order="F")
+    return found
 
 
 def _start(step: ObserverProblem) -> Any:

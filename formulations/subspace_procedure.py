@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from formulations.equation_error import model_meta
-from formulations.realisation import Factors, realisation_programme
+from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
 from formulations.stability import stable
 from optid.bases import fitted_bases, parse
@@ -204,6 +204,19 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
         figures["noise model"] = remark
     status, reason = (Status.INACCURATE, doubt) if doubt else (_status(solution), solution.reason)
     return Evidence(model, solution.objective, _bound(solution), status, reason, figures)
+
+
+def preliminary(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma: np.ndarray, scale: np.ndarray
+                ) -> HammersteinSS:
+    """Return the least-squares model of an observability matrix, for comparisons: no constraints, A contracted.
+
+    Raises:
+        RankError: the record does not determine it.
+    """
+    a, c = realise(gamma, plan.data.l)
+    step = _step(plan, records, expansion, _inside(a), c, scale)
+    realisation = Realisation(step, False)
+    return _model(plan, step, realisation.factors(least_squares_values(realisation)))
 
 
 def _block_rows(plan: Plan, expansion: Expansion) -> int:

@@ -139,6 +139,22 @@ class RankOneForm:
 
 
 @dataclass(frozen=True)
+class NuclearForm:
+    """The structured nuclear-norm problem behind a convex programme, for methods that exploit it.
+
+    ``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²``; its variables are ``yhat`` = v and, with a predictor, ``T`` = theta;
+    the constraint ``structure`` ties the matrix whose nuclear norm is taken to them.
+
+    Attributes:
+        problem: the numbers (`optid.nuclear_norm.NuclearProblem`).
+        weight: name of the parameter that holds the weight.
+    """
+
+    problem: Any
+    weight: str = "weight"
+
+
+@dataclass(frozen=True)
 class Program:
     """One optimisation problem with named parts, independent of who solves it.
 
@@ -155,6 +171,7 @@ class Program:
         derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
             variables; they are recomputed at every point before it is judged.
         rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
+        nuclear: nuclear-norm structure for the ADMM, or None.
         certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
@@ -173,6 +190,7 @@ class Program:
     parameters: Mapping[str, cp.Parameter] = field(default_factory=dict)
     derived: Mapping[str, cp.Expression] = field(default_factory=dict)
     rank_one: RankOneForm | None = None
+    nuclear: NuclearForm | None = None
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
     note: str = ""
@@ -291,7 +309,7 @@ class Program:
             return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
-                       parameters=parameters, view=view, recover=recover, rank_one=None, certify=None,
+                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
@@ -318,7 +336,7 @@ class Program:
                                      "only equalities and inequalities can be softened")
         rest = {key: group for key, group in self.constraints.items() if key != name}
         return replace(self, objective=cp.Minimize(self.objective.expr + weight * penalty), constraints=rest,
-                       rank_one=None, certify=None, note=f"constraint {name!r} is a penalty here")
+                       rank_one=None, nuclear=None, certify=None, note=f"constraint {name!r} is a penalty here")
 
     def without(self, *names: str) -> "Program":
         """Return the programme without the named constraints."""

@@ -12,7 +12,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.program import Program, RankOneForm, View
+from optid.program import NuclearForm, Program, RankOneForm, View
 
 SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 
@@ -45,8 +45,8 @@ class Case:
 
 @cache
 def cases() -> tuple[Case, ...]:
-    """Return every case, classes LP, QP, SOCP, SDP, conic, NLP and rank-one among them."""
-    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one())
+    """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one and nuclear among them."""
+    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), *_nuclear())
 
 
 def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: list[cp.Variable],
@@ -336,6 +336,31 @@ def _rank_one() -> list[Case]:
 
     return [Case(rank_one_fit, value=_search(matrix, y, convex=False)),
             Case(rank_one_convex, value=_search(matrix, y, convex=True))]
+
+
+def _nuclear() -> list[Case]:
+    """A Hankel matrix of one block row has independent entries: its singular values are reduced by half the weight."""
+    y = np.random.default_rng(1).normal(size=(9, 3)) + np.outer(np.arange(9.0), [1.0, -0.5, 0.2])
+    weight = 0.4
+    left, values, right = np.linalg.svd(y, full_matrices=False)
+    kept = np.maximum(values - 0.5 / weight, 0.0)
+    best = (left * kept) @ right
+
+    def nuclear_shrinkage() -> Program:
+        from optid.nuclear_norm import NuclearProblem
+
+        yhat, inner = cp.Variable(y.shape, name="yhat"), cp.Variable(y.T.shape, name="X")
+        r = cp.Variable(y.size, name="r")
+        misfit = cp.vec(yhat - y, order="C")
+        parameter = cp.Parameter(nonneg=True, name="weight", value=weight)
+        return pose("nuclear_shrinkage", cp.normNuc(inner) + parameter * cp.sum_squares(r),
+                    {"structure": inner == yhat.T, "residual": r == misfit}, [yhat, inner, r], start={"yhat": y},
+                    structural=frozenset({"structure", "residual"}), derived={"X": yhat.T, "r": misfit},
+                    parameters={"weight": parameter}, nuclear=NuclearForm(NuclearProblem(y, np.arange(9), 1)),
+                    scale=weight * float(np.sum(y**2)))
+
+    return [Case(nuclear_shrinkage, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
+                 point={"yhat": best}, duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})]
 
 
 def _search(matrix: np.ndarray, y: np.ndarray, *, convex: bool) -> float:

@@ -206,7 +206,7 @@ def test_nothing_is_printed_unless_asked(name, capfd):
     assert captured.out == "" and captured.err == ""
 
 
-NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating"}
+NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating", "admm"}
 
 
 def test_one_accuracy_is_translated_for_every_solver():

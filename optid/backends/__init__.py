@@ -64,7 +64,7 @@ class BackEnd:
 
     Attributes:
         name: the word, in lower case.
-        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one".
+        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one", "nuclear".
         run: (program, settings) -> Answer.
         installed: whether it can run here.
         pip: what to install where it cannot.
@@ -88,6 +88,10 @@ class BackEnd:
         """Return why this back end cannot take the programme, or an empty string."""
         if program.rank_one is not None and "rank-one" in self.classes:
             return ""
+        if program.nuclear is not None and "nuclear" in self.classes:
+            names = ", ".join(map(repr, program.user_constraints))
+            return "" if not names else (f"{self.name} takes no further constraints ({names}); use an SDP back end "
+                                         "(clarabel, scs)")
         kind = program.kind
         if kind in self.classes:
             return ""
@@ -149,6 +153,8 @@ def choose(program: Program) -> tuple[BackEnd, str]:
         return find("gauss_newton"), (
             f"gauss_newton: rank-one least squares with {program.rank_one.problem.root.shape[0]} lifted unknowns"
         )
+    if program.nuclear is not None and not program.user_constraints:
+        return find("admm"), f"admm: nuclear norm of a Hankel matrix, {program.nuclear.problem.shape} entries"
     kind = program.kind
     order = ("uno", "ipopt") if kind == "NLP" and program.size <= 200 else ("ipopt", "uno")
     if kind != "NLP":
