@@ -38,6 +38,9 @@ STALLED = 1e-5
 INSIDE = 1e-6
 """Relative violation up to which a point satisfies the constraints."""
 
+NOWHERE = 1e-9
+"""Relative violation that is rounding; a step to more than that pays for it."""
+
 STEPS = 100
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
@@ -233,7 +236,7 @@ class _Iterate:
         outside = measure_violation(program)[0]
         amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
                      for group in program.user_constraints.values() for member in group)
-        return cls(x, at, program, outside, amount if outside > INSIDE else 0.0)
+        return cls(x, at, program, outside, amount if outside > NOWHERE else 0.0)
 
     def merit(self, weight: float) -> float:
         return self.at.value + weight * self.amount
@@ -282,7 +285,8 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
-                return _evidence(posed, here, Status.LIMIT, "no step descends", {**figures, "programmes": count})
+                reason = f"no step descends, although the last programme promised {last / here.at.value:.0e} of the value"
+                return _evidence(posed, here, Status.LIMIT, reason, {**figures, "programmes": count})
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
     reason = f"{STEPS} programmes did not suffice"
