@@ -1,0 +1,195 @@
+"""Output error with the outputs of the plant as variables: one sparse programme for NLP back ends.
+
+``y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + e`` is posed as
+
+    minimise ‖y - x‖²  subject to  x(k) + sum_i a_i x(k-i) = sum_c sum_j b_cj w_c(k - nk_c - j) + d,  w_c = eta_c mu_c,
+
+with the noise-free output x and the values w of the nonlinearities at every sample as variables: multiple shooting with
+one sample between the nodes (Bock 1981), so that the past of x is the state. A row of the constraints has at most
+na + m nb + 2 unknowns in products of no more than two, and is no steeper for a pole near or outside the unit circle
+than for any other. The first n outputs of an experiment, whose lags reach before it, are free: they are its initial
+state. The optima are those of ``hammerstein_oe.exact``; the ways there differ. Named variables: ``a``, ``b``, ``mu``,
+``offset``, ``x`` (with several experiments ``x[1]``, ``x[2]``, ...), and the expression ``Theta = mu bᵀ``; constraints,
+on x too, need not be convex. With several inputs the per-channel names carry the input, as in ``mu[valve]``.
+
+Work and memory grow with the samples, not with the parameters: it is the way for constraints on states and for
+difficult starts. IPOPT uses the sparsity, and takes records up to the limit in seconds; Uno and fatrop factorise
+without it here and are for some hundred samples. Longer records are refused; ``hammerstein_oe.exact`` takes them.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.equation_error import model_meta
+from formulations.hammerstein_arx import GAUGES
+from formulations.hammerstein_oe import OutputError, check_excited, check_rows, checked_record, plant_layout
+from formulations.noise_models import one_output
+from formulations.output_error_starts import blank, equation_error, stable_poles, with_poles
+from optid.bases import fitted_bases
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import StructureError
+from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
+from optid.models.gauges import leading_sign
+from optid.program import Program, Values, View
+from optid.regressors.sensitivities import Unknowns, simulate
+from optid.solution import Bound
+
+Array = np.ndarray
+
+LIMIT = 20_000
+"""Samples up to which the programme is posed: beyond, factorisations and CVXPY's own work take minutes."""
+
+NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
+
+
+def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True
+          ) -> Program:
+    """Pose the least squares of the simulation errors with the simulated outputs as variables.
+
+    Args:
+        data: the record: every input sample present, outputs may be missing; one output.
+        na: number of poles.
+        nb: number of coefficients of B, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth
+            constraint in the named variables.
+        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+
+    Raises:
+        StructureError: impossible orders, unknown gauge, several outputs, or a record that is too long.
+        DataError: a missing input sample.
+        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+    """
+    if gauge not in GAUGES:
+        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    record = checked_record(one_output(data))
+    if record.n_samples > LIMIT:
+        raise StructureError(
+            f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "
+            f"{LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
+    layout = plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+    check_excited(record, layout)
+    unknowns = Unknowns(layout, record.n_experiments, (True,) * layout.m, bool(offset))
+    check_rows(record, unknowns)
+    return _Shooting(OutputError(record, unknowns, gauge)).program(constraints)
+
+
+class _Shooting:
+    """Writes the programme of one record."""
+
+    def __init__(self, criterion: OutputError) -> None:
+        self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
+        several = criterion.unknowns.experiments > 1
+        self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
+        self.variables: dict[str, cp.Variable] = {}
+        self.tables = [[basis.values(e.u[:, c]) for c, basis in enumerate(self.layout.bases)]
+                       for e in self.data.experiments]
+
+    def key(self, name: str, c: int) -> str:
+        """Name of a quantity of an input."""
+        return name if self.layout.m == 1 else f"{name}[{self.layout.inputs[c]}]"
+
+    def program(self, constraints: Sequence[Any]) -> Program:
+        """Return the programme under the user's constraints."""
+        layout, gauge = self.layout, self.criterion.gauge
+        shapes = {"a": layout.na, "offset": int(self.criterion.unknowns.constant)}
+        for c, (basis, nb) in enumerate(zip(layout.bases, layout.nb)):
+            shapes |= {self.key("mu", c): basis.size, self.key("b", c): nb}
+        self.variables = {name: cp.Variable(size, name=name) for name, size in shapes.items() if size}
+        expressions: dict[str, Any] = dict(self.variables)
+        for c in range(layout.m):
+            expressions[self.key("Theta", c)] = cp.outer(self.variables[self.key("mu", c)],
+                                                         self.variables[self.key("b", c)])
+        structural, derived, residuals = {}, {}, []
+        for i, label in enumerate(self.labels):
+            dynamics, own = self._experiment(i, label)
+            structural |= dynamics
+            derived |= own
+            expressions[f"x{label}"] = self.variables[f"x{label}"]
+            residuals.append(self.variables[f"residual{label}"])
+        structural["gauge"] = tuple(self._gauge(c) for c in range(layout.m))
+        start = self._start()
+        reference = {name: start[name] for name in ("a", "offset") if name in start}
+        view = View(expressions, kind="exact", channels=layout.inputs, bases=dict(zip(layout.inputs, layout.bases)),
+                    gauge=gauge, reference=reference)
+        objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))
+        bound = Bound(-np.inf, False, "none", NO_BOUND)
+        program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
+                          variables=self.variables, start=start, recover=self.recover, view=view,
+                          structural=frozenset(structural), derived=derived, scale=self.criterion.energy,
+                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND)
+        return program.subject_to(*constraints)
+
+    def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the structural constraints and the derived variables of one experiment."""
+        e, layout, variables = self.data.experiments[i], self.layout, self.variables
+        n, count = layout.first_row, self.data.experiments[i].n_samples
+        x = variables[f"x{label}"] = cp.Variable(count, name=f"x{label}")
+        left = x[n:]
+        for lag in range(1, layout.na + 1):
+            left = left + variables["a"][lag - 1] * x[n - lag : count - lag]
+        right: Any = 0.0
+        constraints, derived = {}, {}
+        for c, lags in enumerate(layout.lags):
+            name = f"{self.key('w', c)}{label}"
+            w = variables[name] = cp.Variable(count, name=name)
+            derived[name] = self.tables[i][c] @ variables[self.key("mu", c)]
+            constraints[f"nonlinearity of {name}"] = (w == derived[name],)
+            for j, lag in enumerate(lags):
+                right = right + variables[self.key("b", c)][j] * w[n - lag : count - lag]
+        if "offset" in variables:
+            right = right + variables["offset"][0]
+        constraints[f"dynamics{label}"] = (left == right,)
+        there = np.flatnonzero(np.isfinite(e.y[:, 0]))
+        seen = x if there.size == count else x[there]
+        r = variables[f"residual{label}"] = cp.Variable(there.size, name=f"residual{label}")
+        derived[f"residual{label}"] = seen - e.y[there, 0]
+        constraints[f"residual{label}"] = (r == derived[f"residual{label}"],)
+        return constraints, derived
+
+    def _gauge(self, c: int) -> Any:
+        b, gauge = self.variables[self.key("b", c)], self.criterion.gauge
+        if gauge == "norm":
+            return cp.sum_squares(b) == 1
+        if gauge == "b0":
+            return b[0] == 1
+        return cp.sum(b) == 1 + (cp.sum(self.variables["a"]) if "a" in self.variables else 0)
+
+    def _start(self) -> dict[str, Array]:
+        """The equation error's estimate with stable poles, and its simulation."""
+        criterion, unknowns = self.criterion, self.criterion.unknowns
+        first = equation_error(self.data, unknowns)
+        first = blank(self.data, unknowns) if first is None else first
+        a = stable_poles(first[unknowns.slices["a"]])
+        point = unknowns.unpack(criterion.normalised(
+            with_poles(criterion, unknowns, criterion.normalised(first), a, "ARX").x))
+        start = {"a": point.a, "offset": np.array([point.offset])}
+        for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
+            sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
+            start |= {self.key("mu", c): sign * mu, self.key("b", c): sign * b}
+        outputs = simulate(self.data, unknowns, point)
+        for e, label, x, tables in zip(self.data.experiments, self.labels, outputs, self.tables):
+            start[f"x{label}"] = x
+            there = np.isfinite(e.y[:, 0])
+            start[f"residual{label}"] = x[there] - e.y[there, 0]
+            for c, table in enumerate(tables):
+                start[f"{self.key('w', c)}{label}"] = table @ start[self.key("mu", c)]
+        return {name: start[name] for name in self.variables}
+
+    def recover(self, values: Values) -> HammersteinTF:
+        """Build the model."""
+        pairs = [(np.asarray(values[self.key("mu", c)]), np.asarray(values[self.key("b", c)]))
+                 for c in range(self.layout.m)]
+        plant = HammersteinARX(
+            a=np.asarray(values.get("a", np.zeros(0)), dtype=float), b=tuple(b for _, b in pairs),
+            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(self.layout.bases, pairs)),
+            nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
+            gauge=self.criterion.gauge, **model_meta(self.data))
+        return HammersteinTF(plant)

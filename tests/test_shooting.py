@@ -1,0 +1,134 @@
+"""Output error with outputs as variables: the optimum of the Gauss-Newton route, constraints on states, refusals."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from test_noise_models import BASIS, MU, A, B, quiet, record, system
+
+import optid
+from formulations import shape, shooting
+from optid.bases import Polynomial
+from optid.data import Data
+from optid.errors import DataError, OptidError, RankError, StructureError
+from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
+from optid.solution import Status
+
+ORDERS = {"na": 2, "nb": 2, "nk": 1, "basis": BASIS}
+
+
+def plain(counts=(300,), **options):
+    return record(system("bj", c=[], d=[]), counts, **options)
+
+
+def same(data, solver="ipopt", rel=1e-6, **options):
+    ours = optid.fit(data, "hammerstein_oe.shooting", solver=solver, **options)
+    theirs = optid.fit(data, "hammerstein_oe.exact", **options)
+    assert ours.solution.status is Status.LOCAL
+    assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=rel)
+    for c in range(len(data.inputs)):
+        assert ours.model.theta(c) == pytest.approx(theirs.model.theta(c), rel=1e-4, abs=1e-5)
+    assert ours.model.a == pytest.approx(theirs.model.a, abs=1e-5)
+    return ours
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "uno", "fatrop"])
+def test_back_ends_find_the_optimum_of_gauss_newton(solver):
+    if not optid.backends.back_ends()[solver].installed:
+        pytest.skip(f"{solver} is not installed")
+    fit = same(plain((120,)), solver, **ORDERS)
+    assert fit.model.structure == "oe" and not fit.solution.bound.proved
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_records(seed):
+    rng = np.random.default_rng(seed)
+    model = system("bj", a=np.poly(rng.uniform(-0.9, 0.95, 2))[1:], mu=rng.normal(size=4), c=[], d=[])
+    same(record(model, (400,), seed=seed, noise=0.1), **ORDERS)
+
+
+def test_gaps_and_several_experiments():
+    data = plain((200, 150), gaps=0.2)
+    fit = same(data, **ORDERS)
+    assert fit.solution.values["x[2]"].shape == (150,)
+    # every experiment has a state of its own: the residuals are those of a simulation with the fitted state
+    simulated = fit.model.simulate(data, x0="fit")
+    for i, x in enumerate(simulated, start=1):
+        assert fit.solution.values[f"x[{i}]"] == pytest.approx(x[:, 0], abs=1e-5)
+
+
+def test_two_inputs_without_a_constant_and_the_gauges():
+    functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
+    plant = HammersteinARX(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.0)
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, (400, 2))
+    data = Data(u, plant.simulate(u) + 0.1 * rng.standard_normal((400, 1)))
+    options = {"na": 2, "nb": [2, 1], "nk": [0, 2], "basis": [BASIS, functions[1].basis], "offset": False}
+    for gauge in ("norm", "gain", "b0"):
+        fit = same(data, gauge=gauge, **options)
+        assert fit.model.offset == pytest.approx([0.0]) and fit.model.gauge == gauge
+
+
+def test_no_poles():
+    data = record(HammersteinTF(HammersteinARX([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3)), (200,))
+    ours = optid.fit(data, shooting.exact, na=0, nb=2, nk=1, basis=BASIS, solver="ipopt")
+    theirs = optid.fit(data, "hammerstein_oe.exact", na=0, nb=2, nk=1, basis=BASIS)
+    assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-8)
+
+
+def test_shape_constraints_agree_with_gauss_newton():
+    data = record(system("bj", mu=np.array([-0.2, -0.5, 0.5, 0.4]), c=[], d=[]), (300,), seed=2)
+    fit = same(data, rel=1e-5, constraints=[shape.monotone("increasing")], **ORDERS)
+    assert fit.prices[0].active
+
+
+def test_constraints_on_the_simulated_output_and_nonconvex_ones():
+    data = plain()
+    free = optid.fit(data, shooting.exact, solver="ipopt", **ORDERS)
+    ceiling = 0.9 * float(np.max(free.solution.values["x"]))
+    rules = [lambda v: {"ceiling": v["x"] <= ceiling}, lambda v: {"pole": cp.multiply(v["a"][0], v["a"][0]) >= 1.6}]
+    fit = optid.fit(data, shooting.exact, solver="ipopt", constraints=rules, **ORDERS)
+    assert np.max(fit.model.simulate(data, x0="fit")) <= ceiling + 1e-2
+    assert np.max(fit.solution.values["x"]) <= ceiling + 1e-6 and fit.model.a[0] ** 2 >= 1.6 - 1e-6
+    assert fit.solution.objective > free.solution.objective
+
+
+def test_start_satisfies_the_programme_and_judging_is_ours():
+    program = shooting.exact(plain((150, 100), gaps=0.1), **ORDERS)
+    program.assign(program.start)
+    for group in program.constraints.values():
+        for member in group:
+            assert np.max(np.abs(member.violation())) < 1e-9
+    assert program.kind == "NLP"
+
+
+def test_units():
+    data = plain()
+    options = ORDERS | {"basis": "triangular:4"}
+    fit = optid.fit(data, shooting.exact, solver="ipopt", **options)
+    scaled = optid.fit(data.detrend().scale(), shooting.exact, solver="ipopt", **options)
+    assert scaled.model.theta() == pytest.approx(fit.model.theta(), rel=1e-4, abs=1e-5)
+
+
+def test_refusals():
+    data = plain((200,))
+    with pytest.raises(StructureError, match="30000 samples.*up to 20000.*hammerstein_oe.exact"):
+        quiet(Data(np.tile(data.u, (150, 1)), np.tile(data.y, (150, 1))), shooting.exact, **ORDERS)
+    with pytest.raises(StructureError, match="not convex in"):
+        quiet(data, shooting.exact, solver="clarabel", **ORDERS)
+    with pytest.raises(StructureError, match="gauge must be"):
+        quiet(data, shooting.exact, gauge="none", **ORDERS)
+    with pytest.raises(StructureError, match="one output"):
+        quiet(Data(data.u, np.hstack([data.y, data.y**2])), shooting.exact, **ORDERS)
+    with pytest.raises(StructureError, match="na is the number"):
+        quiet(data, shooting.exact, **(ORDERS | {"na": -1}))
+    with pytest.raises(RankError, match="samples for"):
+        quiet(Data(data.u[:10], data.y[:10]), shooting.exact, **ORDERS)
+    u = data.u.copy()
+    u[17] = np.nan
+    with pytest.raises(DataError, match="'u' is missing at sample 17"):
+        quiet(Data(u, data.y), shooting.exact, **ORDERS)
+    with pytest.raises(DataError, match="'y'"):
+        quiet(Data(data.u, np.full((200, 1), np.nan)), shooting.exact, **ORDERS)
+    with pytest.raises(OptidError):
+        quiet(data, shooting.exact, solver="ipopt",
+              constraints=[lambda v: {"up": v["a"][0] >= 1, "down": v["a"][0] <= -1}], **ORDERS)
