@@ -125,6 +125,26 @@ def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Corr
     return {name: autocorrelation([r[:, o] for r in rest], name, lags) for o, name in enumerate(model.outputs)}
 
 
+def output_noise(model: "HammersteinSS") -> Array:
+    """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
+
+    It is the mean of the spectrum; infinite where a pole on or outside the unit circle is driven by the noise.
+
+    Raises:
+        StructureError: the model has no noise covariances.
+    """
+    from scipy.linalg import solve_discrete_lyapunov
+
+    if model.noise is None:
+        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
+    if not model.K.any():
+        return np.array(model.noise.innovation)
+    if not model.is_stable:
+        return np.full((model.l, model.l), np.inf)
+    states = solve_discrete_lyapunov(model.A, model.K @ model.noise.innovation @ model.K.T)
+    return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
+
+
 def _observer(model: "HammersteinSS") -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:

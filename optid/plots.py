@@ -132,6 +132,26 @@ def poles_and_response(fit: "Fit") -> Figure:
 
 
 @_styled
+def noise(fit: "Fit") -> Figure:
+    """Draw the spectral density of the noise at every output, in dB of its squared unit.
+
+    Raises:
+        StructureError: the model has no noise covariances.
+    """
+    from optid.noise import noise_spectrum
+
+    model = fit.model
+    w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
+    size = np.sqrt(np.abs(np.einsum("foo->fo", noise_spectrum(model, w))))
+    figure = Figure(figsize=(6.4, 3.0), layout="constrained")
+    ax = figure.subplots()
+    panels.draw_response(ax, w, size, [None] * model.l, [name.replace("$", r"\$") for name in model.outputs])
+    ax.set_title("Spectrum of the noise")
+    ax.set_ylabel("power per unit of bandwidth (dB)")
+    return figure
+
+
+@_styled
 def certificate(fit: "Fit") -> Figure:
     """Draw how far the proof of global optimality went: the ladder of proofs and the gap that is left."""
     bound = fit.solution.bound

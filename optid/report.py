@@ -65,6 +65,7 @@ def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
 def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
     tone, word, sentence = summary.verdict(fit)
     tables = [estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
+    tables += [noise] if (noise := summary.noise_table(fit)) else []
     return {
         "version": __version__,
         "title": summary.title(fit),
@@ -190,6 +191,15 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
             "and step response of the linear part.",
         )
     )
+    if summary.noise_table(fit):
+        found.append(
+            _figure(
+                "noise",
+                lambda: plots.noise(fit),
+                "Spectral density of the noise at the outputs, process and measurement noise together. A flat line is "
+                "white noise.",
+            )
+        )
     return found
 
 

@@ -177,19 +177,9 @@ class Uncertainty:
                         value + upper.reshape(value.shape))
 
     def table(self) -> list[tuple[str, float, float, float, float]]:
-        """Return (name, estimate, standard error, lower, upper) of every coefficient of A, B and the offset."""
-        model, rows = self.fit.model, []
-        several = model.l > 1
-        for i, block in enumerate(np.ndindex(self.a.value.shape)):
-            name = f"a{block[0] + 1}" + (f"[{model.outputs[block[1]]},{model.outputs[block[2]]}]" if several else "")
-            rows.append((name, *_row(self.a, i)))
-        for channel, interval in zip(model.inputs, self.b):
-            for i, block in enumerate(np.ndindex(interval.value.shape)):
-                words = ([channel] if model.m > 1 else []) + ([model.outputs[block[1]]] if several else [])
-                rows.append((f"b{block[0]}" + (f"[{','.join(words)}]" if words else ""), *_row(interval, i)))
-        for i, output in enumerate(model.outputs):
-            rows.append(("offset" + (f"[{output}]" if several else ""), *_row(self.offset, i)))
-        return rows
+        """Return (name, estimate, standard error, lower, upper) of every coefficient that tables of the model show."""
+        found = self.of(lambda model: np.array([value for _, value in model.coefficients()]))
+        return [(name, *_row(found, i)) for i, (name, _) in enumerate(self.fit.model.coefficients())]
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +268,9 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0
         RankError: parameters without effect on the predictions.
     """
     if not hasattr(fit.program.compressed, "lifted"):
-        raise StructureError(f"they follow from compressed least squares, which {fit.formulation!r} does not keep; "
-                             "use optid.bootstrap")
+        advice = "; use optid.bootstrap" if fit.model is not None and fit.model.kind == "HammersteinARX" else ""
+        raise StructureError("they follow from compressed least squares, which "
+                             f"{fit.formulation!r} does not keep{advice}")
     return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
 
 

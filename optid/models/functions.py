@@ -12,7 +12,7 @@ class StaticFunction:
     """One static function of a model.
 
     Attributes:
-        word: its name in equations and tables: "f", "f_valve", "g_level".
+        word: its name in equations and tables: "f", "f_valve", "f2_valve", "g_level".
         nonlinearity: the function.
         channel: index of its argument among the inputs, or the outputs for a feedback.
         name: name of that channel.
@@ -62,9 +62,10 @@ def has_feedback(model: Any) -> bool:
 
 
 def _words(letter: str, places: tuple[int, ...], channels: tuple[str, ...], alone: bool) -> list[str]:
-    words, count = [], {}
+    """Names by channel, numbered behind the letter where a channel has several: f1_valve, f2_valve."""
+    words, count = [], dict.fromkeys(places, 0)
     for c in places:
-        count[c] = count.get(c, 0) + 1
-        word = letter if alone else f"{letter}_{channels[c]}"
-        words.append(f"{word}{count[c]}" if places.count(c) > 1 else word)
+        count[c] += 1
+        number = str(count[c]) if places.count(c) > 1 else ""
+        words.append(f"{letter}{number}" + ("" if alone else f"_{channels[c]}"))
     return words

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.expansions import Linear
+from optid.models.functions import static_functions
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
@@ -38,21 +38,16 @@ def listed(model: "HammersteinSS") -> list[tuple[str, float]]:
 
 
 def _function_names(model: "HammersteinSS") -> list[str]:
-    """f_u of every nonlinearity, numbered where an input has several; the input itself where it is linear."""
-    names = []
-    for j, (f, c) in enumerate(zip(model.nonlinearities, model.input_of)):
-        name, several = model.inputs[c], model.input_of.count(c) > 1
-        number = str(model.input_of[: j + 1].count(c)) if several else ""
-        names.append(name if isinstance(f.basis, Linear) and not several else f"f{number}_{name}")
-    return names
+    """Words of the functions of the inputs; the input itself where it is linear and has no other."""
+    found = [function for function in static_functions(model) if not function.fed_back]
+    several = [model.input_of.count(function.channel) > 1 for function in found]
+    return [
+        function.name if function.is_linear and not many else function.word for function, many in zip(found, several)
+    ]
 
 
 def _feedback_names(model: "HammersteinSS") -> list[str]:
-    names = []
-    for j, o in enumerate(model.output_of):
-        number = str(model.output_of[: j + 1].count(o)) if model.output_of.count(o) > 1 else ""
-        names.append(f"g{number}_{model.outputs[o]}")
-    return names
+    return [function.word for function in static_functions(model) if function.fed_back]
 
 
 def _equations(model: "HammersteinSS", digits: int) -> str:

@@ -72,7 +72,7 @@ def coefficient_table(fit: "Fit") -> Table | None:
         if function.is_linear:
             continue
         letter = "nu" if function.fed_back else "mu"
-        where = function.word.partition("_")[2] or (function.word[1:] if len(functions) > 1 else "")
+        where = "" if function.word in "fg" else function.word if function.word[1] != "_" else function.name
         for j, value in enumerate(function.nonlinearity.mu):
             label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
             if known is None or function.fed_back:

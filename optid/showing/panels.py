@@ -132,7 +132,7 @@ def draw_nonlinearity(
         )
     ax.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
     ax.set_xlabel(name)
-    ax.legend(loc="upper left", handlelength=1.4)
+    ax.legend(loc="best", handlelength=1.4)
 
 
 def draw_correlation(ax: Axes, test: Correlation, title: str) -> None:

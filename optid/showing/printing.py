@@ -58,6 +58,8 @@ def describe(fit: "Fit") -> str:
         lines += [_rule("-"), *_facts(evidence)]
     for table in (estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)):
         lines += [_rule("-"), *set_table(table)]
+    if noise := summary.noise_table(fit):
+        lines += [_rule("-"), *set_table(noise)]
     if fit.prices:
         lines += [_rule("-"), *set_table(summary.constraint_table(fit))]
     lines += [_rule("-"), *_wrapped(sentence)]

@@ -7,6 +7,7 @@ import numpy as np
 
 from optid.data import Data
 from optid.models.functions import has_feedback, static_functions
+from optid.models.noise_covariances import NoiseCovariances
 from optid.showing.wording import Table, gap_text, number, percent, seconds
 from optid.solution import Status
 from optid.validation.predictions import predictors
@@ -232,6 +233,31 @@ def _gauge(model: Any) -> str:
         "b0": "first coefficient of b is one",
         "none": "",
     }.get(model.gauge, model.gauge)
+
+
+def noise_table(fit: "Fit") -> Table | None:
+    """Innovations, noise at the outputs and its colour for a state-space model with noise covariances."""
+    model = fit.model
+    if not isinstance(getattr(model, "noise", None), NoiseCovariances):
+        return None
+    from optid.noise import colour, output_noise
+
+    whole = isinstance(fit.data, Data) and not any(fit.data.missing[name] for name in fit.data.inputs)
+    tests = colour(model, fit.data) if whole and isinstance(fit.data, Data) else {}
+    spread = np.sqrt(np.diag(output_noise(model)))
+    own = np.sqrt(np.diag(model.noise.innovation))
+    rows = []
+    for name, unit, innovation, total in zip(model.outputs, model.output_units, own, spread):
+        test = tests.get(name)
+        word = "-" if test is None or np.isnan(test.p_value) else "white" if test.passed else "coloured"
+        label = f"{name} ({unit})" if unit else name
+        p_value = "-" if test is None else number(test.p_value, 2)
+        rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
+    note = (
+        "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
+        "explain the record as well."
+    )
+    return Table("Noise", ("output", "innovations", "noise at output", "colour", "p value"), rows, note)
 
 
 def validation_tables(checked: "Validation") -> list[Table]:
