@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from formulations.equation_error import model_meta
+from optid.bases import Linear
 from optid.data import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinSS, Nonlinearity
+from optid.models.state_forms import balancing
 from optid.regressors.sensitivities import Linearised
 from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
 
@@ -139,8 +141,10 @@ class StateError:
         if model.nx != unknowns.n or model.m != x.m or model.l != x.l or len(model.nonlinearities) != x.m:
             raise StructureError(f"a start has {model.nx} states, {model.m} inputs and {model.l} outputs; "
                                  f"{unknowns.n}, {x.m} and {x.l} are needed")
-        same = [f.basis.to_dict() == basis.to_dict() for f, basis in zip(model.nonlinearities, x.inputs)]
-        same += [g.basis.to_dict() == family.basis.to_dict() for g, family in zip(model.feedback, x.feedback)]
+        pairs = [(f.basis, basis) for f, basis in zip(model.nonlinearities, x.inputs)]
+        pairs += [(g.basis, family.basis) for g, family in zip(model.feedback, x.feedback)]
+        same = [one.to_dict() == other.to_dict() or isinstance(one, Linear) and isinstance(other, Linear)
+                for one, other in pairs]
         if not all(same) or len(model.feedback) > len(x.feedback):
             raise StructureError("a start has other basis functions than the fit: give it the same bases")
         mus = [np.ones(1) if not free else f.mu for f, free in zip(model.nonlinearities, unknowns.free)]
@@ -165,16 +169,11 @@ class StateError:
 
 def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
             ) -> Array | None:
-    """Return an admissible vector of unknowns near a model, in balanced states where it has them; None without one.
+    """Return an admissible vector of unknowns near a model; None without one.
 
     A model whose state is not carried stably is contracted; the initial states are those that fit best.
     """
-    if model.is_stable:
-        try:
-            model = model.balanced()
-        except StructureError:
-            pass
-    point = criterion.point_of(model)
+    point = criterion.point_of(_balanced(criterion, model))
     candidates = [point]
     if criterion.unknowns.innovations:
         candidates.append(replace(point, K=np.zeros_like(point.K)))
@@ -194,3 +193,19 @@ def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] 
             x[p:] += at.follow(np.zeros(p))
             return x
     return None
+
+
+def _balanced(criterion: StateError, model: HammersteinSS) -> HammersteinSS:
+    """Balance the states for the signals and weights of the fit, so that all entries of A are of one size.
+
+    A model without balanced states stays as it is.
+    """
+    data = criterion.data
+    f = model.expanded(np.vstack([e.u for e in data.experiments]))
+    y = np.vstack([e.y for e in data.experiments])
+    g = [np.nanstd(function(y[:, o])) for function, o in zip(model.feedback, model.output_of)]
+    driven = np.hstack([model.B * f.std(axis=0), model.E * np.array(g)])
+    try:
+        return model.transformed(balancing(model.A, driven, np.linalg.cholesky(criterion.weight).T @ model.C))
+    except StructureError:
+        return model

@@ -86,23 +86,29 @@ def transformed(model: "HammersteinSS", T: ArrayLike) -> "HammersteinSS":
 
 def balanced(model: "HammersteinSS") -> "HammersteinSS":
     """Balance the Gramians; the documentation is at `HammersteinSS.balanced`."""
+    return model if model.nx == 0 else transformed(model, balancing(model.A, np.hstack([model.B, model.E]), model.C))
+
+
+def balancing(A: Array, B: Array, C: Array) -> Array:
+    """Return the change of states T (n, n) that makes both Gramians of (A, B, C) diagonal and equal.
+
+    Raises:
+        StructureError: A is unstable, or the triple is not minimal.
+    """
     from scipy.linalg import solve_discrete_lyapunov
 
-    if not model.is_stable:
-        largest = np.abs(model.poles).max()
+    largest = float(np.abs(np.linalg.eigvals(A)).max())
+    if largest >= 1:
         raise StructureError(f"The model is unstable (largest pole {largest:.6g}): it has no Gramians.")
-    if model.nx == 0:
-        return model
-    driven = np.hstack([model.B, model.E])
-    reach = _factor(solve_discrete_lyapunov(model.A, driven @ driven.T))
-    see = _factor(solve_discrete_lyapunov(model.A.T, model.C.T @ model.C))
+    reach = _factor(solve_discrete_lyapunov(A, B @ B.T))
+    see = _factor(solve_discrete_lyapunov(A.T, C.T @ C))
     left, values, right = np.linalg.svd(see.T @ reach)
     if values[-1] <= 1e-13 * values[0]:
         raise StructureError(
             f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
             "Identify it with fewer states."
         )
-    return transformed(model, (left / np.sqrt(values)).T @ see.T)
+    return (left / np.sqrt(values)).T @ see.T
 
 
 def _factor(gramian: Array) -> Array:

@@ -1,0 +1,382 @@
+"""The prediction-error programme of a state-space model: simulation or one-step errors of all outputs minimised.
+
+    x(k+1) = A x + B f(u) + E g(y) + K e,    y(k) = C x + D f(u) + d + e
+
+`exact` is the Hammerstein model with nonlinear output feedback, `linear` (registered as ``ss.exact``) the linear one.
+``criterion="simulation"`` takes K = 0 and the simulation with measured feedback (P2), ``"prediction"`` estimates K.
+Both are procedures: starts from subspace fits with several block rows, Gauss-Newton descents on streamed sensitivities
+(`formulations.state_error`), errors weighted anew by their own covariance, and at the optimum, or under constraints,
+convex programmes in the tangent of the iterate (`formulations.prediction_error`). Constraints on poles are kept by
+every iterate through the length of the steps.
+
+Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
+(not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, and the
+affine expressions ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names
+carry the channel, as in ``mu[valve]``.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.equation_error import flat
+from formulations.prediction_error import Descent, Posed, best_of, descend, refine
+from formulations.state_error import StateError, entered
+from formulations.subspace_procedure import Plan, _feedback_bases, identified
+from optid.bases import fitted_bases
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.judging import measure_violation
+from optid.models import HammersteinSS
+from optid.program import Program, Values, View
+from optid.regressors.sensitivities import Linearised
+from optid.regressors.state_sensitivities import StateUnknowns
+from optid.solving import Evidence, Procedure
+from optid.subspace.expansion import expand
+
+Array = np.ndarray
+
+CRITERIA = ("simulation", "prediction")
+WEIGHTINGS = ("auto", "scale", "variance", "determinant")
+ROUNDS = 10
+"""Times the errors are weighted anew at most."""
+
+SAME_WEIGHT = 1e-4
+FINALISTS = 2
+ROWS_PER_UNKNOWN = 1.1
+AGREE = 1e-4
+
+Bases = Basis | str | Sequence[Basis | str]
+
+
+def linear(
+    data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
+    weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+    initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
+) -> Procedure:
+    """Minimise the simulation or prediction error of a linear state-space model.
+
+    Args:
+        data: the record: every input sample present, outputs may be missing.
+        nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
+        criterion: "simulation" (output error, K = 0) or "prediction" (innovation form, K estimated).
+        block_rows: of the subspace fits to start from, one or several; None chooses three.
+        weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
+            covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
+            likelihood of Gaussian noise) for prediction.
+        offset: estimate a constant; False takes the record as it is.
+        feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
+        initial: models of the same structure to start from besides.
+        iterations: Gauss-Newton steps per descent at most.
+        constraints: rules about poles, builders of CVXPY constraints in the named variables.
+
+    Raises:
+        StructureError: words, orders or starts that do not fit.
+        DataError: a missing input sample.
+        RankError: too few samples for the unknowns.
+    """
+    return _procedure("ss.exact", data, nx, "linear", None, criterion, block_rows, weighting, offset, feedthrough,
+                      initial, iterations, constraints)
+
+
+def exact(
+    data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
+    criterion: str = "simulation", block_rows: int | Sequence[int] | None = None, weighting: str = "auto",
+    offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+    initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
+) -> Procedure:
+    """Minimise the simulation or prediction error of a Hammerstein state-space model with output feedback.
+
+    Every input acts through one nonlinearity (rank one). The feedback functions are taken in coordinates without a
+    part that is linear in the outputs of the record, which A would repeat.
+
+    Args:
+        data: as in `linear`.
+        nx: as in `linear`.
+        basis: basis of the input nonlinearity, one per input or one for all.
+        feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
+        criterion: "simulation" (P2: measured feedback, K = 0) or "prediction" (P1: K estimated).
+        block_rows: as in `linear`.
+        weighting: as in `linear`.
+        offset: as in `linear`.
+        feedthrough: as in `linear`.
+        initial: as in `linear`.
+        iterations: as in `linear`.
+        constraints: as in `linear`, also those of `formulations.shape`.
+
+    Raises:
+        StructureError, DataError, RankError: as `linear`; RankError also for a feedback basis that is linear in y.
+    """
+    return _procedure("hammerstein_ss.exact", data, nx, basis, feedback_basis, criterion, block_rows, weighting, offset,
+                      feedthrough, initial, iterations, constraints)
+
+
+def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, criterion: str, block_rows: Any,
+               weighting: str, offset: bool, feedthrough: Any, initial: Any, iterations: int,
+               constraints: Sequence[Any]) -> Procedure:
+    for what, word, known in (("criterion", criterion, CRITERIA), ("weighting", weighting, WEIGHTINGS)):
+        if word not in known:
+            raise StructureError(f"{what}={word!r}: use one of {', '.join(known)}.")
+    if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 1:
+        raise StructureError(f"iterations={iterations!r}: a whole number from 1 is needed.")
+    given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
+    plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
+                offset=bool(offset), feedthrough=feedthrough, stability="free", iterations=2 * (
+                    feedback_basis is not None))
+    _check_inputs(data)
+    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
+    if criterion == "prediction" and feedback_basis is not None:
+        plan = replace(plan, instruments="simulated+past")
+    poles, others = _sorted(constraints)
+    return _run(plan, given, criterion, weighting, models, int(iterations), poles, others)
+
+
+def _check_inputs(data: Data) -> None:
+    for number, e in enumerate(data.experiments, start=1):
+        lost = ~np.isfinite(e.u)
+        if lost.any():
+            k, c = np.argwhere(lost)[0]
+            where = f" of experiment {number}" if data.n_experiments > 1 else ""
+            raise DataError(
+                f"input {data.inputs[c]!r} is missing at sample {k}{where} ({int(lost[:, c].sum())} in all): the state "
+                "needs every input. Interpolate it, or split the record there")
+
+
+def _sorted(constraints: Sequence[Any]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Split into rules about poles, which steps obey, and constraints that programmes carry."""
+    poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
+    for rule in poles:
+        if getattr(rule, "verify", None) is None:
+            raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
+                                 "use it with hammerstein_ss.asivid")
+    return poles, tuple(rule for rule in constraints if rule not in poles)
+
+
+def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: str, models: list[HammersteinSS],
+         iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...]) -> Procedure:
+    data, refusal = plan.data, None
+    found: dict[str, HammersteinSS] = {f"start {i}": model for i, model in enumerate(models, start=1)}
+    nx = plan.order
+    for rows in block_rows if block_rows is not None else _block_rows(plan):
+        try:
+            evidence = yield from _quietly(identified(replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows)))
+        except (RankError, StructureError, np.linalg.LinAlgError) as error:
+            refusal = refusal or error
+            continue
+        if evidence.model is not None:
+            nx = nx or int(evidence.figures["order"])
+            found[f"{evidence.figures['block rows']} block rows"] = evidence.model
+    if nx is None or not found:
+        raise refusal or RankError("no subspace fit has a point to start from; use another order")
+    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
+                       data.inputs, data.outputs)
+    unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), criterion == "prediction", plan.offset)
+    _check_rows(data, unknowns)
+    y = np.vstack([e.y for e in data.experiments])
+    variances = np.nanvar(y, axis=0)
+    error = StateError(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
+                       tuple(rule.verify for rule in poles))
+    starts = {name: x for name, model in found.items() if (x := entered(error, model)) is not None}
+    if not starts:
+        raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
+    error, best, figures = _searched(error, starts, criterion, weighting, iterations)
+    posing = Posing(plan.name, error, constraints)
+    x = posing.signed(best.x)
+    evidence = yield from refine(posing.posed(), replace(best, x=x), {"order": nx, **figures}, x)
+    return _told(evidence, error)
+
+
+def _told(evidence: Evidence | None, error: StateError) -> Evidence | None:
+    if evidence is None or evidence.model is None:
+        return evidence
+    return replace(evidence, figures={**evidence.figures, "weight of the outputs": error.weight})
+
+
+def _quietly(procedure: Procedure) -> Procedure:
+    """Run a procedure that only provides a start: its warnings are about an answer nobody sees."""
+    answer: Any = None
+    while True:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            try:
+                program = procedure.send(answer)
+            except StopIteration as stop:
+                return stop.value
+        answer = yield program
+
+
+def _block_rows(plan: Plan) -> list[int | None]:
+    """Three numbers of block rows: what the subspace fit would choose, and multiples of what the order needs."""
+    if plan.order is None:
+        return [None]
+    least = plan.order // plan.data.l + 2
+    shortest = min(e.n_samples for e in plan.data.experiments)
+    most = max(shortest // (4 * (plan.data.m + plan.data.l + 1)), least)
+    return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
+
+
+def _check_rows(data: Data, unknowns: StateUnknowns) -> None:
+    rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
+    free = unknowns.size - unknowns.n**2
+    if rows < ROWS_PER_UNKNOWN * free:
+        raise RankError(f"{rows} output samples for {free} unknowns (initial states included): at least "
+                        f"{int(np.ceil(ROWS_PER_UNKNOWN * free))} are needed. Use a longer record, fewer states or "
+                        "fewer basis functions")
+
+
+def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, weighting: str, iterations: int
+              ) -> tuple[StateError, Descent, dict[str, Any]]:
+    """Descend from every start, then weight the errors anew until the weights stay; the best end wins."""
+    if error.unknowns.l == 1:
+        weighting = "scale"  # one output has nothing to be weighed against
+    elif weighting == "auto":
+        weighting = "determinant" if criterion == "prediction" else "variance"
+    found = best_of(error, starts, iterations)
+    levels = [error.level(one.x) if weighting != "scale" else one.value for one in found]
+    order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
+    ends = []
+    for i in order[:FINALISTS]:
+        end = _weighted(error, found[i], weighting, iterations)
+        ends.append((end[0].level(end[1].x) if weighting != "scale" else end[1].value, *end))
+    _, final, best = min(ends, key=lambda end: (end[2].border, end[0]))
+    values = np.array([one.value for one in found])
+    reach = (1 + AGREE) * values.min() + 1e-14 * error.energy
+    agreed = [one.start for one in found if one.value <= reach]
+    figures = {"starts": f"{len(agreed)} of {len(found)} starts arrive at the smallest error ({', '.join(agreed)})",
+               "starts that agree": len(agreed), "errors of the starts": np.sort(values)[::-1]}
+    return final, best, figures
+
+
+def _weighted(error: StateError, one: Descent, weighting: str, iterations: int) -> tuple[StateError, Descent]:
+    steps = one.steps
+    if weighting == "scale":
+        return error, descend(error, one.x, iterations=iterations, start=one.start)
+    for _ in range(ROUNDS):
+        new = error.reweighted(one.x, full=weighting == "determinant")
+        change = np.linalg.norm(new.weight - error.weight) / np.linalg.norm(new.weight)
+        error, start = new, one.start
+        one = descend(error, one.x, iterations=iterations, start=start)
+        steps += one.steps
+        if change < SAME_WEIGHT:
+            break
+    return error, replace(one, steps=steps)
+
+
+# -- the programme ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Posing:
+    """Writes programmes in the tangent of an iterate, and reads their values."""
+
+    name: str
+    criterion: StateError
+    constraints: tuple[Any, ...]
+
+    def posed(self) -> Posed:
+        """Return what the constrained iteration needs."""
+        return Posed(self.criterion, self.pose, self.pack, self.model)
+
+    @cached_property
+    def places(self) -> dict[str, str]:
+        """{variable: part of the vector}, in the order of the vector."""
+        unknowns, found = self.criterion.unknowns, {}
+        x = unknowns.expansion
+        for part in unknowns.slices:
+            kind, number = part.rstrip("0123456789"), part[len(part.rstrip("0123456789")) :]
+            if kind in ("mu", "b"):
+                found[kind if x.m == 1 else f"{kind}[{x.input_names[int(number)]}]"] = part
+            elif kind in ("nu", "e"):
+                word = {"nu": "mu feedback", "e": "b feedback"}[kind]
+                output = x.output_names[x.feedback[int(number)].output]
+                found[word if x.l == 1 else f"{word}[{output}]"] = part
+            else:
+                found[kind] = part
+        return {**found, "x0": "x0"}
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Name the parts of a vector."""
+        unknowns = self.criterion.unknowns
+        found = {}
+        for name, part in self.places.items():
+            if part == "x0":
+                states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.n).T
+                found[name] = states if unknowns.experiments > 1 else states[:, 0]
+            else:
+                found[name] = x[unknowns.slices[part]].reshape(unknowns.shapes[part])
+        return found
+
+    def pack(self, values: Mapping[str, Array]) -> Array:
+        """Return the vector of named values."""
+        parts = [np.ravel(np.asarray(values[name]).T if part == "x0" else values[name])
+                 for name, part in self.places.items()]
+        return np.concatenate(parts).astype(float)
+
+    def pose(self, x: Array, at: Linearised, damping: float) -> Program:
+        """Write the programme of one step from x; the gauge is part of the least squares, see `StateError`."""
+        values, unknowns = self.values(x), self.criterion.unknowns
+        variables = {name: cp.Variable(value.shape, name=name) for name, value in values.items()}
+        parts = [flat(v) if name == "x0" or v.ndim == 1 else cp.vec(v, order="C") for name, v in variables.items()]
+        stacked = cp.hstack(parts)
+        matrix, errors = at.whole
+        residual = matrix @ (stacked - x) + errors
+        r = cp.Variable(x.size, name="residual")
+        objective = cp.sum_squares(r) + at.remainder
+        if damping:
+            weights = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
+            objective = objective + cp.sum_squares(cp.multiply(weights, stacked - x))
+        names = unknowns.expansion.input_names
+        view = View({**variables, **self._theta(variables, values)}, kind="tangent", channels=names,
+                    bases=dict(zip(names, unknowns.expansion.inputs)), gauge="norm", reference=values)
+        program = Program(name=self.name, objective=cp.Minimize(objective), constraints={"residual": (r == residual,)},
+                          variables={**variables, "residual": r}, start={**values, "residual": errors},
+                          recover=self.recover, view=view, structural=frozenset({"residual"}),
+                          derived={"residual": residual}, scale=self.criterion.energy)
+        return program.subject_to(*self.constraints)
+
+    def _theta(self, variables: Mapping[str, cp.Variable], values: Mapping[str, Array]) -> dict[str, cp.Expression]:
+        """Every mu bᵀ to first order, (P, n + l)."""
+        names, found = self.criterion.unknowns.expansion.input_names, {}
+        for name in names:
+            tail = f"[{name}]" if len(names) > 1 else ""
+            mu, b = f"mu{tail}", f"b{tail}"
+            if mu in variables:
+                found[f"Theta{tail}"] = (cp.outer(variables[mu], values[b]) + cp.outer(values[mu], variables[b])
+                                         - np.outer(values[mu], values[b]))
+            else:
+                found[f"Theta{tail}"] = cp.reshape(variables[b], (1, variables[b].size), order="F")
+        return found
+
+    def signed(self, x: Array) -> Array:
+        """Turn the sign of every (mu, b) to where the constraints are violated least."""
+        x = self.criterion.normalised(x)
+        at = self.criterion.unknowns.slices
+        for part in [part for part in at if part.startswith("mu")]:
+            if not self.constraints:
+                break
+            turned = np.array(x)
+            turned[at[part]] *= -1.0
+            turned[at["b" + part[2:]]] *= -1.0
+            here = self.criterion.linearise(x)
+            sizes = []
+            for one in (x, turned):
+                program = self.pose(one, here, 0.0)
+                program.assign(program.start)
+                sizes.append(measure_violation(program)[0])
+            x = turned if sizes[1] < sizes[0] else x
+        return x
+
+    def model(self, x: Array) -> HammersteinSS:
+        """Build the model of a vector."""
+        found = self.criterion.at(self.criterion.unknowns.unpack(x))
+        return found.regauge("norm") if any(self.criterion.unknowns.free) and not self.constraints else found
+
+    def recover(self, values: Values) -> HammersteinSS:
+        """Build the model of the programme's values."""
+        return self.model(self.pack(values))

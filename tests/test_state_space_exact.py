@@ -1,0 +1,248 @@
+"""State-space models by prediction and simulation error, against finite differences, SciPy and known systems."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from state_systems import linear as linear_system
+
+import optid
+from formulations import shape
+from formulations.rule import Rule
+from formulations.stability import stable
+from formulations.state_error import StateError, entered
+from formulations.state_space_exact import exact, linear
+from optid.bases import Linear, Polynomial, Triangular, UserFunctions
+from optid.data import Data
+from optid.errors import DataError, RankError, StructureError
+from optid.models import HammersteinSS, Nonlinearity
+from optid.regressors.state_sensitivities import StateUnknowns, linearise_states
+from optid.subspace.expansion import expand
+
+
+def problem(innovations, missing, fed, experiments=2, n=3, seed=0, basis=None):
+    """A criterion on noise and a random point: nothing about it is special."""
+    rng = np.random.default_rng(seed)
+    us = [rng.normal(size=(60 - 7 * i, 2)) for i in range(experiments)]
+    ys = [0.3 * np.cumsum(rng.normal(size=(60 - 7 * i, 2)), axis=0) for i in range(experiments)]
+    for y in ys:
+        y[rng.uniform(size=y.shape) < missing] = np.nan
+    data = Data(us, ys) if experiments > 1 else Data(us[0], ys[0])
+    bases = [Triangular(4).fitted(-4, 4), Linear()]
+    feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else []
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    expansion = expand(records, bases, feedback, data.inputs, data.outputs)
+    unknowns = StateUnknowns(n, expansion, experiments, (True, False), innovations)
+    criterion = StateError(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
+    return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
+
+
+def weighted_square(criterion, x):
+    covariance, total = np.linalg.inv(criterion.weight), 0.0
+    for errors in criterion.residuals(x):
+        for e in errors:
+            here = ~np.isnan(e)
+            if here.any():
+                total += e[here] @ np.linalg.inv(covariance[np.ix_(here, here)]) @ e[here]
+    return total
+
+
+@pytest.mark.parametrize("innovations", [False, True])
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+@pytest.mark.parametrize("basis", [None, Polynomial(3), UserFunctions((np.sin, np.tanh), interval=(-3.0, 3.0))])
+def test_sensitivities_equal_finite_differences(innovations, missing, basis):
+    criterion, x = problem(innovations, missing, basis is not None, basis=basis)
+    at = criterion.linearise(x)
+    assert at.value == pytest.approx(weighted_square(criterion, x), rel=1e-12)
+    matrix, errors = at.whole
+    differences = [(weighted_square(criterion, x + 1e-6 * d) - weighted_square(criterion, x - 1e-6 * d)) / 2e-6
+                   for d in np.eye(x.size)]
+    assert 2 * matrix.T @ errors == pytest.approx(differences, abs=1e-6 * np.abs(differences).max())
+    point = criterion.unknowns.unpack(x)
+    model = criterion.at(point)
+    run = model.predict if innovations else model.simulate_measured_feedback
+    for y, e, errors in zip(run(criterion.data, x0=list(point.x0)), criterion.data.experiments, criterion.residuals(x)):
+        assert y - e.y == pytest.approx(errors, abs=1e-10, nan_ok=True)
+
+
+def test_chunks_and_methods_agree():
+    criterion, x = problem(True, 0.1, True)
+    found = [linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at,
+                              criterion.gauge_rows(x), chunk) for chunk in (0, 7)]
+    grams = [one.whole[0].T @ one.whole[0] for one in found]
+    assert grams[0] == pytest.approx(grams[1], rel=1e-9, abs=1e-9 * np.abs(grams[0]).max())
+
+
+@pytest.mark.parametrize("innovations", [False, True])
+def test_directions_of_the_gauge_change_nothing(innovations):
+    criterion, x = problem(innovations, 0.0, True)
+    rows = criterion.gauge_rows(x)
+    assert len(rows) == 9 + 2  # n^2 changes of states, the scales of one input and of one output
+    assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
+    plain = linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at)
+    assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()
+
+
+def test_vector_of_a_model_and_back():
+    criterion, x = problem(True, 0.0, True)
+    unknowns = criterion.unknowns
+    model = criterion.at(unknowns.unpack(x))
+    again = criterion.normalised(unknowns.pack(criterion.point_of(model)))
+    assert again[: unknowns.shared] == pytest.approx(x[: unknowns.shared], abs=1e-10)
+
+
+def system(seed=0, n=2, noise=0.05, samples=400, kind="output", experiments=1):
+    """A linear two-input two-output record and its model."""
+    model = replace(linear_system(seed, n=n, offset_x=None), dt=1.0)
+    rng = np.random.default_rng(seed + 1)
+    us, ys = [], []
+    for i in range(experiments):
+        u = rng.normal(size=(samples - 50 * i, 2))
+        e = noise * rng.normal(size=(len(u), 2))
+        if kind == "output":
+            y = replace(model, K=None).simulate(u, x0=rng.normal(size=n)) + e
+        else:
+            x, y = rng.normal(size=n), np.zeros((len(u), 2))
+            for k in range(len(u)):
+                y[k] = model.C @ x + model.D @ u[k] + model.offset_y + e[k]
+                x = model.A @ x + model.B @ u[k] + model.K @ e[k]
+        us.append(u), ys.append(y)
+    return model, Data(us, ys) if experiments > 1 else Data(us[0], ys[0])
+
+
+@pytest.mark.parametrize("criterion", ["simulation", "prediction"])
+def test_scipy_finds_no_better_point(criterion):
+    _, data = system(seed=3, kind="innovation" if criterion == "prediction" else "output", samples=300, noise=0.2)
+    fit = optid.fit(data, linear, nx=2, criterion=criterion, weighting="scale")
+    unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion == "prediction")
+    error = StateError(data, unknowns, np.diag(1 / data.y.var(axis=0)))
+    x = entered(error, fit.model)
+    assert error.linearise(x).value == pytest.approx(fit.solution.objective, rel=1e-8)
+    root = np.linalg.cholesky(error.weight).T
+
+    def weighted(z):
+        return np.vstack([r @ root.T for r in error.residuals(z)]).ravel()
+
+    best = scipy.optimize.least_squares(weighted, x, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert 2 * best.cost == pytest.approx(fit.solution.objective, rel=1e-8)
+
+
+def _expansion(data):
+    return expand([np.hstack([e.u, e.y]) for e in data.experiments], [Linear()] * data.m, [], data.inputs, data.outputs)
+
+
+def test_linear_system_without_noise_with_missing_samples_and_two_experiments():
+    model, data = system(noise=0.0, experiments=2, n=3)
+    rng = np.random.default_rng(5)
+    ys = [np.where(rng.uniform(size=y.shape) < 0.02, np.nan, y) for y in data.y]
+    lost = Data(list(data.u), ys)
+    fit = optid.fit(lost, "ss.exact", nx=3)
+    assert np.sort_complex(fit.model.poles) == pytest.approx(np.sort_complex(model.poles), abs=1e-6)
+    assert fit.model.impulse_response(20) == pytest.approx(model.impulse_response(20), abs=1e-6)
+    for found, y in zip(fit.model.simulate(lost, x0="fit"), data.y):
+        assert found == pytest.approx(y, abs=1e-5)
+    assert fit.solution.objective < 1e-8
+
+
+def hammerstein(samples=1500, noise=0.02, seed=0, fed=True):
+    """Two inputs with a cubic each, one output fed back through a sine."""
+    rng = np.random.default_rng(seed)
+    cubic = Polynomial(3, interval=(-2.0, 2.0))
+    functions = (Nonlinearity(cubic, np.array([1.0, 0.4, 0.3])), Nonlinearity(cubic, np.array([0.6, -0.5, 0.2])))
+    sine = UserFunctions((lambda y: np.sin(2 * y),), interval=(-4.0, 4.0))
+    model = HammersteinSS(
+        [[0.7, 0.35], [-0.35, 0.6]], [[0.3, 0.1], [0.0, 0.4]], [[1.0, 0.0], [0.2, 1.0]], nonlinearities=functions,
+        E=[[0.1], [0.25]] if fed else None, feedback=(Nonlinearity(sine, np.ones(1)),) if fed else (),
+        output_of=(0,) if fed else (), offset_y=[0.3, -0.2])
+    u = rng.uniform(-2, 2, (samples, 2))
+    return model, u, rng
+
+
+def test_hammerstein_with_feedback_without_noise():
+    model, u, _ = hammerstein(noise=0.0)
+    y = model.simulate(u, x0=[0.5, -0.5])
+    data = Data(u, y)
+    sine = UserFunctions((lambda v: np.sin(2 * v),), interval=(-4.0, 4.0))
+    fit = optid.fit(data, "hammerstein_ss.exact", nx=2, basis=Polynomial(3, interval=(-2.0, 2.0)),
+                    feedback_basis=[sine, None])
+    assert fit.model.simulate_measured_feedback(data, x0="fit") == pytest.approx(y, abs=1e-5)
+    assert fit.model.simulate(data, x0="fit") == pytest.approx(y, abs=1e-4)
+    for c in range(2):
+        ratio = fit.model.nonlinearities[c].mu / model.nonlinearities[c].mu
+        assert ratio == pytest.approx(np.full(3, ratio[0]), rel=1e-5)
+
+
+def test_innovation_form_finds_the_kalman_gain_and_the_noise():
+    model, data = system(kind="innovation", samples=4000, noise=0.3, seed=3)
+    fit = optid.fit(data, "ss.exact", nx=2, criterion="prediction")
+    truth = data.y - model.predict(data)
+    found = data.y - fit.model.predict(data)
+    assert np.linalg.det(np.cov(found.T)) < np.linalg.det(np.cov(truth.T))
+    assert np.cov(found.T) == pytest.approx(0.09 * np.eye(2), abs=0.01)
+    products = lambda one: np.array([one.C @ np.linalg.matrix_power(one.A, k) @ one.K for k in range(4)])  # noqa: E731
+    assert products(fit.model) == pytest.approx(products(model), abs=0.06)
+
+
+def test_the_optimum_does_not_depend_on_units():
+    _, data = system(noise=0.2)
+    one = optid.fit(data, linear, nx=2)
+    other = optid.fit(Data(10 * data.u, data.y * [1e-3, 1e3] + [0.0, 50.0]), linear, nx=2)
+    found = (other.model.simulate(10 * data.u) - other.model.simulate(0 * data.u)) / [1e-3, 1e3]
+    assert found == pytest.approx(one.model.simulate(data.u) - one.model.simulate(0 * data.u), abs=1e-4)
+
+
+def test_covariance_weights_are_a_fixed_point():
+    _, data = system(noise=0.2)
+    fit = optid.fit(data, linear, nx=2, weighting="determinant")
+    errors = data.y - fit.model.simulate(data, x0="fit")
+    covariance = errors.T @ errors / len(errors)
+    assert fit.figures["weight of the outputs"] @ covariance == pytest.approx(np.eye(2), abs=0.02)
+
+
+def test_poles_obey_their_constraint_at_every_step():
+    _, data = system(noise=0.05, n=2)
+    free = optid.fit(data, linear, nx=2)
+    radius = 0.9 * np.abs(free.model.poles).max()
+    fit = optid.fit(data, linear, nx=2, constraints=[stable(radius)], raises=False)
+    assert np.abs(fit.model.poles).max() <= radius * (1 + 1e-6)
+    assert fit.solution.objective > 0
+    with pytest.raises(StructureError, match="cannot judge a model"):
+        optid.fit(data, linear, nx=2, constraints=[Rule("somewhere", lambda v: [], None, frozenset({"poles"}))])
+
+
+def test_shape_constraints_hold_for_every_input():
+    model, u, rng = hammerstein(fed=False)
+    data = Data(u, model.simulate(u) + 0.05 * rng.normal(size=(len(u), 2)))
+    fit = optid.fit(data, "hammerstein_ss.exact", nx=2, basis=Triangular(6), block_rows=6,
+                    constraints=[shape.monotone("increasing", channel="u2")])
+    f = fit.model.nonlinearities[1]
+    assert (np.diff(f(np.linspace(-2, 2, 200))) >= -1e-6).all()
+    free = optid.fit(data, "hammerstein_ss.exact", nx=2, basis=Triangular(6), block_rows=6)
+    assert (np.diff(free.model.nonlinearities[1](np.linspace(-2, 2, 200))) < -1e-3).any()
+
+
+def test_refusals():
+    _, data = system()
+    u = data.u.copy()
+    u[5, 1] = np.nan
+    with pytest.raises(DataError, match="'u2' is missing at sample 5"):
+        optid.fit(Data(u, data.y), linear, nx=2)
+    with pytest.raises(StructureError, match="criterion='best'"):
+        optid.fit(data, linear, nx=2, criterion="best")
+    with pytest.raises(StructureError, match="weighting"):
+        optid.fit(data, linear, nx=2, weighting="best")
+    with pytest.raises(StructureError, match="iterations"):
+        optid.fit(data, linear, nx=2, iterations=0)
+    with pytest.raises(StructureError, match="nx"):
+        optid.fit(data, linear, nx=0)
+    with pytest.raises(StructureError, match="a start has 3 states"):
+        optid.fit(data, linear, nx=2, initial=linear_system(n=3))
+    short = Data(data.u[:30], data.y[:30])
+    with pytest.raises((RankError, StructureError)):
+        optid.fit(short, linear, nx=12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises((RankError, DataError), match="linear"):
+            optid.fit(data, exact, nx=2, basis="linear", feedback_basis="polynomial:1")
