@@ -31,7 +31,7 @@ from optid.subspace.methods import (
     simulate_clipped,
 )
 from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
-from optid.subspace.realisation import largest_gap, realise
+from optid.subspace.realisation import largest_gap, scaled_pair
 
 OBSERVERS = ("auto", "none", "kalman")
 NOISES = ("white", "coloured")
@@ -163,8 +163,8 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
         plan: what was asked for.
         records: raw channels, with simulated outputs where the expansion reads them.
         expansion: the signals.
-        gamma: (rows l, n) observability matrix.
-        scale: (l,) sizes of the outputs, by which residuals are divided.
+        gamma: (rows l, n) observability matrix, in units of the outputs.
+        scale: (l,) sizes of the outputs, by which it and the residuals are divided.
         figures: what was measured before.
 
     Yields:
@@ -174,7 +174,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
         The evidence, with figures added.
     """
     data, figures = plan.data, dict(figures)
-    a, c = realise(gamma, data.l)
+    a, c, gamma = scaled_pair(gamma, scale)
     doubt = ""
     rules = plan.about("poles")
     unstable = plan.stability == "auto" and float(np.max(np.abs(np.linalg.eigvals(a)))) >= 1
@@ -213,7 +213,7 @@ def preliminary(plan: Plan, records: list[np.ndarray], expansion: Expansion, gam
     Raises:
         RankError: the record does not determine it.
     """
-    a, c = realise(gamma, plan.data.l)
+    a, c, _ = scaled_pair(gamma, scale)
     step = _step(plan, records, expansion, _inside(a), c, scale)
     realisation = Realisation(step, False)
     return _model(plan, step, realisation.factors(least_squares_values(realisation)))
@@ -265,7 +265,7 @@ def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.nd
     for _ in range(plan.iterations):
         projection = _projected(plan, records, model, alpha, kind)
         nx, _ = _order(plan, projection)
-        a, c = realise(projection.gamma(nx), plan.data.l)
+        a, c, _ = scaled_pair(projection.gamma(nx), projection.scale)
         step = _step(plan, records, model, _inside(a), c, projection.scale)
         bu, du, ez, d, _ = step.matrices(step.least_squares())
         outputs = simulate_clipped(raw, model, _inside(a), c, bu, du, ez, d)

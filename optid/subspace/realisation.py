@@ -74,6 +74,18 @@ def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
     return np.asarray(np.linalg.lstsq(upper, lower, rcond=None)[0], dtype=float), gamma[:l].copy()
 
 
+def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
+    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
+
+    Args:
+        gamma: (rows l, n) in units of the outputs.
+        scale: (l,) sizes of the outputs.
+    """
+    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
+    a, _ = realise(scaled, len(scale))
+    return a, gamma[: len(scale)].copy(), scaled
+
+
 def largest_gap(values: Array, largest: int) -> int:
     """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
 
