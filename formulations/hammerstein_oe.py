@@ -189,7 +189,7 @@ class OutputError:
     unknowns: Unknowns
     gauge: str
 
-    @cached_property
+    @property
     def energy(self) -> float:
         """Sum of squares of the output about its mean."""
         y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
