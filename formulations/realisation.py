@@ -15,6 +15,7 @@ form: ``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
@@ -28,6 +29,9 @@ from optid.rank_one import reduce
 from optid.rank_one.bilinear import starts
 from optid.rank_one.whitening import leading_pair
 from optid.subspace.observer import ObserverProblem
+
+RELAXED = 150
+"""Multipliers up to which the proof of this step, which proves nothing about (A, C), is worth a semidefinite programme."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +161,8 @@ def _factored(realisation: Realisation, name: str, linear: Mapping[str, cp.Varia
     return residual_programme(
         step, name, variables, _residual(step, linear, thetas), constraints={"gauge": tuple(gauges)}, start=start,
         recover=realisation.factors, view=_view(realisation, {**variables}, thetas),
-        rank_one=RankOneForm(step.problem, tuple(linear), tuple(names), "norm"), certify=certify_rank_one)
+        rank_one=RankOneForm(step.problem, tuple(linear), tuple(names), "norm"),
+        certify=partial(certify_rank_one, max_size=RELAXED))
 
 
 def _lumped(realisation: Realisation, name: str, linear: Mapping[str, cp.Variable]) -> Program:

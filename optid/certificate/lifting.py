@@ -67,13 +67,15 @@ class Lifted:
         return np.array(self.rows), np.array(self.right), np.array(self.equality, dtype=bool)
 
 
-def certify_rank_one(program: Program, values: Values, duals: Values) -> tuple[Bound, Values | None]:
+def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
+                     ) -> tuple[Bound, Values | None]:
     """Certify a point of a rank-one programme under its user constraints.
 
     Args:
         program: a programme with a `RankOneForm`.
         values: the point.
         duals: multipliers by constraint; not needed, because the certificate computes its own.
+        max_size: number of multipliers above which the semidefinite relaxation is not attempted.
 
     Returns:
         The bound, and values to restart from where the relaxation proposes a better point.
@@ -86,7 +88,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values) -> tuple[B
         return Bound(-np.inf, False, "none", f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, "
                      "offset) and not a cone on mu"), None
     problem, point, swapped = _oriented(form.problem, _point(form, values), lifted)
-    found = certify(problem, point, cones=lifted.cones or None, linear=lifted.linear())
+    found = certify(problem, point, cones=lifted.cones or None, linear=lifted.linear(), max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
     return found.bound, _named(program, form, found.better[0])
