@@ -105,8 +105,9 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
         own_time = fresh.problem.solver_stats.solve_time if fresh.problem.solver_stats else None
         alone = own_time or alone
         ratio = alone / min(times)
+        difference = abs(other.objective - own.objective) / own.objective
         print(f"    {solver:10s} {alone:9.4f} s  objective {other.objective:.8g}  difference "
-              f"{abs(other.objective - own.objective) / own.objective:.1e}  compiled in {compiled:.2f} s, {other.status}"
+              f"{difference:.1e}  compiled in {compiled:.2f} s, {other.status}"
               f"  ADMM {ratio:.0f} times faster (goal 20)")
 
 
@@ -116,8 +117,8 @@ def main() -> None:
     parser.add_argument("--solvers", nargs="*", default=["clarabel", "scs"], help="SDP back ends of the race")
     parser.add_argument("--accuracy", type=float, default=1e-6, help="accuracy asked of all solvers")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--forms", nargs="*", default=["instruments"], help="forms of N2 to race; the SDP of the others "
-                        "has cones of some 200 rows, which takes an interior-point method minutes")
+    parser.add_argument("--forms", nargs="*", default=["instruments"], help="forms of N2 to race; the SDP of the "
+                        "others has cones of some 200 rows, which takes an interior-point method minutes")
     parser.add_argument("--rows", type=int, default=15, help="block rows of the race")
     parser.add_argument("--no-fits", action="store_true", help="race only")
     parser.add_argument("--no-race", action="store_true", help="fits only")
@@ -127,8 +128,7 @@ def main() -> None:
 
     print("N1: 100 samples, noise 0.27, projection")
     train, shown = part(data, 0, 100), part(data, 0, 400)
-    l, m = data.l, data.m
-    rows = int(min(30 // l, 101 // (l + m + 1) + 1))
+    rows = int(min(30 // data.l, 101 // (data.l + data.m + 1) + 1))
     if not arguments.no_fits:
         fit = optid.fit(train, "subspace.nuclear", form="projection", noise=0.27, block_rows=rows)
         after = part(data, 100, 400)
