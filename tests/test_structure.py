@@ -1,0 +1,209 @@
+"""The structure test: its columns by hand, its level and power on simulated systems, real records."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import kstest
+from systems import inputs, mimo, siso
+
+import optid
+from optid.bases import Polynomial
+from optid.data import Data
+from optid.errors import RankError
+from optid.validation import validate
+from optid.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
+from optid.validation.structure import Design, FTest, structure_test
+
+SPEC = importlib.util.spec_from_file_location(
+    "structure_benchmark", Path(__file__).parent.parent / "benchmarks" / "structure.py"
+)
+benchmark = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(benchmark)
+
+
+def hammerstein(count=1500, seed=0, wiener=False, delay=0, noise=0.2):
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-2, 2, count)
+    a, b = [1, -1.3, 0.6], np.r_[np.zeros(delay), 1.0, 0.5]
+    y = np.tanh(lfilter(b, a, u)) if wiener else lfilter(b, a, np.tanh(2 * u))
+    return Data(u, y + noise * y.std() * lfilter([1], [1, -0.8], rng.normal(size=count)))
+
+
+# -- parts -----------------------------------------------------------------------------------------------------------
+
+
+def test_families_by_hand():
+    data = Data(np.linspace(-1, 3, 401), np.zeros(401) + np.arange(401))
+    family = Family.of(data, 0, 2, 3)
+    assert family.size == 5 and np.allclose(family.nodes, [-1, 0, 1, 2, 3])
+    values = family.values(np.array([0.5, 1.0, -7.0]))
+    x = (0.5 - 1) / data.u.std()
+    assert values[0] == pytest.approx([x, x**2 - 1, 0.5, 0.5, 0])
+    assert values[1, 2:] == pytest.approx([0, 1, 0]) and values[2, 2:] == pytest.approx([0, 0, 0])
+    three = Data(np.tile([0.0, 1.0, 2.0], 9), np.arange(27.0))
+    assert Family.of(three, 0, 3, 5).size == 2
+    with pytest.raises(RankError, match="'u' is constant"):
+        Family.of(Data(np.ones(20), np.arange(20.0)), 0, 3, 5)
+
+
+def test_filters_are_orthonormal_and_span_the_dynamics():
+    poles = np.array([0.6 + 0.3j, 0.6 - 0.3j])
+    filters = orthonormal_filters(poles, 2, 3, 300)
+    assert filters.T @ filters == pytest.approx(np.eye(filters.shape[1]), abs=1e-12)
+    assert not filters[:3].any()
+    count = len(filters)
+    near = np.real(np.poly(poles * 1.02))
+    for numerator, a, tolerance in (([1.0], np.real(np.poly(poles)), 1e-3), ([0, 0, 1.0], [1.0], 1e-3),
+                                    ([1.0, -2.0], near, 2e-2)):
+        response = lfilter(np.r_[np.zeros(3), numerator], a, np.eye(1, count)[0])
+        left = response - filters @ (filters.T @ response)
+        assert np.linalg.norm(left) < tolerance * np.linalg.norm(response)
+    assert orthonormal_filters(np.zeros(0, complex), 2, 0, 50) @ np.ones(3) == pytest.approx([1, 1, 1, 0])
+
+
+def test_convolution_by_hand():
+    rng = np.random.default_rng(0)
+    values, filters = rng.normal(size=(30, 2)), rng.normal(size=(5, 3))
+    found = convolved(values, filters)
+    expected = [[[sum(filters[i, j] * values[t + 4 - i, p] for i in range(5)) for p in range(2)] for j in range(3)]
+                for t in range(26)]
+    assert found == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize("delay", [0, 1, 7])
+def test_delay_is_never_overestimated(delay):
+    found = [delay_of(hammerstein(1500, seed, delay=delay)) for seed in range(20)]
+    assert max(found) <= delay
+    if delay > 1:
+        assert np.median(found) == delay - 1
+
+
+def test_poles_behind_a_nonlinearity_in_coloured_noise():
+    poles = poles_of(hammerstein(6000, 1))
+    truth = np.roots([1, -1.3, 0.6])
+    assert all(np.abs(poles - pole).min() < 0.02 for pole in truth)
+
+
+def test_f_test_by_hand():
+    from scipy.stats import f
+
+    test = FTest.of(6.0, 3, 20.0, 40)
+    assert test.p_value == pytest.approx(f.sf(6 / 3 / (20 / 40), 3, 40))
+    assert test.saving == pytest.approx(1 - (20 / 40) / (26 / 43))
+    assert FTest.of(1.0, 0, 1.0, 10) == FTest() and FTest.of(-1e-12, 2, 1.0, 10).p_value == 1
+
+
+def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
+    data = hammerstein(900)
+    design = Design.of(data)
+    whole = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
+    monkeypatch.setattr("optid.validation.structure.CHUNK", 100)
+    parts = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
+    assert parts == pytest.approx(whole, abs=1e-10) and len(whole) == 900 - len(design.filters) + 1
+    several = structure_test(data)
+    monkeypatch.undo()
+    assert several.p_value == pytest.approx(structure_test(data).p_value, rel=1e-6)
+
+
+# -- level and power -------------------------------------------------------------------------------------------------
+
+
+def test_products_keep_their_level_in_coloured_noise():
+    found = [structure_test(hammerstein(800, seed)) for seed in range(60)]
+    assert kstest([one.products["y"] for one in found], "uniform").pvalue > 1e-3
+    assert all(one.passed for one in found)
+
+
+def test_random_systems_are_told_apart():
+    wrong = {wiener: [benchmark.system(seed, wiener, 1500)[1] for seed in range(20)
+                      if structure_test(benchmark.system(seed, wiener, 1500)[0]).passed == wiener]
+             for wiener in (False, True)}
+    assert len(wrong[False]) <= 1 and len(wrong[True]) <= 1, wrong
+
+
+def test_a_second_path_is_found_by_rank():
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-1, 1, 1500)
+    w = np.tanh(3 * u)
+    w[1:] += u[:-1] ** 2
+    y = lfilter([1], [1, -0.5], w) + 0.1 * rng.normal(size=1500)
+    found = structure_test(Data(u, y))
+    assert not found.passed and found.rank["y"] < 1e-6 < found.products["y"]
+    assert "different lags see different nonlinearities" in found.finding
+    wiener = structure_test(hammerstein(1500, wiener=True))
+    assert not wiener.passed and "inputs at different lags act together" in wiener.finding
+
+
+def test_records_without_noise():
+    model = siso(Polynomial(3))
+    u = inputs(model, 1200)
+    assert structure_test(Data(u, model.simulate(u))).passed
+    assert structure_test(Data(u, np.ones(1200) + 0 * u[:, 0])).p_value == 1
+
+
+def test_missing_samples_and_experiments():
+    for wiener in (False, True):
+        data = hammerstein(3000, 5, wiener)
+        u, y = data.u.copy(), data.y.copy()
+        rng = np.random.default_rng(0)
+        u[rng.uniform(size=3000) < 0.003] = np.nan
+        y[rng.uniform(size=3000) < 0.02] = np.nan
+        assert structure_test(Data(u, y)).passed != wiener
+        assert structure_test(Data([u[:1000], u[1000:1700], u[1700:]], [y[:1000], y[1000:1700], y[1700:]])).passed \
+            != wiener
+
+
+def test_several_inputs_and_outputs():
+    model = mimo()
+    u = inputs(model, 3000)
+    rng = np.random.default_rng(1)
+    clean = model.simulate(u)
+    y = clean + 0.2 * clean.std(axis=0) * rng.normal(size=clean.shape)
+    found = structure_test(Data(u, y))
+    assert found.passed and set(found.products) == {"y1", "y2"} and set(found.ratios) == {"u1", "u2", "u3"}
+    y[:, 1] += 0.5 * clean.std(axis=0)[1] * u[:, 0] * u[:, 1]
+    found = structure_test(Data(u, y))
+    assert not found.passed and found.products["y2"] < 1e-10 < found.products["y1"]
+
+
+def test_a_binary_input_still_shows_products():
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], 1000)
+    y = lfilter([1, 0.5], [1, -0.7], u)
+    noise = 0.1 * rng.normal(size=1000)
+    assert structure_test(Data(u, y + noise)).passed
+    assert not structure_test(Data(u, y + 0.5 * y**2 + noise)).passed
+
+
+def test_refusals():
+    with pytest.raises(RankError, match="constant"):
+        structure_test(Data(np.ones(500), np.arange(500.0)))
+    with pytest.raises(RankError):
+        structure_test(hammerstein(60))
+    sine = np.sin(0.7 * np.arange(2000))
+    with pytest.raises(RankError):
+        structure_test(Data(sine, lfilter([1], [1, -0.5], sine) + 1e-3 * np.random.default_rng(0).normal(size=2000)))
+
+
+# -- real records ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif("OPTID_DATA" not in os.environ, reason="OPTID_DATA names no folder with the real records")
+def test_real_records():
+    folder = Path(os.environ["OPTID_DATA"])
+    wiener = structure_test(optid.read(folder / "nlid_mod1.csv", inputs=["u"], outputs=["y"], dt=0.001))
+    assert not wiener.passed and wiener.products["y"] < 1e-20
+    reflex = structure_test(optid.read(folder / "nlid_reflex.csv", inputs=["u"], outputs=["y"], dt=0.005))
+    assert reflex.passed
+
+
+def test_validation_uses_it():
+    model = siso(Polynomial(3))
+    u = inputs(model, 1200)
+    y = model.simulate(u)
+    y = y + 0.1 * y.std() * np.random.default_rng(0).normal(size=y.shape)
+    assert validate(model, Data(u, y, dt=0.1)).structure == structure_test(Data(u, y, dt=0.1))
