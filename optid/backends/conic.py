@@ -88,12 +88,15 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     Returns:
         The solver's claim; an exception inside the solver becomes ``Status.FAILED`` with its words.
     """
-    problem = program.problem
+    problem, options = program.problem, tolerances(name, settings)
+    if name == "clarabel" and program.scale < 1:  # objectives are in units of the data; its relative gap is one to 1
+        options |= {key: options[key] * max(program.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
+                    if key not in settings.options}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # inaccuracy is judged by our residuals, not by a warning
             problem.solve(solver=name.upper(), verbose=settings.verbose, warm_start=settings.warm,
-                          **tolerances(name, settings))
+                          **options)
     except Exception as error:  # a solver that crashes is an outcome
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
     status = STATUS.get(problem.status, Status.FAILED)
