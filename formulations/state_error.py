@@ -36,12 +36,14 @@ class StateError:
         unknowns: their order; with innovations the errors are those of one-step prediction, otherwise of simulation
             with measured feedback.
         weight: (l, l) weight of the errors.
+        limit: modulus below which the poles that carry the state must stay.
         checks: constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is.
     """
 
     data: Data
     unknowns: StateUnknowns
     weight: Array
+    limit: float = STABLE
     checks: tuple[Callable[[Any], str], ...] = ()
 
     @cached_property
@@ -56,12 +58,12 @@ class StateError:
         return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x))
 
     def admissible(self, x: Array) -> bool:
-        """Whether the matrix that carries the state is stable, and the constraints on poles hold."""
+        """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""
         if not np.all(np.isfinite(x)):
             return False
         point = self.unknowns.unpack(x)
         inner = point.A - point.K @ point.C
-        if np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0) >= STABLE:
+        if np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0) >= self.limit:
             return False
         return not self.checks or not any(check(self.at(point)) for check in self.checks)
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from formulations.equation_error import flat
 from formulations.prediction_error import Descent, Posed, best_of, descend, refine
-from formulations.state_error import StateError, entered
+from formulations.state_error import STABLE, StateError, entered
 from formulations.subspace_procedure import Plan, _feedback_bases, identified
 from optid.bases import fitted_bases
 from optid.bases.basis import Basis
@@ -43,6 +43,7 @@ from optid.subspace.expansion import expand
 Array = np.ndarray
 
 CRITERIA = ("simulation", "prediction")
+STABILITIES = ("stable", "free")
 WEIGHTINGS = ("auto", "scale", "variance", "determinant")
 ROUNDS = 10
 """Times the errors are weighted anew at most."""
@@ -58,7 +59,8 @@ Bases = Basis | str | Sequence[Basis | str]
 def linear(
     data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
     weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-    initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
+    stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+    constraints: Sequence[Any] = ()
 ) -> Procedure:
     """Minimise the simulation or prediction error of a linear state-space model.
 
@@ -72,6 +74,8 @@ def linear(
             likelihood of Gaussian noise) for prediction.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
+        stability: "stable" keeps every iterate stable (for prediction, its predictor); "free" lets the poles go where
+            the errors are smallest, for plants that integrate or grow over the record.
         initial: models of the same structure to start from besides.
         iterations: Gauss-Newton steps per descent at most.
         constraints: rules about poles, builders of CVXPY constraints in the named variables.
@@ -82,14 +86,15 @@ def linear(
         RankError: too few samples for the unknowns.
     """
     return _procedure("ss.exact", data, nx, "linear", None, criterion, block_rows, weighting, offset, feedthrough,
-                      initial, iterations, constraints)
+                      stability, initial, iterations, constraints)
 
 
 def exact(
     data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
     criterion: str = "simulation", block_rows: int | Sequence[int] | None = None, weighting: str = "auto",
     offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-    initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
+    stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+    constraints: Sequence[Any] = ()
 ) -> Procedure:
     """Minimise the simulation or prediction error of a Hammerstein state-space model with output feedback.
 
@@ -106,6 +111,7 @@ def exact(
         weighting: as in `linear`.
         offset: as in `linear`.
         feedthrough: as in `linear`.
+        stability: as in `linear`; what counts are the poles with the feedback taken as a given signal.
         initial: as in `linear`.
         iterations: as in `linear`.
         constraints: as in `linear`, also those of `formulations.shape`.
@@ -114,13 +120,14 @@ def exact(
         StructureError, DataError, RankError: as `linear`; RankError also for a feedback basis that is linear in y.
     """
     return _procedure("hammerstein_ss.exact", data, nx, basis, feedback_basis, criterion, block_rows, weighting, offset,
-                      feedthrough, initial, iterations, constraints)
+                      feedthrough, stability, initial, iterations, constraints)
 
 
 def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, criterion: str, block_rows: Any,
-               weighting: str, offset: bool, feedthrough: Any, initial: Any, iterations: int,
+               weighting: str, offset: bool, feedthrough: Any, stability: str, initial: Any, iterations: int,
                constraints: Sequence[Any]) -> Procedure:
-    for what, word, known in (("criterion", criterion, CRITERIA), ("weighting", weighting, WEIGHTINGS)):
+    for what, word, known in (("criterion", criterion, CRITERIA), ("weighting", weighting, WEIGHTINGS),
+                              ("stability", stability, STABILITIES)):
         if word not in known:
             raise StructureError(f"{what}={word!r}: use one of {', '.join(known)}.")
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 1:
@@ -134,7 +141,8 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     if criterion == "prediction" and feedback_basis is not None:
         plan = replace(plan, instruments="simulated+past")
     poles, others = _sorted(constraints)
-    return _run(plan, given, criterion, weighting, models, int(iterations), poles, others)
+    return _run(plan, given, criterion, weighting, STABLE if stability == "stable" else np.inf, models,
+                int(iterations), poles, others)
 
 
 def _check_inputs(data: Data) -> None:
@@ -158,8 +166,9 @@ def _sorted(constraints: Sequence[Any]) -> tuple[tuple[Any, ...], tuple[Any, ...
     return poles, tuple(rule for rule in constraints if rule not in poles)
 
 
-def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: str, models: list[HammersteinSS],
-         iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...]) -> Procedure:
+def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: str, limit: float,
+         models: list[HammersteinSS], iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...]
+         ) -> Procedure:
     data, refusal = plan.data, None
     found: dict[str, HammersteinSS] = {f"start {i}": model for i, model in enumerate(models, start=1)}
     nx = plan.order
@@ -180,7 +189,7 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     _check_rows(data, unknowns)
     y = np.vstack([e.y for e in data.experiments])
     variances = np.nanvar(y, axis=0)
-    error = StateError(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
+    error = StateError(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)), limit,
                        tuple(rule.verify for rule in poles))
     starts = {name: x for name, model in found.items() if (x := entered(error, model)) is not None}
     if not starts:
