@@ -31,7 +31,7 @@ from optid.rank_one.whitening import leading_pair
 from optid.subspace.observer import ObserverProblem
 
 RELAXED = 150
-"""Multipliers up to which the proof of this step, which proves nothing about (A, C), is worth a semidefinite programme."""
+"""Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,34 @@ from numba import njit
 from optid.bases.basis import Array
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def window_products(flat: Array, count: int, d: int, out: Array) -> None:
+    """Add sum_t s(t) [s(t); s(t + 1); ...]^T to out for the first `count` samples of a few signals.
+
+    Args:
+        flat: samples of the d signals, one after the other; the windows of sample t begin at t d.
+        count: number of samples t.
+        d: number of signals.
+        out: (d, width).
+    """
+    width = out.shape[1]
+    whole = count - count % 4
+    for t in range(0, whole, 4):  # four samples at a time: the sums are read and written a quarter as often
+        first = flat[t * d : t * d + width]
+        second = flat[(t + 1) * d : (t + 1) * d + width]
+        third = flat[(t + 2) * d : (t + 2) * d + width]
+        fourth = flat[(t + 3) * d : (t + 3) * d + width]
+        for i in range(d):
+            a, b, c, e = flat[t * d + i], flat[(t + 1) * d + i], flat[(t + 2) * d + i], flat[(t + 3) * d + i]
+            row = out[i]
+            for k in range(width):
+                row[k] += a * first[k] + b * second[k] + c * third[k] + e * fourth[k]
+    for t in range(whole, count):
+        for i in range(d):
+            for k in range(width):
+                out[i, k] += flat[t * d + i] * flat[t * d + k]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def adjoint_responses(transposed: Array, outputs: Array, signals: Array, state: Array, out: Array) -> None:
     """Write the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
