@@ -1,9 +1,9 @@
 """Speed of the subspace step on expanded inputs, and beside SLICOT on a linear system.
 
 Prints
-* 2 inputs x 10 functions, 2 outputs, 10 block rows: CPU time of statistics, RQ and singular values here, of forming the
-  block Hankel matrices and taking their QR decomposition, the ratio, and the largest relative difference of the singular
-  values (goals: >= 20 times faster, equal to 1e-8);
+* 2 inputs x 10 functions, 2 outputs, 10 block rows: CPU time of statistics, RQ and singular values here, of forming
+  the block Hankel matrices and taking their QR decomposition, the ratio, and the largest relative difference of the
+  singular values (goals: >= 20 times faster, equal to 1e-8);
 * plain linear system with 2 inputs, 2 outputs, 4 states: the same step beside IB01AD of SLICOT (package ctrlsys), with
   its fast and its QR route (goal: at most twice the time of the faster), and the largest relative difference of the
   singular values; a reason where ctrlsys is not installed (`pip install ctrlsys`);
@@ -70,10 +70,10 @@ def formed(record: np.ndarray, expansion, rows: int, scale: np.ndarray) -> np.nd
     return np.linalg.svd(r22 / np.tile(scale, rows)[:, None], compute_uv=False)
 
 
-def cpu(work) -> tuple[float, object]:
+def cpu(work, *arguments) -> tuple[float, object]:
     """CPU seconds of a call, and what it returned."""
     start = time.process_time()
-    found = work()
+    found = work(*arguments)
     return time.process_time() - start, found
 
 
@@ -82,16 +82,15 @@ def expanded(count: int, rows: int, rounds: int, basis: str) -> None:
     own(record, expansion, rows)  # compiled and warm
     times = []
     for _ in range(rounds):
-        fast, projection = cpu(lambda: own(record, expansion, rows))
-        slow, values = cpu(lambda: formed(record, expansion, rows, projection.scale))
+        fast, projection = cpu(own, record, expansion, rows)
+        slow, values = cpu(formed, record, expansion, rows, projection.scale)
         times.append((fast, slow))
     fast, slow = np.median(np.array(times), axis=0)
     ours = projection.range.values
     error = float(np.max(np.abs(ours - values[: ours.size]) / values[0]))
-    gammas = [projection.gamma(4)]
-    poles = np.sort(np.abs(np.linalg.eigvals(realise(gammas[0], 2)[0])))
-    print(f"expanded inputs, {basis}, {count} samples, 2 x {expansion.input_sizes[0]} functions, 2 outputs, {rows} block "
-          f"rows ({2 * rows * (expansion.p + 2)} rows):")
+    poles = np.sort(np.abs(np.linalg.eigvals(realise(projection.gamma(4), 2)[0])))
+    print(f"expanded inputs, {basis}, {count} samples, 2 x {expansion.input_sizes[0]} functions, 2 outputs, {rows} "
+          f"block rows ({2 * rows * (expansion.p + 2)} rows):")
     print(f"  here {1e3 * fast:.0f} ms ({projection.statistics.method}), formed and QR {1e3 * slow:.0f} ms: "
           f"{slow / fast:.1f} times faster (goal >= 20)")
     print(f"  singular values equal to {error:.1e} of the largest (goal 1e-8); moduli of the poles {poles.round(4)}")
@@ -122,7 +121,7 @@ def slicot(count: int, rows: int, rounds: int) -> None:
     here()
     times = []
     for _ in range(rounds):
-        found = [cpu(here), cpu(lambda: there("C")), cpu(lambda: there("F")), cpu(lambda: there("Q"))]
+        found = [cpu(here), *(cpu(there, route) for route in "CFQ")]
         times.append([seconds for seconds, _ in found])
     ours, cholesky, fast, plain = np.median(np.array(times), axis=0)
     difference = float(np.max(np.abs(found[0][1] - found[3][1]) / found[3][1][0]))
@@ -138,9 +137,10 @@ def hair_dryer() -> None:
         print("hair dryer skipped: OPTID_DATA does not name a folder with daisy_hairdryer.csv")
         return
     columns = np.loadtxt(path, delimiter=",", skiprows=1)
-    found = fit(Data(u=columns[:, -2], y=columns[:, -1], dt=0.08), "hammerstein_ss.sid", block_rows=15, offset=False)
+    data = Data(u=columns[:, -2], y=columns[:, -1], dt=0.08)
+    found = fit(data, "hammerstein_ss.sid", block_rows=15, offset=False)
     ours = " ".join(f"{value:.4f}" for value in found.figures["singular values"])
-    poles = ", ".join(f"{p.real:.4f}{p.imag:+.4f}i" if abs(p.imag) > 1e-9 else f"{p.real:.4f}" for p in found.model.poles)
+    poles = ", ".join(f"{p.real:.4f}" + f"{p.imag:+.4f}i" * (abs(p.imag) > 1e-9) for p in found.model.poles)
     print("hair dryer, 15 block rows (SLICOT IB01AD):")
     print(f"  singular values {ours}\n  printed         {PRINTED}   {'equal' if ours == PRINTED else 'DIFFERENT'}")
     print(f"  order {found.figures['order']} (4); poles {poles} (0.9611, 0.7455, 0.4758 +- 0.2001i)")
