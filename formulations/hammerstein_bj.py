@@ -9,7 +9,8 @@ in the linear model), ``offset``, ``c``, ``d``, ``x0`` ((n,), or (n, experiments
 input, as in ``mu[valve]``.
 
 Every experiment has its own initial state of the plant; the noise starts from rest. Where the output is missing the
-innovation counts as zero and the prediction takes its place; every input is needed.
+innovation counts as zero and the prediction takes its place, with the consequences told in
+`formulations.hammerstein_armax`; every input is needed.
 """
 
 from collections.abc import Sequence

@@ -223,6 +223,16 @@ def test_gaps_cost_no_more_than_their_samples():
     assert np.all(bias < 4.0)
 
 
+@pytest.mark.parametrize("kind", ORDERS)
+def test_many_gaps(kind):
+    """A third of the outputs missing: the plant is unharmed, the noise model off by a few hundredths."""
+    model = system(kind)
+    pose, orders = ORDERS[kind]
+    fit = optid.fit(record(model, (40_000,), seed=4, gaps=0.33), pose, starts=1, **orders)
+    assert fit.model.a == pytest.approx(A, abs=0.008) and fit.model.theta() == pytest.approx(model.theta(), abs=0.03)
+    assert fit.model.c == pytest.approx(C, abs=0.06)
+
+
 def test_missing_inputs():
     data = record(system("armax"), (4000,))
     u = data.u.copy()
