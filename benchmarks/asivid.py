@@ -5,8 +5,8 @@ Prints, beside the goals,
 * item 5: condition of R11 over the length of the record, with simulated feedback (bounded) and with past outputs and
   future inputs as instruments (grows);
 * item 6: Van der Pol, error with measured feedback over p = q: 2 fails (> 70 %), 3 and 4 pass (< 5 %, noise free);
-* item 7: reaction wheel pendulum under the chirp: angle error of ASIVID at order 3 at least 5 times smaller than that of
-  the linear method;
+* item 7: reaction wheel pendulum under the chirp: angle error of ASIVID at order 3 at least 5 times smaller than that
+  of the linear method;
 * the relative error of the feedback Markov parameters of Example 1 over N = 3k .. 48k under white and under AR(0.9)
   measurement noise, medians over seeds, and the slope of its logarithm over that of N (goal: -1/2, at most -0.4).
 
@@ -49,9 +49,8 @@ def feedback_error(model) -> float:
     """Relative error of the Markov parameters of the orthogonalised feedback, whatever the gauge, in %."""
     model = model.injected(-model.L)
     found, true = [], []
-    for j, (own, g) in enumerate(zip(model.feedback, FEEDBACK)):
-        scale = float(own.mu @ np.ones(1)) if own.mu.size == 1 else 1.0
-        found.append(markov(model.A, model.C, model.E[:, [j]]) * scale)
+    for j, own in enumerate(model.feedback):
+        found.append(markov(model.A, model.C, model.E[:, [j]]) * own.mu[0])
         true.append(markov(EXAMPLE1.a, EXAMPLE1.c, EXAMPLE1.e[:, [j]]))
     found, true = np.concatenate(found, axis=2), np.concatenate(true, axis=2)
     return 100 * float(np.linalg.norm(found - true) / np.linalg.norm(true))
@@ -66,21 +65,21 @@ def measured_feedback_error(model, data) -> np.ndarray:
 def exactness() -> None:
     found = fit(example(3000, 0), "hammerstein_ss.asivid", **KNOWN)
     ratio = found.figures["second over first singular value, channel u1"]
-    print(f"4. noise-free Example 1: eig(A) to {pole_distance(found.model):.1e} (goal 1e-10), second over first singular "
-          f"value {ratio:.1e} (goal 1e-10)")
+    print(f"4. noise-free Example 1: eig(A) to {pole_distance(found.model):.1e} (goal 1e-10), second over first "
+          f"singular value {ratio:.1e} (goal 1e-10)")
 
 
 def conditions(lengths) -> None:
     print("5. condition of R11 over N:")
     kinds = {"simulated feedback": {}, "future inputs, past outputs": {"noise": "white", "iterations": 0}}
     for name, more in kinds.items():
-        row = [fit(example(n, 0, 0.5), "hammerstein_ss.asivid", prove=False, **KNOWN, **more).figures["condition of R11"]
-               for n in lengths]
+        fits = [fit(example(n, 0, 0.5), "hammerstein_ss.asivid", prove=False, **KNOWN, **more) for n in lengths]
+        row = [found.figures["condition of R11"] for found in fits]
         print(f"   {name:<30}" + "".join(f"{n:>7}: {value:8.1f}" for n, value in zip(lengths, row)))
 
 
 def oscillator(seeds: int) -> None:
-    print(f"6. Van der Pol, N = 6000 + 1000, 6 block rows, error with measured feedback in %, medians of {seeds} seeds:")
+    print(f"6. Van der Pol, N = 6000 + 1000, 6 block rows, error with measured feedback in %, {seeds} seeds, medians:")
     for process, measurement in ((0.0, 0.0), (0.005, 0.02)):
         row = []
         for degree in (2, 3, 4):
