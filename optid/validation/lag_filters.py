@@ -143,18 +143,11 @@ def poles_of(data: Data, delay: int = 0, block_rows: int = BLOCK_ROWS) -> NDArra
     alpha = block_rows
     while alpha > FEWEST and 6 * alpha * (p + outs) > data.n_samples:
         alpha -= 1
-    while True:
-        try:
-            statistics = _statistics(data, families, 3 * alpha, delay)
-            z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
-            phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
-            y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
-            order = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=(alpha - 1) * outs).order
-            break
-        except RankError:  # missing samples leave too few long windows
-            if alpha <= FEWEST:
-                raise
-            alpha = max(FEWEST, alpha // 2)
+    statistics = _statistics(data, families, 3 * alpha, delay)
+    z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
+    phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
+    y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
+    order = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=(alpha - 1) * outs).order
     if order == 0:
         return np.zeros(0, dtype=complex)
     observability = rq(statistics, z, phi, y).decomposition[0][:, : min(order + SPARE, (alpha - 1) * outs)]
@@ -195,11 +188,22 @@ def convolved(values: Array, filters: Array) -> Array:
     return np.stack(columns, axis=1)
 
 
+def interpolated(u: Array) -> Array:
+    """Fill missing samples linearly, column by column."""
+    filled = u.copy()
+    for column in filled.T:
+        lost = np.isnan(column)
+        if lost.any() and not lost.all():
+            column[lost] = np.interp(np.flatnonzero(lost), np.flatnonzero(~lost), column[~lost])
+    return np.nan_to_num(filled)
+
+
 def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:
     m = data.m
 
     def expand(raw: Array) -> Array:
         return np.hstack([*(family.values(raw[:, c]) for c, family in enumerate(families)), raw[:, m:]])
 
-    records = [np.hstack([e.u[: e.n_samples - delay], e.y[delay:]]) for e in data.experiments]
+    # windows without a gap would be few; interpolation adds noise and a zero, but leaves the poles where they are
+    records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
     return hankel_statistics([r for r in records if len(r) >= rows] or records, rows, expand, centre="mean")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import RankError
-from optid.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
+from optid.validation.lag_filters import Family, convolved, delay_of, interpolated, orthonormal_filters, poles_of
 
 if TYPE_CHECKING:
     from optid.rank_one import RankOne
@@ -47,7 +47,9 @@ CHUNK = 16384
 PRESENT = 0.9
 """Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
 
-NOISE_ORDER = 12
+NOISE_ORDER, KEPT = 12, 0.4
+"""Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
+
 DISTINCT = 1e-4
 """Smallest eigenvalue of the correlations of alternatives that counts as a direction of its own."""
 
@@ -167,7 +169,7 @@ class Design:
         delay = delay_of(data)
         filters = orthonormal_filters(poles_of(data, delay), EXTRA, delay, max(20, data.n_samples // 5))
         energy = np.cumsum(np.sum(filters**2, axis=1))
-        u = tuple(_interpolated(e.u) for e in data.experiments)
+        u = tuple(interpolated(e.u) for e in data.experiments)
         stacked = np.concatenate(u)
         each = data.n_samples // data.m
         hats, fine = int(np.clip(each // SAMPLES, 0, HATS)), int(np.clip(each // FINE_SAMPLES, 2, FINE_HATS))
@@ -339,7 +341,10 @@ def _autoregression(residuals: list[Array]) -> Array:
     from scipy.linalg import solve_toeplitz
 
     total = sum(int(np.sum(~np.isnan(r))) for r in residuals)
+    complete = total / sum(len(r) for r in residuals)
     most = min(NOISE_ORDER, total // 50, max(len(r) for r in residuals) - 1)
+    while most > 1 and complete ** (most + 1) < KEPT:  # a row is lost with any of its samples
+        most -= 1
     covariance = np.zeros(most + 1)
     for lag in range(most + 1):
         products = np.concatenate([r[lag:] * r[: max(len(r) - lag, 0)] for r in residuals])
@@ -436,13 +441,3 @@ def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple
     left = fine.T @ gram @ fine
     values, vectors = np.linalg.eigh((left + left.T) / 2)
     return fine @ vectors[:, values > DISTINCT]
-
-
-def _interpolated(u: Array) -> Array:
-    """Fill missing samples linearly, column by column."""
-    filled = u.copy()
-    for column in filled.T:
-        lost = np.isnan(column)
-        if lost.any() and not lost.all():
-            column[lost] = np.interp(np.flatnonzero(lost), np.flatnonzero(~lost), column[~lost])
-    return np.nan_to_num(filled)
