@@ -1,6 +1,7 @@
 """A model as text: one difference equation per output."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from optid.bases.expansions import Linear
@@ -8,11 +9,26 @@ from optid.models import simulation
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_arx import HammersteinARX
+    from optid.models.hammerstein_tf import HammersteinTF
 
 
 def written(model: "HammersteinARX", digits: int = 4) -> str:
     """Write one difference equation per output, with coefficients of so many significant digits."""
     return "\n".join(_equation(model, o, digits) for o in range(model.l))
+
+
+def written_with_noise(model: "HammersteinTF", digits: int = 4) -> str:
+    """Write the equations of a model with a noise filter: of the plant and, where it is apart, of the noise."""
+    name = model.outputs[0]
+    noise = "".join(f" {'-' if v < 0 else '+'} {abs(v):.{digits}g} e(k-{i})" for i, v in enumerate(model.c, 1) if v)
+    if model.shares_poles:
+        return written(model.plant, digits) + " + e(k)" + noise
+    x = next(word for word in ("x", "x0", "x_plant", f"{name}_x") if word not in (*model.inputs, name))
+    plant = written(replace(model.plant, outputs=(x,)), digits)
+    if model.structure == "oe":
+        return f"{plant}\n{name}(k) = {x}(k) + e(k)"
+    past = "".join(f" {'+' if v < 0 else '-'} {abs(v):.{digits}g} v(k-{i})" for i, v in enumerate(model.d, 1) if v)
+    return f"{plant}\nv(k) = e(k){noise}{past}\n{name}(k) = {x}(k) + v(k)"
 
 
 def polynomial(coefficients: Iterable[float], digits: int = 4) -> str:

@@ -14,11 +14,12 @@ from optid.bases.expansions import Linear
 from optid.channels import Transform
 from optid.data import Data
 from optid.errors import StructureError
-from optid.models import noise_filter, simulation
+from optid.models import noise_filter
 from optid.models.coefficients import checked_horizon, coefficients, listed
-from optid.models.equations import polynomial, written
+from optid.models.equations import polynomial, written_with_noise
 from optid.models.experiments import in_units_of, one_or_all
 from optid.models.hammerstein_arx import HammersteinARX
+from optid.models.noise_prediction import predict_record
 from optid.models.nonlinearity import Nonlinearity
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins"}
@@ -172,7 +173,7 @@ class HammersteinTF:
 
         None for output error and Box-Jenkins, whose initial state is estimated; the largest lag for ARX and ARMAX.
         """
-        return self.plant.memory if self._shares_poles else 0
+        return self.plant.memory if self.shares_poles else 0
 
     @property
     def poles(self) -> Any:
@@ -205,6 +206,16 @@ class HammersteinTF:
             "bj": f"C = {c}, D = {d}",
         }[self.structure]
 
+    @property
+    def na(self) -> int:
+        """Number of poles of the plant."""
+        return self.plant.na
+
+    @property
+    def nb(self) -> tuple[int, ...]:
+        """Number of numerator coefficients, one per input."""
+        return self.plant.nb
+
     def theta(self, c: int = 0) -> Array:
         """Return mu b^T of input c (P, nb), the same in every gauge."""
         return self.plant.theta(c)
@@ -212,7 +223,7 @@ class HammersteinTF:
     def coefficients(self) -> list[tuple[str, float]]:
         """Return (name, value) of every coefficient of A, B, the offset, C and (Box-Jenkins) D, as tables show them."""
         found = listed(self.plant)
-        for name, values in (("c", self.c), ("d", () if self._shares_poles else self.d)):
+        for name, values in (("c", self.c), ("d", () if self.shares_poles else self.d)):
             found += [(f"{name}{i}", float(value)) for i, value in enumerate(values, start=1)]
         return found
 
@@ -244,13 +255,13 @@ class HammersteinTF:
 
     def equation(self, digits: int = 4) -> str:
         """Write the model as difference equations: of the plant and, where it is apart, of the noise."""
-        return _equations(self, digits)
+        return written_with_noise(self, digits)
 
     def __str__(self) -> str:
         """Return the equations, the poles and the noise model."""
         text = self.equation()
         parts = {"poles": self.poles, "zeros of the noise": self.noise_zeros}
-        if not self._shares_poles:
+        if not self.shares_poles:
             parts["poles of the noise"] = self.noise_poles
         for name, roots in parts.items():
             if roots.size:
@@ -258,7 +269,8 @@ class HammersteinTF:
         return text
 
     @property
-    def _shares_poles(self) -> bool:
+    def shares_poles(self) -> bool:
+        """Whether D is A: the noise enters the equation of the plant (ARX, ARMAX)."""
         return self.structure in ("arx", "armax")
 
     # -- prediction and simulation -------------------------------------------------------------------------------
@@ -287,7 +299,7 @@ class HammersteinTF:
         raw = in_units_of(self, data)
         states = _states(x0, raw.n_experiments)
         return one_or_all([
-            self._predicted(e.u, e.y, horizon, state, f"Experiment {i}: " * (raw.n_experiments > 1))
+            predict_record(self, e.u, e.y, horizon, state, f"Experiment {i}: " * (raw.n_experiments > 1))
             for i, (e, state) in enumerate(zip(raw.experiments, states), start=1)
         ])
 
@@ -313,33 +325,6 @@ class HammersteinTF:
     def state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Return the state of the plant after samples without noise, see `HammersteinARX.state`."""
         return self.plant.state(u, y)
-
-    def _predicted(self, u: Array, y: Array, horizon: int, x0: Any, label: str) -> Array:
-        if self._shares_poles:
-            drive = simulation.driven(self.plant, u)[:, 0]
-            found = noise_filter.innovations(y[:, 0], drive, self.c, self.d, start=self.memory)
-            return noise_filter.predict(found, self.c, self.d, horizon)[:, None]
-        gaps = ~np.isfinite(u).all(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], gaps, [True]]).astype(int)))
-        prediction = np.full((len(y), 1), np.nan)
-        for first, last in zip(edges[::2], edges[1::2]):
-            present = int(np.isfinite(y[first:last]).sum())
-            state = x0 if first == 0 else "fit"
-            if gaps.any() and isinstance(state, str) and state == "fit" and present <= 2 * self.plant.memory:
-                continue  # the estimated state would repeat the outputs
-            prediction[first:last] = self._predicted_apart(u[first:last], y[first:last], horizon, state, label)
-        return prediction
-
-    def _predicted_apart(self, u: Array, y: Array, horizon: int, x0: Any, label: str) -> Array:
-        """Predict a stretch without missing inputs: the plant's output and, apart from it, the noise."""
-        plant = self.plant
-        if isinstance(x0, str):
-            state = np.zeros((plant.memory, 1)) if x0 == "zero" else fitted_state(self, u, y, label)
-        else:
-            state = simulation.state_like(plant, x0)
-        x = simulation.simulate_record(plant, u, state, label)
-        found = noise_filter.innovations((y - x)[:, 0], None, self.c, self.d)
-        return x + noise_filter.predict(found, self.c, self.d, horizon)[:, None]
 
     # -- changes -------------------------------------------------------------------------------------------------
 
@@ -374,34 +359,18 @@ class HammersteinTF:
         plant = HammersteinARX.from_dict(content["plant"], functions)
         return cls(plant, np.array(content["c"], dtype=float), np.array(content["d"], dtype=float))
 
+    def to_dlti(self, output: int | str = 0, input: int | str = 0) -> Any:
+        """Return the linear part of the plant from one f to the output as a `scipy.signal.dlti`."""
+        return self.plant.to_dlti(output, input)
 
-def fitted_state(model: HammersteinTF, u: Array, y: Array, label: str = "") -> Array:
-    """Estimate the state (n, 1) of the plant at the first sample by least squares of the one-step prediction errors.
+    def to_control(self) -> Any:
+        """Return the linear part of the plant, all inputs, as a python-control system."""
+        return self.plant.to_control()
 
-    Args:
-        model: a model whose noise has poles of its own.
-        u: (N, m) inputs, none missing.
-        y: (N, 1) outputs, NaN = missing.
-        label: words that name the experiment in a message.
+    def to_casadi(self) -> Any:
+        """Return the plant, without noise, as a `casadi.Function` (x, u) -> (x_next, y)."""
+        return self.plant.to_casadi()
 
-    Raises:
-        DataError: a missing input, or an output that leaves the range of numbers.
-    """
-    plant, n = model.plant, model.plant.memory
-    if n == 0:
-        return np.zeros((0, 1))
-    count = min(len(y), simulation.horizon_of(max(noise_filter.radius(plant.a), noise_filter.radius(model.c)), n))
-    rest = (y - simulation.simulate_record(plant, u, np.zeros((n, 1)), label))[:count, 0]
-    present = np.isfinite(rest)
-    free = simulation.impulse_of_inverse(plant, count)[:, 0, 0]
-    columns = np.zeros((count, n))
-    for i in range(min(n, count)):
-        column = np.concatenate([np.zeros(i), free[: count - i]])
-        columns[:, i] = noise_filter.innovations(np.where(present, column, np.nan), None, model.c, model.d).innovations
-    target = noise_filter.innovations(rest, None, model.c, model.d).innovations
-    sizes = np.linalg.norm(columns[present], axis=0)
-    sizes[sizes == 0] = 1.0
-    return (np.linalg.lstsq(columns[present] / sizes, target[present])[0] / sizes)[:, None]
 
 
 def _states(x0: Any, count: int) -> Sequence[Any]:
@@ -418,16 +387,3 @@ def _states(x0: Any, count: int) -> Sequence[Any]:
 def _roots(values: Array) -> Any:
     roots: Any = np.roots(np.concatenate([[1.0], values])).astype(complex)
     return roots[np.lexsort((roots.imag, -np.abs(roots)))]
-
-
-def _equations(model: HammersteinTF, digits: int) -> str:
-    name = model.outputs[0]
-    noise = "".join(f" {'-' if v < 0 else '+'} {abs(v):.{digits}g} e(k-{i})" for i, v in enumerate(model.c, 1) if v)
-    if model.structure in ("arx", "armax"):
-        return written(model.plant, digits) + " + e(k)" + noise
-    x = next(word for word in ("x", "x0", "x_plant", f"{name}_x") if word not in (*model.inputs, name))
-    plant = written(replace(model.plant, outputs=(x,)), digits)
-    if model.structure == "oe":
-        return f"{plant}\n{name}(k) = {x}(k) + e(k)"
-    past = "".join(f" {'+' if v < 0 else '-'} {abs(v):.{digits}g} v(k-{i})" for i, v in enumerate(model.d, 1) if v)
-    return f"{plant}\nv(k) = e(k){noise}{past}\n{name}(k) = {x}(k) + v(k)"
