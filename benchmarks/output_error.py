@@ -98,7 +98,8 @@ def hammerstein(folder: Path, quick: bool) -> dict:
               f"   ({fit.solution.status}, {seconds:.2f} s)")
         if quick:
             continue
-        grid = product(na=nas, nb=nbs, nk=delays, basis=[optid.Triangular(p, span) for p in sizes for span in ((low, high), None)])
+        bases = [optid.Triangular(p, span) for p in sizes for span in ((low, high), None)]
+        grid = product(na=nas, nb=nbs, nk=delays, basis=bases)
         structure, inside = hold_out(train, "hammerstein_oe.exact", grid)
         for label, constraints in (("", []), (", monotone", ["monotone:increasing"])):
             fit, seconds = timed_fit(train, "hammerstein_oe.exact", constraints=constraints, **structure)
