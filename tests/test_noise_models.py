@@ -233,6 +233,28 @@ def test_many_gaps(kind):
     assert fit.model.c == pytest.approx(C, abs=0.06)
 
 
+def test_outputs_that_never_follow_one_another():
+    data = record(system("armax"), (3000,))
+    y = data.y.copy()
+    y[::2] = np.nan
+    fit = optid.fit(Data(data.u, y), armax, **ORDERS["armax"][1])
+    assert fit.model.a == pytest.approx(A, abs=0.02) and fit.figures["rows"] == 1500 - 10
+    assert np.nansum(fit.model.innovations(Data(data.u, y)) ** 2) == pytest.approx(fit.solution.objective, rel=1e-6)
+
+
+def test_unstable_plant_in_a_loop():
+    """Prediction errors do not need a stable plant, nor an input independent of the noise."""
+    rng, a, count = np.random.default_rng(0), np.poly([1.1, 0.6])[1:], 3000
+    e, r = 0.1 * rng.standard_normal(count), rng.uniform(-0.8, 0.8, count)
+    u, y = np.zeros(count), np.zeros(count)
+    for k in range(count):
+        y[k] = e[k] - (a @ [y[k - 1], y[k - 2]] - u[k - 1] - 0.03 * u[k - 1] ** 3 + 0.5 * e[k - 1] if k > 1 else 0.0)
+        u[k] = r[k] - 0.6 * y[k]
+    fit = quiet(Data(u, y), armax, na=2, nb=1, nk=1, nc=1, basis=Polynomial(3))
+    assert fit.model.a == pytest.approx(a, abs=0.02) and fit.model.c == pytest.approx([-0.5], abs=0.05)
+    assert not fit.model.is_stable and fit.solution.status is Status.LOCAL
+
+
 def test_missing_inputs():
     data = record(system("armax"), (4000,))
     u = data.u.copy()

@@ -289,7 +289,8 @@ class HammersteinTF:
             (N, 1) in raw units; a tuple of such arrays for several experiments. A missing output counts as an
             innovation of zero. NaN where a missing input leaves no prediction: in the samples that it reaches (ARX,
             ARMAX), or in it (the others, whose state is estimated anew after the gap; also in stretches between gaps
-            too short for that). ARX and ARMAX: NaN in the first `memory` + horizon - 1 samples.
+            too short for that). ARX and ARMAX: NaN in the first `memory` + horizon - 1 samples, and on until so many
+            outputs follow one another without a gap (ten times `memory` samples where they never do).
 
         Raises:
             DataError: other channels or another sampling time than the model's.

@@ -3,6 +3,10 @@
 ``s(k) = g(k) - sum_i d_i s(k-i) + sum_i c_i e(k-i) + e(k)``. An innovation that cannot be computed, because the sample
 or its prediction is missing, counts as zero; a missing sample is then replaced by its prediction. This is the
 stationary predictor: it forgets the larger uncertainty after a gap at the rate of the zeros of C.
+
+Before the recursion has its first prediction, and after a missing drive, a missing sample has no replacement: nothing
+is predicted until as many samples follow one another as D reaches back. A record in which they never do is begun with
+the last sample held in the gaps, and its first innovations count as zero while that is forgotten.
 """
 
 from functools import cache
@@ -12,6 +16,11 @@ import numpy as np
 
 from optid.bases.basis import Array
 
+PRESENT, MISSING, DEAD = 0, 1, 2
+
+WARMING = 10
+"""Times the lags of a record that is begun with held samples, during which its innovations count as zero."""
+
 
 class Filtered(NamedTuple):
     """What one pass of the noise filter over a record finds, each (N,).
@@ -20,11 +29,13 @@ class Filtered(NamedTuple):
         innovations: zero where they cannot be computed.
         filled: the samples, the missing ones replaced by their predictions.
         predicted: one step ahead; NaN where that is impossible.
+        state: PRESENT where there is an innovation, MISSING where the prediction stands for the sample, DEAD elsewhere.
     """
 
     innovations: Array
     filled: Array
     predicted: Array
+    state: Any
 
 
 def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 0) -> Filtered:
@@ -38,9 +49,12 @@ def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 
         start: number of first samples whose innovation counts as zero and that are not predicted.
     """
     known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
+    samples = np.ascontiguousarray(s, dtype=float)
     with np.errstate(all="ignore"):
-        found = _kernel()(np.ascontiguousarray(s, dtype=float), known, np.asarray(c), np.asarray(d), start)
-    return Filtered(*found)
+        found = Filtered(*_kernel()(samples, known, np.asarray(c), np.asarray(d), start, -1))
+        if np.all(found.state != PRESENT) and np.isnan(samples).any():
+            found = Filtered(*_kernel()(samples, known, np.asarray(c), np.asarray(d), WARMING * start, start))
+    return found
 
 
 def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
@@ -88,9 +102,11 @@ def with_roots(roots: Array, size: int) -> Array:
     return found
 
 
-def _march(s: Array, drive: Array, c: Array, d: Array, start: int) -> tuple[Array, Array, Array]:
+def _march(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) -> tuple[Array, Array, Array, Any]:
     count = s.shape[0]
     e, filled, predicted = np.zeros(count), np.empty(count), np.empty(count)
+    state = np.full(count, 2, dtype=np.int8)
+    last = 0.0
     for k in range(count):
         value = drive[k]
         for i in range(min(d.shape[0], k)):
@@ -99,12 +115,18 @@ def _march(s: Array, drive: Array, c: Array, d: Array, start: int) -> tuple[Arra
             value += c[i] * e[k - 1 - i]
         predicted[k] = value if k >= start else np.nan
         if np.isnan(s[k]):
-            filled[k] = predicted[k]
+            filled[k] = predicted[k] if held < 0 else value
+            if held >= 0 and (k < held or np.isnan(value)):
+                filled[k] = last
+            elif not np.isnan(filled[k]):
+                state[k] = 1
         else:
             filled[k] = s[k]
             if k >= start and not np.isnan(value):
                 e[k] = s[k] - value
-    return e, filled, predicted
+                state[k] = 0
+        last = filled[k]
+    return e, filled, predicted, state
 
 
 @cache

@@ -22,6 +22,7 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.models import noise_filter
+from optid.models.noise_filter import DEAD, PRESENT
 from optid.models.nonlinearity import Nonlinearity
 from optid.regressors.layout import Layout
 from optid.regressors.sensitivities import (
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 CHUNK = 4096
 """Samples whose sensitivities are formed at a time: they stay in the processor's cache."""
-
-PRESENT, MISSING, DEAD = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +190,7 @@ def predict(u: Array, y: Array, unknowns: NoiseUnknowns, point: NoisePoint, inde
     else:
         x = np.zeros(len(u))
         found = noise_filter.innovations(y, drive, point.c, plant.a, start=unknowns.skipped)
-    state = np.where(np.isnan(found.predicted), DEAD, np.where(np.isnan(y), MISSING, PRESENT)).astype(np.int8)
-    return Predicted(x, np.nan_to_num(found.filled), found.innovations, state)
+    return Predicted(x, np.nan_to_num(found.filled), found.innovations, found.state)
 
 
 def blocks(u: Array, found: Predicted, unknowns: NoiseUnknowns, point: NoisePoint, chunk: int = CHUNK
