@@ -38,8 +38,8 @@ VALIDATION = {
     "hair": ("daisy_hairdryer", 750, 250, range(2, 9), (7.5086, 7.8874, 7.9014)),
     "robot": ("daisy_robotarm", 800, 224, range(2, 13), (5.7773, 3.5258, 3.9485)),
     "dryer": ("daisy_dryer_industrial", 600, 267, range(1, 7), (49.2288, 49.4671, 50.3791)),
-    "evaporator": ("daisy_evaporator", 5000, 1305, range(1, 7), (43.0268, 42.9225, 37.4237)),
-    "cd": ("daisy_cdplayer", 1500, 548, range(2, 13, 2), (19.6774, 23.5653, 18.0015)),
+    "evaporator": ("daisy_evaporator", 5000, 1305, range(1, 9), (43.0268, 42.9225, 37.4237)),
+    "cd": ("daisy_cdplayer", 1500, 548, range(2, 21, 2), (19.6774, 23.5653, 18.0015)),
 }
 WHOLE = {
     # name: (file, order, published SLmoesp, OMOESP, MOESP, N4SID)

@@ -3,7 +3,8 @@
     x(k+1) = A x + B f(u) + E g(y) + K e,    y(k) = C x + D f(u) + d + e
 
 `exact` is the Hammerstein model with nonlinear output feedback, `linear` (registered as ``ss.exact``) the linear one.
-``criterion="simulation"`` takes K = 0 and the simulation with measured feedback (P2), ``"prediction"`` estimates K.
+``criterion="simulation"`` takes K = 0 and the simulation with measured feedback (P2); a noise model is estimated from
+what it leaves. ``"prediction"`` estimates K with the other unknowns.
 Both are procedures: starts from subspace fits with several block rows, Gauss-Newton descents on streamed sensitivities
 (`formulations.state_error`), errors weighted anew by their own covariance, and at the optimum, or under constraints,
 convex programmes in the tangent of the iterate (`formulations.prediction_error`). Constraints on poles are kept by
@@ -27,13 +28,15 @@ import numpy as np
 from formulations.equation_error import flat
 from formulations.prediction_error import Descent, Posed, best_of, descend, refine
 from formulations.state_error import STABLE, StateError, entered
-from formulations.subspace_procedure import Plan, _feedback_bases, identified
+from formulations.subspace_procedure import Plan, feedback_bases, identified
 from optid.bases import fitted_bases
 from optid.bases.basis import Basis
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.judging import measure_violation
-from optid.models import HammersteinSS
+from optid.models import HammersteinSS, NoiseCovariances
+from optid.noise import with_noise
 from optid.program import Program, Values, View
 from optid.regressors.sensitivities import Linearised
 from optid.regressors.state_sensitivities import StateUnknowns
@@ -133,10 +136,12 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 1:
         raise StructureError(f"iterations={iterations!r}: a whole number from 1 is needed.")
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
+    _check_inputs(data)
+    # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
+    data = data.mapped(lambda u: u, lambda y: y, transform=Transform.identity(data.m, data.l))
     plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
                 offset=bool(offset), feedthrough=feedthrough, stability="free", iterations=2 * (
                     feedback_basis is not None))
-    _check_inputs(data)
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
     if criterion == "prediction" and feedback_basis is not None:
         plan = replace(plan, instruments="simulated+past")
@@ -145,7 +150,10 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
                 int(iterations), poles, others)
 
 
-def _check_inputs(data: Data) -> None:
+def _check_inputs(data: Any) -> None:
+    if not isinstance(data, Data):
+        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
+                             "with optid.read instead of a stream")
     for number, e in enumerate(data.experiments, start=1):
         lost = ~np.isfinite(e.u)
         if lost.any():
@@ -183,7 +191,7 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
             found[f"{evidence.figures['block rows']} block rows"] = evidence.model
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
-    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
+    expansion = expand(plan.records, fitted_bases(data, plan.basis), feedback_bases(data, plan.feedback_basis),
                        data.inputs, data.outputs)
     unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), criterion == "prediction", plan.offset)
     _check_rows(data, unknowns)
@@ -198,13 +206,30 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     posing = Posing(plan.name, error, constraints)
     x = posing.signed(best.x)
     evidence = yield from refine(posing.posed(), replace(best, x=x), {"order": nx, **figures}, x)
-    return _told(evidence, error)
+    return _with_noise(evidence, error)
 
 
-def _told(evidence: Evidence | None, error: StateError) -> Evidence | None:
+def _with_noise(evidence: Evidence | None, error: StateError) -> Evidence | None:
+    """Add the covariances of the noise: with K as it was fitted, or with one estimated from the simulation errors."""
     if evidence is None or evidence.model is None:
         return evidence
-    return replace(evidence, figures={**evidence.figures, "weight of the outputs": error.weight})
+    figures, model, data = {**evidence.figures, "weight of the outputs": error.weight}, evidence.model, error.data
+    try:
+        if error.unknowns.innovations:
+            errors = np.vstack([e.y for e in data.experiments]) - np.vstack(_listed(model.predict(data)))
+            errors = errors[~np.isnan(errors).any(axis=1)]
+            covariance = errors.T @ errors / max(len(errors), 1)
+            cross = model.K @ covariance
+            model = replace(model, noise=NoiseCovariances(cross @ model.K.T, covariance, cross, covariance))
+        else:
+            model = with_noise(model, data)
+    except StructureError as reason:
+        figures["noise model"] = f"none: {reason}"
+    return replace(evidence, model=model, figures=figures)
+
+
+def _listed(arrays: Any) -> list[Array]:
+    return list(arrays) if isinstance(arrays, tuple) else [arrays]
 
 
 def _quietly(procedure: Procedure) -> Procedure:

@@ -14,7 +14,7 @@ from formulations.stability import stable
 from optid.bases import fitted_bases, parse
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models import Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.solution import Bound, Solution, Status
@@ -25,10 +25,11 @@ from optid.subspace.innovations import model_innovations
 from optid.subspace.methods import (
     Projection,
     check_order,
-    check_signal,
     default_block_rows,
     project,
+    signal_rank,
     simulate_clipped,
+    tested_order,
 )
 from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
 from optid.subspace.realisation import largest_gap, scaled_pair
@@ -36,6 +37,7 @@ from optid.subspace.realisation import largest_gap, scaled_pair
 OBSERVERS = ("auto", "none", "kalman")
 NOISES = ("white", "coloured")
 SPLITS = ("exact", "lumped")
+ORDERS = ("auto", "gap")
 STABILITIES = ("auto", "free")
 INSIDE = 0.999
 """Modulus to which poles outside the unit circle are brought by ``stability="auto"``."""
@@ -76,8 +78,8 @@ class Plan:
             one_of(name, value, known)
         if not isinstance(self.data, Data):
             raise DataError(f"{self.name} needs records in memory (optid.Data), not a {type(self.data).__name__}.")
-        if not (self.nx == "auto" or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
-            raise StructureError(f"nx={self.nx!r}: a whole number from 1, or 'auto'.")
+        if not (self.nx in ORDERS or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
+            raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
         self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
 
     @property
@@ -100,7 +102,7 @@ class Plan:
         return tuple(bool(one) for one in given)
 
 
-def _feedback_bases(data: Data, given: Any) -> list[Basis | None]:
+def feedback_bases(data: Data, given: Any) -> list[Basis | None]:
     """Return one basis with an interval, or None, per output."""
     several = list(given) if isinstance(given, list | tuple) else [given] * data.l
     if len(several) != data.l:
@@ -123,7 +125,7 @@ def _feedback_bases(data: Data, given: Any) -> list[Basis | None]:
 def prepared(plan: Plan) -> tuple[Expansion, int]:
     """Return the signals of a plan and its number of block rows, after the checks of its channels."""
     data = plan.data
-    expansion = expand(plan.records, fitted_bases(data, plan.basis), _feedback_bases(data, plan.feedback_basis),
+    expansion = expand(plan.records, fitted_bases(data, plan.basis), feedback_bases(data, plan.feedback_basis),
                        data.inputs, data.outputs)
     check_channels(plan.records, data.inputs, data.outputs)
     return expansion, _block_rows(plan, expansion)
@@ -146,9 +148,9 @@ def identified(plan: Plan) -> Procedure:
         else:
             instruments = instruments.replace("simulated", "inputs")
     projection = _projected(plan, records, expansion, alpha, instruments)
-    nx, gap = _order(plan, projection)
-    figures = {"order": nx, "block rows": alpha, "instruments": instruments,
-               "singular values": projection.range.values, "gap of singular values": gap,
+    nx, reason = _order(plan, projection, records, expansion)
+    figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
+               "instruments": instruments, "singular values": projection.range.values,
                "condition of R11": projection.blocks.condition}
     if projection.blocks.discarded:
         figures["regressor directions left out"] = projection.blocks.discarded
@@ -238,15 +240,26 @@ def _projected(plan: Plan, records: list[np.ndarray], expansion: Expansion, alph
                    tolerance=plan.tolerance, weighting=plan.weighting)
 
 
-def _order(plan: Plan, projection: Projection) -> tuple[int, float]:
-    """Return the order, and the ratio of the singular values on its two sides."""
-    values = projection.range.values
-    nx = plan.order
+def _order(plan: Plan, projection: Projection, records: list[np.ndarray], expansion: Expansion) -> tuple[int, str]:
+    """Return the order, and where it was to be found the reason in words."""
+    nx, values, reason = plan.order, projection.range.values, ""
+    rank = signal_rank(projection)
+    if plan.nx == "auto" and rank <= min(projection.block_rows - 1, values.size - 1):  # a record without noise
+        nx, reason = rank, f"{rank}: the singular values after it are rounding"
+    elif plan.nx == "auto":
+        try:
+            nx, reason = tested_order(records, expansion, projection.block_rows, instruments=projection.instruments,
+                                      offset=plan.offset)
+        except RankError:  # singular regressors, or a record too short for the distribution
+            nx = None
     if nx is None:
         nx = largest_gap(values, min(projection.block_rows - 1, values.size // 2))
-    check_signal(projection, nx)
-    following = values[nx] if nx < values.size else 0.0
-    return nx, float(values[nx - 1] / following) if following > 0 else float("inf")
+        following = values[nx] if nx < values.size else 0.0
+        reason = f"{nx}: the largest gap of the singular values, {values[nx - 1]:.3g} before {following:.3g}"
+    if nx > rank:
+        raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more block "
+                        "rows or a richer input.")
+    return nx, reason
 
 
 def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
@@ -264,7 +277,7 @@ def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.nd
     records, kind = raw, "inputs"
     for _ in range(plan.iterations):
         projection = _projected(plan, records, model, alpha, kind)
-        nx, _ = _order(plan, projection)
+        nx, _ = _order(plan, projection, records, model)
         a, c, _ = scaled_pair(projection.gamma(nx), projection.scale)
         step = _step(plan, records, model, _inside(a), c, projection.scale)
         bu, du, ez, d, _ = step.matrices(step.least_squares())

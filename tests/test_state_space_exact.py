@@ -246,3 +246,57 @@ def test_refusals():
         warnings.simplefilter("ignore")
         with pytest.raises((RankError, DataError), match="linear"):
             optid.fit(data, exact, nx=2, basis="linear", feedback_basis="polynomial:1")
+
+
+def test_detrended_and_scaled_data_give_the_model_in_raw_units():
+    model, u, rng = hammerstein(samples=600)
+    y = model.simulate(u) + 0.05 * rng.normal(size=(len(u), 2))
+    y[rng.uniform(size=y.shape) < 0.02] = np.nan
+    raw = Data(u, y)
+    sine = UserFunctions((lambda v: np.sin(2 * v),), interval=(-4.0, 4.0))
+    for criterion in ("simulation", "prediction"):
+        options = {"nx": 2, "basis": "polynomial:3", "criterion": criterion, "block_rows": 6, "weighting": "scale"}
+        options["feedback_basis"] = [Polynomial(5), None]
+        one = optid.fit(raw, "hammerstein_ss.exact", **options)
+        other = optid.fit(raw.detrend().scale(), "hammerstein_ss.exact", **options)
+        assert other.model.predict(raw) == pytest.approx(one.model.predict(raw), abs=2e-3)
+        assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-5)
+        assert other.model.noise.innovation == pytest.approx(one.model.noise.innovation, rel=1e-2, abs=1e-5)
+    with pytest.raises(StructureError, match="UserFunctions"):
+        optid.fit(raw.scale(), "hammerstein_ss.exact", **{**options, "feedback_basis": [sine, None]})
+
+
+@pytest.mark.parametrize("criterion", ["simulation", "prediction"])
+def test_noise_covariances_belong_to_the_gain(criterion):
+    model, data = system(kind="innovation", samples=3000, noise=0.3, seed=3)
+    found = optid.fit(data, "ss.exact", nx=2, criterion=criterion).model
+    noise = found.noise
+    assert noise.innovation == pytest.approx(0.09 * np.eye(2), abs=0.01)
+    assert noise.Q == pytest.approx(found.K @ noise.innovation @ found.K.T, abs=1e-8)
+    assert noise.S == pytest.approx(found.K @ noise.innovation, abs=1e-8)
+    assert found.C @ found.K == pytest.approx(model.C @ model.K, abs=0.06)
+
+
+def test_poles_may_leave_the_circle_where_that_is_allowed():
+    plant = HammersteinSS([[1.01, 0.1], [0.0, 0.6]], [[0.0], [1.0]], [[1.0, 0.0]])
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        y = plant.simulate(u) + 0.05 * rng.normal(size=300)
+        stable_one = optid.fit(Data(u, y), "ss.exact", nx=2, raises=False)
+        free = optid.fit(Data(u, y), "ss.exact", nx=2, stability="free")
+    assert stable_one.model.is_stable and stable_one.solution.status.value == "limit"
+    assert np.abs(free.model.poles).max() == pytest.approx(1.01, abs=1e-3)
+    assert free.solution.objective < 0.5 * stable_one.solution.objective
+
+
+def test_a_start_of_the_user_is_taken():
+    model, data = system(noise=0.05)
+    fit = optid.fit(data, linear, nx=2, initial=model, block_rows=5)
+    assert "start 1" in fit.figures["starts"]
+
+
+def test_order_is_found_from_the_gap():
+    _, data = system(noise=0.01, n=3, samples=800)
+    assert optid.fit(data, linear, nx="auto").figures["order"] == 3
