@@ -1,12 +1,13 @@
 """Noise statistics of a state-space model: gain of the innovations, covariances, spectrum, colour.
 
 With A and C known, what the inputs and the measured feedback do not explain is ``r = (I + C (qI - A)^-1 K) e``. The
-gain K and the covariance of the innovations e minimise the prediction errors (Gauss-Newton, started from a long
-autoregression of r: Hannan and Rissanen 1982). The covariances reported are those of the residuals of the state and the
-output equation along the states of that predictor, ``w = K e`` and ``v = e``: Q = K Re K', S = K Re, R = Re (Van
-Overschee and De Moor, Subspace Identification for Linear Systems, 1996, chapter 3). They are positive semidefinite and
-belong to K by construction. Q, R and S are not unique: every process and measurement noise with the same spectrum gives
-the same outputs. What the data determine is the spectrum, hence K and Re.
+gain K and the covariance of the innovations e minimise the prediction errors (Levenberg-Marquardt, the initial states
+eliminated, started from several observers and from long autoregressions of their errors: Hannan and Rissanen 1982). The
+covariances reported are those of the residuals of the state and the output equation along the states of that predictor,
+``w = K e`` and ``v = e``: Q = K Re K', S = K Re, R = Re (Van Overschee and De Moor, Subspace Identification for Linear
+Systems, 1996, chapter 3). They are positive semidefinite and belong to K by construction. Q, R and S are not unique:
+every process and measurement noise with the same spectrum gives the same outputs. What the data determine is the
+spectrum, hence K and Re.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,9 @@ from optid.data import Data
 from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
+from optid.subspace.innovations import innovation_form
 from optid.validation.correlations import Correlation, autocorrelation
+from optid.validation.predictions import between_gaps, one_step
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
@@ -34,7 +37,13 @@ ROUNDING = 1e-10
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
 
-STEPS, TOLERANCE = 30, 1e-6
+STEPS, TOLERANCE, LARGEST = 50, 1e-10, 1e8
+
+RATIOS = (1e-2, 1.0, 1e2)
+"""Process over measurement noise of the observers behind the starts, in units of C."""
+
+TRIED = 2
+"""Starts that are refined, the best of all."""
 
 
 class Noise(NamedTuple):
@@ -64,27 +73,25 @@ def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
             model returns to raw units). Samples may be missing.
 
     Raises:
-        DataError: a missing input, or other channels than the model's.
+        DataError: other channels than the model's, or no stretch long enough without a missing input.
         StructureError: a pole on or outside the unit circle that the outputs do not see.
     """
     observer = _observer(model)
-    data = _as_it_is(data)
+    data, _ = between_gaps(_as_it_is(data), 2 * model.nx + 1)
     rest = residuals(replace(model, K=observer, noise=None), data)
     level = float(np.nanmax(np.abs(np.vstack([e.y for e in data.experiments])), initial=0.0))
     if not np.nanmax(np.abs(np.vstack(rest)), initial=0.0) > ROUNDING * level:
         return Noise(observer, _innovation_form(observer, _covariance(rest)))
     A = model.A - observer @ model.C
-    gain = _stable(A, model.C, _first_gain(A, model.C, rest), _covariance(rest))
-    gain, covariance = _refined(A, model.C, gain, rest)
+    found = [_refined(A, model.C, gain, rest) for gain in _starts(A, model.C, rest)[:TRIED]]
+    gain, covariance = min(found, key=lambda pair: _logdet(pair[1]))
     return Noise(observer + gain, _innovation_form(observer + gain, covariance))
 
 
 def residuals(model: "HammersteinSS", data: Data) -> list[Array]:
     """Return the one-step prediction errors (N, l) of every experiment in the units of the model, NaN = missing."""
     data = _as_it_is(data)
-    predicted = model.predict(data, x0="fit")
-    several = predicted if data.n_experiments > 1 else (predicted,)
-    return [e.y - p for e, p in zip(data.experiments, several)]
+    return [e.y - p for e, p in zip(data.experiments, one_step(model, data))]
 
 
 def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
@@ -145,6 +152,36 @@ def output_noise(model: "HammersteinSS") -> Array:
     return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
 
 
+def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
+    """Gains to start from, the most promising first: of several observers, and from the whitening of their errors.
+
+    The observers are those of equal noise in all states and equal noise at all outputs.
+    """
+    size = np.linalg.norm(C, axis=1)
+    unit, observers = np.diag(np.where(size > 0, size, 1.0) ** 2), [np.zeros((len(A), len(C)))]
+    for ratio in RATIOS:
+        try:
+            observers.append(np.array(kalman_gain(A, C, ratio * np.eye(len(A)), unit).K))
+        except StructureError:
+            continue
+    found = list(observers)
+    for gain in observers:
+        errors = _whitened(A, C, gain, rest)
+        whole = [part for e in errors for part in _complete(e)]
+        try:
+            found.append(np.array(innovation_form(A, C, gain, whole)[0]))
+        except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
+            continue
+    return sorted(found, key=lambda gain: _logdet(_innovations(A, C, gain, rest)))
+
+
+def _complete(errors: Array) -> list[Array]:
+    """Cut (N, l) into stretches without missing samples."""
+    present = ~np.isnan(errors).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
+    return [errors[start:stop] for start, stop in edges.reshape(-1, 2)]
+
+
 def _observer(model: "HammersteinSS") -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
@@ -181,31 +218,6 @@ def _covariance(signals: Sequence[Array], lag: int = 0) -> Array:
     return (found + found.T) / 2 if lag == 0 else found
 
 
-def _first_gain(A: Array, C: Array, rest: Sequence[Array]) -> Array:
-    """Gain whose response C A^(i-1) K is nearest to that of a long autoregression of the residuals.
-
-    The autoregression solves the Yule-Walker equations, loaded a little: with missing samples the sample covariances
-    need not be positive definite.
-    """
-    l, samples = C.shape[0], int(np.sum(~np.isnan(np.vstack(rest)), axis=0).min())  # noqa: E741
-    order = int(np.clip(10 * np.log10(max(samples, 10)), 1, max(1, samples // (10 * l))))
-    unit = np.sqrt(np.maximum(np.diag(_covariance(rest)), np.finfo(float).tiny))
-    lagged = [_covariance(rest, lag) / np.outer(unit, unit) for lag in range(order + 1)]
-    system = np.block([[lagged[j - i] if j >= i else lagged[i - j].T for j in range(order)] for i in range(order)])
-    right = np.vstack([matrix.T for matrix in lagged[1:]])
-    past = np.linalg.lstsq(system + 1e-6 * np.eye(len(system)), right)[0].T.reshape(l, order, l)
-    response = [np.eye(l)]
-    for i in range(1, order + 1):
-        response.append(sum((past[:, j - 1] @ response[i - j] for j in range(1, i + 1)), np.zeros((l, l))))
-    scaled = C / unit[:, None]
-    rows, power = [], np.eye(len(A))
-    for _ in range(order):
-        rows.append(scaled @ power)
-        power = A @ power
-    gain = np.linalg.lstsq(np.vstack(rows), np.vstack(response[1:]), rcond=1e-8)[0]
-    return gain / unit  # per unit of the innovations
-
-
 def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
     """Return the gain of the same spectrum that makes A - K C stable."""
     if _radius(A - gain @ C) < 1:
@@ -213,52 +225,88 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
     try:
         level = covariance + 1e-12 * np.trace(covariance) * np.eye(len(C))
         return np.array(kalman_gain(A, C, gain @ level @ gain.T, level, gain @ level).K)
-    except StructureError:  # zeros on the unit circle
+    except (StructureError, ValueError):  # zeros on the unit circle
         return np.zeros_like(gain)
 
 
 def _refined(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
-    """Minimise the determinant of the covariance of the innovations by Gauss-Newton with backtracking."""
-    best = _innovations(A, C, gain, rest)
+    """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
+
+    A step that makes the predictor unstable is replaced by the stable gain of the same spectrum.
+    """
+    best, damping = _innovations(A, C, gain, rest), 1e-4
     for _ in range(STEPS):
-        step = _direction(A, C, gain, rest, best)
-        size, improved = 1.0, False
-        while size > 1e-3:
-            trial = gain + size * step
-            if _radius(A - trial @ C) < 1:
-                found = _innovations(A, C, trial, rest)
-                if _logdet(found) < _logdet(best):
-                    improved = True
-                    break
-            size /= 2
-        if not improved:
+        normal, right = _equations(A, C, gain, rest, best)
+        found, trial = None, gain
+        while damping < LARGEST and found is None:
+            step = _solved(normal + damping * np.diag(np.diag(normal)), right).reshape(gain.shape[::-1]).T
+            trial = _stable(A, C, gain + step, best)
+            covariance = _innovations(A, C, trial, rest)
+            if _logdet(covariance) < _logdet(best):
+                found = covariance
+            damping *= 0.1 if found is not None else 10.0
+        if found is None:
             break
-        moved = float(np.linalg.norm(size * step)) / max(float(np.linalg.norm(trial)), 1e-300)
         gained = _logdet(best) - _logdet(found)
         gain, best = trial, found
-        if moved < TOLERANCE or gained < 1e-12:
+        if gained < TOLERANCE:
             break
     return gain, best
 
 
 def _innovations(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
     """Covariance (l, l) of the innovations under a gain."""
-    run = _kernels()[0]
-    return _covariance([run(A - gain @ C, C, gain, r) for r in rest])
+    return _covariance(_whitened(A, C, gain, rest))
 
 
-def _direction(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> Array:
-    """Gauss-Newton step in the gain, the innovations in units of their covariance."""
-    n, l = gain.shape  # noqa: E741
+def _whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> list[Array]:
+    """Innovations (N, l) of every experiment under a gain, with the initial state that fits best."""
+    F, run = A - gain @ C, _kernels()[0]
+    return [run(F, C, gain, r, x0) for r, x0 in zip(rest, _initial(F, C, gain, rest))]
+
+
+def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array]) -> list[Array]:
+    """Initial states (n,) that minimise the squared innovations, which are affine in them."""
+    weight = np.diag(1 / np.sqrt(np.maximum(np.diag(_covariance(rest)), np.finfo(float).tiny)))
+    found = []
+    for r in rest:
+        settled = r[: _settling(F, len(r))]
+        normal, right = _kernels()[1](F, C, gain, settled, np.zeros(len(F)), weight)
+        part = normal[gain.size :, gain.size :]
+        found.append(_solved(part, right[gain.size :]))
+    return found
+
+
+def _settling(F: Array, count: int) -> int:
+    """Samples after which the initial state is forgotten."""
+    radius = _radius(F)
+    return count if radius > 0.99 else min(count, len(F) + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1))))
+
+
+def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
+    """Normal equations of a step in the gain (column by column), the innovations in units of their covariance.
+
+    The initial states are eliminated.
+    """
     values, vectors = np.linalg.eigh(covariance)
     weight = (vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T
-    normal, right = np.zeros((n * l, n * l)), np.zeros(n * l)
-    for r in rest:
-        information, pull = _kernels()[1](A - gain @ C, C, gain, r, weight)
-        normal += information
-        right += pull
-    load = 1e-10 * np.trace(normal) / max(n * l, 1)
-    return np.linalg.solve(normal + load * np.eye(n * l), right).reshape(l, n).T
+    F, size = A - gain @ C, gain.size
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for r, x0 in zip(rest, _initial(F, C, gain, rest)):
+        information, pull = _kernels()[1](F, C, gain, r, x0, weight)
+        cross = information[size:, :size]
+        both = _solved(information[size:, size:], np.column_stack([cross, pull[size:]]))
+        normal += information[:size, :size] - cross.T @ both[:, :-1]
+        right += pull[:size] - cross.T @ both[:, -1]
+    return normal, right
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Solve a symmetric system; directions without information stay at zero."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    inverse = np.where(values > 1e-12 * max(values[-1], 1e-300), 1 / np.where(values == 0, 1.0, values), 0.0)
+    return (vectors * inverse) @ (vectors.T @ (right.T / scale).T) / (scale if right.ndim == 1 else scale[:, None])
 
 
 def _logdet(covariance: Array) -> float:
@@ -270,11 +318,11 @@ def _radius(A: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
 
 
-def _innovate(F: Array, C: Array, gain: Array, r: Array) -> Array:
+def _innovate(F: Array, C: Array, gain: Array, r: Array, x0: Array) -> Array:
     """Innovations e = r - C x, x+ = F x + K r with F = A - K C; a missing residual corrects nothing."""
     n, l = gain.shape  # noqa: E741
     e = np.empty_like(r)
-    x, later = np.zeros(n), np.empty(n)
+    x, later = x0.copy(), np.empty(n)
     for k in range(r.shape[0]):
         for i in range(n):
             later[i] = 0.0
@@ -292,12 +340,14 @@ def _innovate(F: Array, C: Array, gain: Array, r: Array) -> Array:
     return e
 
 
-def _sensitivities(F: Array, C: Array, gain: Array, r: Array, weight: Array) -> tuple[Array, Array]:
-    """Sum of J'J and J'e over a record, J the derivative of -e by the gain (column by column), both whitened."""
+def _sensitivities(F: Array, C: Array, gain: Array, r: Array, x0: Array, weight: Array) -> tuple[Array, Array]:
+    """Sum of J'J and J'e over a record, J the derivative of -e by the gain (column by column) and x0, both whitened."""
     n, l = gain.shape  # noqa: E741
-    q = n * l
-    x, later = np.zeros(n), np.zeros(n)
+    q = n * l + n
+    x, later = x0.copy(), np.zeros(n)
     turn, turned = np.zeros((n, q)), np.zeros((n, q))
+    for i in range(n):
+        turn[i, n * l + i] = 1.0
     normal, right = np.zeros((q, q)), np.zeros(q)
     e, white, slope, rows = np.zeros(l), np.zeros(l), np.zeros((l, q)), np.zeros((l, q))
     for k in range(r.shape[0]):

@@ -12,7 +12,8 @@ from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
 from optid.noise import (
     _covariance,
-    _direction,
+    _equations,
+    _initial,
     _innovations,
     colour,
     estimate_noise,
@@ -103,26 +104,29 @@ def test_no_other_gain_predicts_better():
     assert all(loss(found.K.ravel() + 0.02 * rng.normal(size=6)) > best for _ in range(20))
 
 
-def test_the_step_is_that_of_a_formed_jacobian():
+def test_the_normal_equations_are_those_of_a_formed_jacobian():
     model = truth(7)
-    data = record(model, (400,), missing=0.1)
+    data = record(model, (400, 150), missing=0.1)
     rest, gain = residuals(bare(model), data), 0.5 * model.K
     covariance = _innovations(A, C, gain, rest)
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
+    starts = _initial(A - gain @ C, C, gain, rest)
 
     def errors(flat):
-        x, e = np.zeros(3), []
-        for r in rest[0]:
-            e.append(np.where(np.isnan(r), 0.0, r - C @ x))
-            x = A @ x + flat.reshape(2, 3).T @ e[-1]
+        e = []
+        for r, x in zip(rest, flat[6:].reshape(2, 3)):
+            for row in r:
+                e.append(np.where(np.isnan(row), 0.0, row - C @ x))
+                x = A @ x + flat[:6].reshape(2, 3).T @ e[-1]
         return (np.array(e) @ weight.T).ravel()
 
-    start = gain.T.ravel()
-    jacobian = np.column_stack(
-        [(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(6)]
-    )
-    step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0].reshape(2, 3).T
-    assert _direction(A, C, gain, rest, covariance) == pytest.approx(step, rel=1e-4, abs=1e-7)
+    start = np.concatenate([gain.T.ravel(), *starts])
+    jacobian = np.column_stack([(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(12)])
+    step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0][:6]
+    assert np.linalg.solve(*_equations(A, C, gain, rest, covariance)) == pytest.approx(step, rel=1e-4, abs=1e-7)
+    weight = np.diag(1 / np.sqrt(np.diag(_covariance(rest))))  # in which the initial states fit best
+    best = np.linalg.norm(errors(start))
+    assert all(np.linalg.norm(errors(start + sign * h)) > best for h in 0.01 * np.eye(12)[6:] for sign in (-1, 1))
 
 
 @pytest.mark.parametrize("radius", [1.0, 1.02])
@@ -187,3 +191,17 @@ def test_covariances_with_missing_samples_by_hand():
     x = np.array([[1.0, 2.0], [np.nan, 1.0], [3.0, np.nan], [0.0, 1.0]])
     assert _covariance([x])[0, 0] == pytest.approx(10 / 3) and _covariance([x])[0, 1] == pytest.approx(2 / 2)
     assert _covariance([x], 1)[0, 1] == pytest.approx(3 / 1)
+
+
+def test_missing_inputs_cut_the_record():
+    model = truth(2)
+    data = record(model, (6000, 3000))
+    us = [u.copy() for u in data.u]
+    us[0][[700, 2500, 2504]] = np.nan
+    us[1][1] = np.nan
+    found = estimate_noise(bare(model), Data(us, data.y))
+    assert np.linalg.norm(found.K - model.K) < 0.15 * np.linalg.norm(model.K)
+    rest = residuals(model, Data(us, data.y))
+    lost = np.flatnonzero(np.isnan(rest[0][:, 0]))
+    assert lost.tolist() == [700, *range(2500, 2505)]
+    assert np.isnan(rest[1][:2]).all() and not np.isnan(rest[1][2:]).any()

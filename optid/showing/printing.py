@@ -143,5 +143,5 @@ def set_table(table: Table) -> list[str]:
         if len(row[0]) > names:
             lines += [row[0], " " * names + cells]
         else:
-            lines.append(f"{row[0]:<{names}}{cells}")
+            lines.append(f"{row[0]:<{names}}{cells}".rstrip())
     return lines + (_wrapped(table.note) if table.note else [])

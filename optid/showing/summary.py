@@ -242,8 +242,7 @@ def noise_table(fit: "Fit") -> Table | None:
         return None
     from optid.noise import colour, output_noise
 
-    whole = isinstance(fit.data, Data) and not any(fit.data.missing[name] for name in fit.data.inputs)
-    tests = colour(model, fit.data) if whole and isinstance(fit.data, Data) else {}
+    tests = colour(model, fit.data) if isinstance(fit.data, Data) else {}
     spread = np.sqrt(np.diag(output_noise(model)))
     own = np.sqrt(np.diag(model.noise.innovation))
     rows = []

@@ -50,9 +50,13 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         return model, "none: the prediction errors vanish, there is no noise to model"
     try:
         k, noise = innovation_form(model.A, model.C, gain, errors)
+        if any(data.missing[name] for name in data.inputs):  # the complete stretches alone
+            return replace(model, K=k, noise=noise), ""
+        from optid.noise import with_noise
+
+        return with_noise(model, data), ""
     except StructureError as reason:
         return model, f"none: {reason}"
-    return replace(model, K=k, noise=noise), ""
 
 
 def _complete(u: Array, y: Array) -> list[tuple[Array, Array]]:

@@ -199,6 +199,9 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
 def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
     shares = {}
     for function in static_functions(model):
+        if function.is_linear:  # known everywhere
+            shares[function.name] = 0.0
+            continue
         c, name, basis = function.channel, function.name, function.nonlinearity.basis
         samples = np.concatenate([(e.y if function.fed_back else e.u)[:, c] for e in data.experiments])
         shares[name] = basis.n_outside(samples) / max(int(np.sum(~np.isnan(samples))), 1)
