@@ -63,7 +63,7 @@ def formed(record: np.ndarray, expansion, rows: int, scale: np.ndarray) -> np.nd
     hankel = windows_of(expansion(record), 2 * rows).reshape(len(record) - 2 * rows + 1, -1)
     hankel = np.concatenate([np.ones((len(hankel), 1)), hankel], axis=1)
     statistics = hankel_statistics([record[: 4 * rows]], 2 * rows, expansion, method="gram")  # for positions alone
-    z, phi, y = positions(statistics, expansion, "inputs+past", True)
+    z, phi, y = positions(statistics, expansion, "inputs+past", True, rows)
     order = np.concatenate([phi, z[~np.isin(z, phi)], y])
     triangle = np.linalg.qr(hankel[:, order], mode="r")
     r22 = triangle[phi.size : z.size, -y.size :].T
@@ -138,7 +138,7 @@ def hair_dryer() -> None:
         return
     columns = np.loadtxt(path, delimiter=",", skiprows=1)
     data = Data(u=columns[:, -2], y=columns[:, -1], dt=0.08)
-    found = fit(data, "hammerstein_ss.sid", block_rows=15, offset=False)
+    found = fit(data, "hammerstein_ss.sid", nx="gap", block_rows=15, offset=False)
     ours = " ".join(f"{value:.4f}" for value in found.figures["singular values"])
     poles = ", ".join(f"{p.real:.4f}" + f"{p.imag:+.4f}i" * (abs(p.imag) > 1e-9) for p in found.model.poles)
     print("hair dryer, 15 block rows (SLICOT IB01AD):")

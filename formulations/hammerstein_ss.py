@@ -37,7 +37,8 @@ def sid(
 
     Args:
         data: the record.
-        nx: order, or "auto".
+        nx: order; "auto" for the smallest order after which the singular values are noise (`optid.model_order`), "gap"
+            for the largest gap between them (SLICOT's rule).
         block_rows: block rows of the future, and as many of the past; more than the order. None chooses.
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs

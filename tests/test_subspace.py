@@ -314,7 +314,7 @@ def test_hair_dryer_as_slicot_sees_it(real_data):
     """IB01AD: order 4 by the largest gap; poles as printed to three decimals (P1)."""
     record = np.loadtxt(real_data / "daisy_hairdryer.csv", delimiter=",", skiprows=1)
     data = Data(u=record[:, -2], y=record[:, -1], dt=0.08)
-    fit = quiet(data, "hammerstein_ss.sid", block_rows=15, offset=False)
+    fit = quiet(data, "hammerstein_ss.sid", nx="gap", block_rows=15, offset=False)
     assert fit.figures["order"] == 4
     printed = [69.8841, 14.9963, 3.6675, 1.9677, 0.3000, 0.2078, 0.1651, 0.1373, 0.1133, 0.1059, 0.0856, 0.0784, 0.0733,
                0.0678, 0.0571]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.bases.basis import Array
-from optid.errors import RankError, StructureError
+from optid.errors import StructureError
 from optid.subspace.expansion import Expansion
 from optid.subspace.hankel import HankelStatistics, hankel_statistics
 from optid.subspace.realisation import Range, estimate_range
@@ -56,20 +56,21 @@ class Projection:
 
 
 def positions(
-    statistics: HankelStatistics, expansion: Expansion, instruments: str, offset: bool
+    statistics: HankelStatistics, expansion: Expansion, instruments: str, offset: bool, alpha: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the positions of instruments, regressors and outputs among the windows of 2 alpha samples.
+    """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
 
     The last block row of the feedback functions never reaches the future outputs and is left out.
 
     Args:
-        statistics: moments of the windows.
+        statistics: moments of windows of 2 alpha samples or more.
         expansion: the signals.
         instruments: "past" (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs),
             "inputs+past", "simulated" (past and future inputs and functions of simulated outputs), "simulated+past".
         offset: whether a constant is among instruments and regressors.
+        alpha: block rows of the past and of the future.
     """
-    alpha, at = statistics.rows // 2, statistics.at
+    at = statistics.at
     past, future, both = range(alpha), range(alpha, 2 * alpha), range(2 * alpha)
     one = np.zeros(int(offset), dtype=np.intp)
     phi = np.concatenate([one, at(expansion.eta, future), at(expansion.zeta, future[:-1])])
@@ -117,10 +118,28 @@ def project(
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     statistics.check()
-    z, phi, y = positions(statistics, expansion, instruments, offset)
+    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = _spread(statistics, expansion, offset)
     return Projection(statistics, blocks, estimate_range(blocks, expansion.l, weighting, scale), instruments, scale)
+
+
+def tested_order(
+    records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool
+) -> tuple[int, str]:
+    """Return the order whose trailing singular values are noise by their own distribution, and the reason in words.
+
+    Arguments as in `project`.
+
+    Raises:
+        RankError: records shorter than three times the block rows, or regressors that the instruments do not reach.
+    """
+    from optid.model_order import choose_order
+
+    statistics = hankel_statistics(records, 3 * block_rows, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
+    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
+    return choose_order(statistics, z, phi, y, rows=2 * block_rows, largest=(block_rows - 1) * expansion.l)
 
 
 def _spread(statistics: HankelStatistics, expansion: Expansion, offset: bool) -> Array:
@@ -164,17 +183,10 @@ def check_order(nx: int, block_rows: int, outputs: int) -> None:
                              f"{(block_rows - 1) * outputs}.")
 
 
-def check_signal(projection: Projection, nx: int) -> None:
-    """Refuse an order larger than the rank that the data have, noise included.
-
-    Raises:
-        RankError: with the rank.
-    """
+def signal_rank(projection: Projection) -> int:
+    """Return how many singular values are more than rounding, noise included."""
     values = projection.range.values
-    rank = int(np.sum(values > 10 * len(projection.statistics.gram) * np.finfo(float).eps * values[0]))
-    if nx > rank:
-        raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more block "
-                        "rows or a richer input.")
+    return int(np.sum(values > 10 * len(projection.statistics.gram) * np.finfo(float).eps * values[0]))
 
 
 def simulate_clipped(
