@@ -41,6 +41,7 @@ WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
 """Weights tried by default, each the inverse of a noise variance relative to the variance of the outputs."""
 
 RANK = 1e-3  # singular values below this part of the largest are none
+NOTHING = 1e-5  # of the largest singular value of the measured outputs' matrix
 LARGEST = 10  # order at most where it is chosen
 SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposition costs
 
@@ -60,6 +61,11 @@ class Structured:
     centre: np.ndarray
     scale: np.ndarray
     size: float
+
+    @property
+    def floor(self) -> float:
+        """Singular values below it are none: a weight so small that nothing is left of the matrix has rank zero."""
+        return NOTHING * self.size
 
     def penalty(self, weight: float) -> float:
         """Return lambda for a weight: the inverse noise variance times the size per output sample."""
@@ -168,8 +174,8 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     if not solution.has_point:
         return _without(solution.status, solution.reason)
     vectors, sizes = structured.decomposed(solution.values)
-    rank = rank_of(sizes)
-    nx = plan.order or order_of(sizes, (alpha - 1) * expansion.l)
+    rank = rank_of(sizes, structured.floor)
+    nx = plan.order or order_of(sizes, alpha - 1, structured.floor)
     if nx > rank:
         return _without(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: use a "
                                        "larger weight or a smaller order")
@@ -224,7 +230,7 @@ def order_scores(plan: Plan, expansion: Expansion, structured: Structured, value
         rest: the other record.
     """
     vectors, sizes = structured.decomposed(values)
-    most = min(rank_of(sizes), (structured.problem.rows - 1) * expansion.l)
+    most = min(rank_of(sizes, structured.floor), structured.problem.rows - 1)
     orders = range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most)
     found = {}
     for nx in orders:
@@ -245,14 +251,14 @@ def held_out_fit(model: Any, data: Data) -> float:
     return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(several))))
 
 
-def rank_of(sizes: np.ndarray) -> int:
-    """Return the number of singular values above a thousandth of the largest."""
-    return int(np.sum(sizes > RANK * sizes[0])) if sizes[0] > 0 else 0
+def rank_of(sizes: np.ndarray, floor: float = 0.0) -> int:
+    """Return the number of singular values above a thousandth of the largest and above a floor."""
+    return int(np.sum((sizes > RANK * sizes[0]) & (sizes > floor)))
 
 
-def order_of(sizes: np.ndarray, most: int) -> int:
+def order_of(sizes: np.ndarray, most: int, floor: float = 0.0) -> int:
     """Return the rank, one at least, `LARGEST` at most."""
-    return int(np.clip(rank_of(sizes), 1, min(LARGEST, most)))
+    return int(np.clip(rank_of(sizes, floor), 1, min(LARGEST, most)))
 
 
 def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
@@ -372,6 +378,8 @@ def _explained(problem: NuclearProblem, predictor: Predictor, theta: cp.Variable
 
 def certify(problem: NuclearProblem, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the dual bound, recomputed from a feasible dual point near the multipliers, or near the subgradient."""
+    if program.user_constraints:
+        return Bound(-np.inf, False, "none", "the dual bound is that of the programme without constraints"), None
     penalty = float(np.asarray(program.parameters["weight"].value))
     program.assign({name: values[name] for name in values if name not in program.derived})
     objective = float(np.asarray(program.objective.expr.value))

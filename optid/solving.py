@@ -168,7 +168,9 @@ def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) ->
 
     It decides alone where the objective has kinks, so that stationarity cannot be measured.
     """
-    if bound.proved or np.isfinite(point.residuals.stationarity) or program.kind == "NLP":
+    if bound.proved or not np.isfinite(bound.value):  # no bound refutes nothing
+        return False
+    if np.isfinite(point.residuals.stationarity) or program.kind == "NLP":
         return False
     return relative_gap(point.objective, bound.value, program.scale) > _tolerance(accuracy)
 
