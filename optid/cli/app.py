@@ -26,6 +26,7 @@ from optid.cli.options import (
     Runs,
     Time,
 )
+from optid.cli.ordering import order
 from optid.cli.terminal import FILES, Command, Group, Waiting, coloured, hearing, note, say
 from optid.errors import DataError
 
@@ -344,3 +345,4 @@ def examples() -> None:
 
 
 app.command(cls=Command)(design)
+app.command(cls=Command)(order)
