@@ -319,6 +319,10 @@ def _static_theta(view: View, channel: str | None, output: str | None = None) ->
         except np.linalg.LinAlgError:
             raise StructureError("the model has a pole at 1, hence no static characteristic; add 'stable'") from None
         return view[view.key("Theta", channel)] @ through_matrices(view, channel, row, output)
+    if view.kind == "tangent" and "C" in view.reference:  # states: to first order in A, B, C and D
+        if view.key("static", channel) not in view:
+            raise StructureError("nonlinear feedback: the static characteristic does not follow from the inputs alone")
+        return view[view.key("static", channel)][:, output_index(view, output)]
     if view["offset"].size > 1:
         raise StructureError("constraints on the static characteristic are defined for one output")
     if view.key("Theta", channel) not in view:  # a linear model has b alone
@@ -358,7 +362,7 @@ def output_index(view: View, output: str | None) -> int:
 
 
 def _offset(view: View, output: str | None) -> Any:
-    if view.kind == "realisation":
+    if "C" in view.reference:
         return view["offset"][output_index(view, output)] if "offset" in view else 0.0
     return view["offset"][0]
 

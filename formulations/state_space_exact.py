@@ -13,7 +13,8 @@ every iterate through the length of the steps.
 Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
 (not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, and the
 affine expressions ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names
-carry the channel, as in ``mu[valve]``.
+carry the channel, as in ``mu[valve]``. Without feedback the static curves (`shape.gain`, `shape.value_range`, ...) are
+constrained to first order about the iterate as well.
 """
 
 import warnings
@@ -366,7 +367,8 @@ class Posing:
             weights = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
             objective = objective + cp.sum_squares(cp.multiply(weights, stacked - x))
         names = unknowns.expansion.input_names
-        view = View({**variables, **self._theta(variables, values)}, kind="tangent", channels=names,
+        view = View({**variables, **self._theta(variables, values), **self._static(variables, values)}, kind="tangent",
+                    channels=names, outputs=unknowns.expansion.output_names,
                     bases=dict(zip(names, unknowns.expansion.inputs)), gauge="norm", reference=values)
         program = Program(name=self.name, objective=cp.Minimize(objective), constraints={"residual": (r == residual,)},
                           variables={**variables, "residual": r}, start={**values, "residual": errors},
@@ -385,6 +387,31 @@ class Posing:
                                          - np.outer(values[mu], values[b]))
             else:
                 found[f"Theta{tail}"] = cp.reshape(variables[b], (1, variables[b].size), order="F")
+        return found
+
+    def _static(self, variables: Mapping[str, cp.Variable], values: Mapping[str, Array]) -> dict[str, cp.Expression]:
+        """Coefficients (P, l) of the static curves ``mu (C (I - A)^-1 B + D)ᵀ`` to first order; none with feedback."""
+        expansion, found = self.criterion.unknowns.expansion, {}
+        n = self.criterion.unknowns.n
+        left = np.eye(n) - values["A"]
+        if expansion.feedback or np.linalg.cond(left) > 1e12:
+            return found
+        to_state = np.linalg.inv(left)
+        seen = values["C"] @ to_state
+        for name in expansion.input_names:
+            tail = f"[{name}]" if len(expansion.input_names) > 1 else ""
+            mu, b = f"mu{tail}", f"b{tail}"
+            rest = to_state @ values[b][:n]
+            gain = seen @ variables[b][:n] + (variables["C"] - values["C"]) @ rest + (
+                seen @ (variables["A"] - values["A"]) @ rest)
+            at = seen @ values[b][:n]
+            if values[b].size > n:
+                gain, at = gain + variables[b][n:], at + values[b][n:]
+            if mu in variables:
+                found[f"static{tail}"] = (cp.outer(variables[mu], at) + cp.outer(values[mu], gain)
+                                          - np.outer(values[mu], at))
+            else:
+                found[f"static{tail}"] = cp.reshape(gain, (1, at.size), order="F")
         return found
 
     def signed(self, x: Array) -> Array:

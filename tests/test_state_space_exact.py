@@ -300,3 +300,20 @@ def test_a_start_of_the_user_is_taken():
 def test_order_is_found_from_the_gap():
     _, data = system(noise=0.01, n=3, samples=800)
     assert optid.fit(data, linear, nx="auto").figures["order"] == 3
+
+
+def test_static_gain_is_kept():
+    model, u, rng = hammerstein(fed=False)
+    data = Data(u, model.simulate(u) + 0.05 * rng.normal(size=(len(u), 2)))
+    options = {"nx": 2, "basis": Polynomial(3, interval=(-2.0, 2.0)), "block_rows": 6}
+    free = optid.fit(data, "hammerstein_ss.exact", **options)
+    gain = 1.2 * free.model.static_gain([0.5, 0.0])[0, 0]
+    fit = optid.fit(data, "hammerstein_ss.exact", constraints=[shape.gain(gain, at=0.5, channel="u1", output="y1")],
+                    **options)
+    assert fit.model.static_gain([0.5, 0.0])[0, 0] == pytest.approx(gain, rel=1e-5)
+    assert fit.solution.status.value == "locally optimal"
+    with pytest.raises(StructureError, match="outputs are y1, y2"):
+        optid.fit(data, "hammerstein_ss.exact", constraints=[shape.gain(gain, at=0.5, channel="u1")], **options)
+    with pytest.raises(StructureError, match="nonlinear feedback"):
+        optid.fit(data, "hammerstein_ss.exact", feedback_basis=["polynomial:4", None],
+                  constraints=[shape.gain(gain, at=0.5, channel="u1", output="y1")], **options)
