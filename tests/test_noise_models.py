@@ -355,3 +355,26 @@ def test_noise_with_a_zero_on_the_unit_circle():
     y = system("armax").plant.simulate(u) + lfilter([1, -1.0], np.r_[1, A], 0.2 * rng.standard_normal(500))
     fit = quiet(Data(u, y), armax, na=2, nb=2, nk=1, nc=1, basis=BASIS, raises=False)
     assert noise_filter.radius(fit.model.c) < 1 and fit.model.c[0] == pytest.approx(-1.0, abs=0.02)
+
+
+def test_without_poles():
+    u = np.random.default_rng(0).uniform(-1, 1, 2000)
+    plant = HammersteinARX([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3)
+    y = plant.simulate(u) + lfilter([1, -0.5], [1], 0.2 * np.random.default_rng(1).standard_normal(2000))
+    for pose, orders in ((armax, {"nc": 1}), (bj, {"nc": 1, "nd": 0})):
+        model = optid.fit(Data(u, y), pose, na=0, nb=2, nk=1, basis=BASIS, **orders).model
+        assert model.theta() == pytest.approx(plant.theta(), abs=0.03) and model.c == pytest.approx([-0.5], abs=0.06)
+
+
+def test_gas_furnace_of_box_and_jenkins(real_data):
+    """The transfer-function model of their book (1976, section 11.4), within its standard errors.
+
+    y = -(0.53 + 0.37 B + 0.51 B^2) / (1 - 0.57 B) x(t-3) + a / (1 - 1.53 B + 0.63 B^2), variance of a 0.0561.
+    """
+    data = optid.read(real_data / "boxjenkins_gas_furnace.csv", inputs=["u"], outputs=["y"], dt=9.0)
+    fit = optid.fit(data, "bj.exact", na=1, nb=3, nk=3, nc=0, nd=2)
+    estimates = {name: (value, error) for name, value, error, *_ in fit.uncertainty.table()}
+    for name, published in (("a1", -0.57), ("b0", -0.53), ("b1", -0.37), ("b2", -0.51), ("d1", -1.53), ("d2", 0.63)):
+        value, error = estimates[name]
+        assert abs(value - published) < error
+    assert fit.solution.objective / 296 == pytest.approx(0.0561, abs=0.0005)
