@@ -5,6 +5,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parent.parent / "examples"
@@ -37,6 +38,11 @@ EXPECTED: dict[str, dict[str, Range]] = {
     "larger_than_memory": {
         "a1": about(-1.5, 1e-3), "a2": about(0.7, 1e-3), "b1 / b0": about(0.75, 2e-3), "rows": (1_999_998, 1_999_998),
     },
+    "noise_models": {
+        "hammerstein_arx.exact error": (0.005, 0.1), "hammerstein_oe.exact error": (0, 0.005),
+        "hammerstein_bj.exact error": (0, 0.005), "hammerstein_bj.exact 1": (95, 96),
+        "hammerstein_bj.exact 5": (90, 91), "hammerstein_armax.exact 5": (75, 85), "hammerstein_oe.exact 5": (84, 85),
+    },
     # reference: a (-1.50, 0.70), b (1.07, 0.79), s_2/s_1 0.02 to 0.04, E_200 0.0207 triangular, 0.0206 trigonometric
     "thesis/ch3_example": {
         **both({"a1": about(-1.5, 0.01), "a2": about(0.7, 0.01), "b0": about(1.07, 0.01), "b1": about(0.79, 0.01),
@@ -54,6 +60,39 @@ EXPECTED: dict[str, dict[str, Range]] = {
            for reading in ("as printed", "signs kept")},
         "wT / wF, as printed, spread": (0, 0.15), "b1F / b1T, signs kept, spread": (0, 0.02),
         "relative L2 distance of f b, at the end": (0.01, 0.04),
+    },
+    # reference: noise free below 0.2 %, then 3.2 / 6.2 % and 8.6 / 17.3 %, each near the floor of its record
+    "thesis/ch4_example1": {
+        "noise free ASIVID y1": (0, 1e-9), "noise free ASIVID y2": (0, 1e-9),
+        "N = 6000 ASIVID y1": (0, 3.6), "N = 6000 ASIVID y2": (0, 6.9),
+        "N = 7000 ASIVID y1": (0, 9.5), "N = 7000 ASIVID y2": (0, 19.1),
+        "N = 6000 SID y1": (20, 32), "N = 6000 no feedback y1": (8, 13),
+    },
+    # reference: 73 % without the cubic, 1.2 % and 7 % with it, 73 to 76 % linear
+    "thesis/ch4_vanderpol": {
+        "p = q = 2, noise free": (70, 1000), "p = q = 2, noisy": (70, 1000), "p = q = 3, noise free": (0, 5),
+        "p = q = 3, noisy": (0, 7.8), "p = q = 4, noisy": (0, 7.8), "trigonometric feedback, noisy": (0, 12.8),
+        "SID, noisy": (65, 100), "radius": (0.99, 1), "angle": about(0.1, 0.01),
+    },
+    "thesis/ch4_efficiency": {
+        "disagreement, N = 500": (0, 1e-8), "disagreement, N = 1000": (0, 1e-8), "ratio, N = 1000": (1.5, 1e4),
+    },
+    # reference: 1 without noise, 0.82 to 0.93 at N = 300, 0.97 to 1 at N >= 1000
+    "thesis/ch6_order": {
+        **{f"{case}, N = {n}": (share, 1) for case in ("measurement", "combined", "strong")
+           for n, share in ((300, 0.85), (1000, 0.95))},
+        "deterministic, N = 300": (1, 1), "deterministic, N = 1000": (1, 1), "slope of the threshold": (-0.6, -0.4),
+    },
+    # reference at order 3: LSID 6.8 / 3.5 %, ASIVID 0.7 / 2.5 %; a sinusoid determines no order above 2
+    "thesis/ch5_tables": {
+        "chirp LSID 3 angle": (4, 8), "chirp ASIVID 3 angle": (0, 1.5), "chirp ASIVID 3 speed": (0, 2.9),
+        "chirp ASIVID 8 angle": (0, 2), "sinusoid LSID 2 angle": (0, 1), "sinusoid ASIVID 4 angle": (np.inf, np.inf),
+    },
+    "thesis/ch5_experiments": {
+        "1 sinusoid ASIVID angle": (np.inf, np.inf), "3 noise ASIVID angle": (0, 3.2),
+        "3 levels ASIVID angle": (0, 4.3), "4 levels, scaled ASIVID angle": (0, 4.3),
+        "4 chirp, scaled and shaped ASIVID angle": (0, 1.5),
+        "1 sinusoid condition": (1e12, np.inf), "3 levels condition": (1e2, 1e4),
     },
     # the source reports cosines that vanish; a record of 1000 samples has them below 0.011 or so
     "thesis/ch3_table31": {

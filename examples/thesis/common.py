@@ -1,10 +1,11 @@
-"""What the scripts of chapter 3 share: the two bases, the gauge, the error E_N, tables and files.
+"""What the scripts share: for chapter 3 the two bases, the gauge and the error E_N; subspace fits, tables and files.
 
 Source: D. Luo, System Identification and Fault Detection of Complex Systems, PhD dissertation, University of Central
-Florida, 2005, chapter 3. Where its numbers are lost, the systems of `optid.examples` replace its own.
+Florida, 2005. Where its numbers are lost, the systems of `optid.examples` and `optid.plants` replace its own.
 """
 
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
@@ -74,3 +75,16 @@ def save(figure: Figure, folder: Path, name: str) -> None:
 def run(main: Callable[[Path], Any]) -> None:
     """Run a script with the folder for its figures from the command line; default: figures."""
     main(Path(sys.argv[1] if len(sys.argv) > 1 else "figures"))
+
+
+def feedback_error(model: Any, data: optid.Data) -> Any:
+    """Error of the simulation with measured feedback (P2), % of the root mean square of each output."""
+    simulated = model.simulate_measured_feedback(data, x0="fit")
+    return 100 * np.sqrt(np.sum((data.y - simulated) ** 2, axis=0) / np.sum(data.y**2, axis=0))
+
+
+def subspace(data: optid.Data, method: str, quiet: bool = True, **settings: Any) -> Any:
+    """Model of a subspace method: "sid" (linear unless a basis is given), "sivid" or "asivid"; without the proof."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore" if quiet else "default", optid.errors.DataWarning)
+        return optid.fit(data, f"hammerstein_ss.{method}", prove=False, **settings).model

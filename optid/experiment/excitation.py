@@ -34,8 +34,9 @@ TRUSTED = 0.5
 WANTED, WIDER = 1e4, 1.3
 """A band that was not asked for grows by this factor until the condition number is no larger."""
 
-BOOST = 10.0
-"""Shaping raises no frequency by more than this factor over the strongest."""
+BOOST = 4.0
+"""Shaping raises no frequency by more than this factor over another: what is left of a resonance would drown in dead
+zone and noise."""
 
 
 @dataclass(frozen=True, eq=False)
