@@ -125,8 +125,8 @@ def asivid(
         feedback_basis: as in `sivid`.
         noise: "coloured" keeps measured outputs out of the instruments; "white" adds the past of the outputs and of
             their feedback functions.
-        iterations: simulations of the feedback with a preliminary model: the first with a model without feedback; 0
-            uses past and future inputs (and with noise="white" the past outputs) alone.
+        iterations: simulations of the feedback with a preliminary model, each with the model of the one before; 0 uses
+            past and future inputs (and with noise="white" the past outputs) alone.
         form: as in `sivid`.
         weighting: as in `sid`.
         offset: as in `sid`.
@@ -140,7 +140,7 @@ def asivid(
         StructureError, RankError, DataError: as `sivid`.
 
     Warns:
-        DataWarning: the feedback basis is nearly linear in y.
+        DataWarning: the feedback basis is nearly linear in y; the simulated feedback explains little of the measured.
     """
     one_of("noise", noise, NOISES)
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 0:

@@ -30,6 +30,7 @@ from optid.subspace.methods import (
     signal_rank,
     simulate_clipped,
     tested_order,
+    weakest_feedback,
 )
 from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
 from optid.subspace.realisation import largest_gap, scaled_pair
@@ -39,6 +40,9 @@ NOISES = ("white", "coloured")
 SPLITS = ("exact", "lumped")
 ORDERS = ("auto", "gap")
 STABILITIES = ("auto", "free")
+WEAK = 0.1
+"""Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
+
 INSIDE = 0.999
 """Modulus to which poles outside the unit circle are brought by ``stability="auto"``."""
 
@@ -152,6 +156,13 @@ def identified(plan: Plan) -> Procedure:
     figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
                "instruments": instruments, "singular values": projection.range.values,
                "condition of R11": projection.blocks.condition}
+    if expansion.simulated:
+        share, output = weakest_feedback(projection, expansion)
+        figures["share of the feedback that the simulated one explains"] = share
+        if share < WEAK:
+            warnings.warn(f"the simulated feedback of output {output!r} explains {100 * share:.1f} % of the measured "
+                          "one: its effect will be uncertain. Use noise='white' where the noise allows it, more "
+                          "iterations or a stronger input.", DataWarning, stacklevel=2)
     if projection.blocks.discarded:
         figures["regressor directions left out"] = projection.blocks.discarded
     return (yield from completed(plan, records, expansion, projection.gamma(nx), projection.scale, figures))
@@ -272,11 +283,20 @@ def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.nda
 
 
 def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.ndarray], Expansion]:
-    """Return the records with outputs simulated by a preliminary model, and the expansion that reads them."""
-    raw, model = plan.records, expansion.without_feedback()
-    records, kind = raw, "inputs"
-    for _ in range(plan.iterations):
-        projection = _projected(plan, records, model, alpha, kind)
+    """Return the records with outputs simulated by a preliminary model, and the expansion that reads them.
+
+    Any preliminary model will do: what it simulates depends on the inputs alone. The first one has past outputs as
+    instruments; where the regressors are singular then, it has no feedback.
+    """
+    raw, model, records, kind = plan.records, expansion, plan.records, "inputs+past"
+    for i in range(plan.iterations):
+        try:
+            projection = _projected(plan, records, model, alpha, kind)
+        except RankError:
+            if i:
+                raise
+            model, kind = expansion.without_feedback(), "inputs"
+            projection = _projected(plan, records, model, alpha, kind)
         nx, _ = _order(plan, projection, records, model)
         a, c, _ = scaled_pair(projection.gamma(nx), projection.scale)
         step = _step(plan, records, model, _inside(a), c, projection.scale)

@@ -160,6 +160,18 @@ def test_condition_stays_bounded_only_with_simulated_feedback():
     assert figures[32000][1] > 2 * figures[2000][1]
 
 
+def test_simulated_feedback_that_explains_nothing_is_warned_of():
+    """A limit cycle that noise drives and the input does not hold: its simulated phase is not the measured one."""
+    from optid.plants import van_der_pol
+
+    u = np.random.default_rng(0).uniform(-0.02, 0.02, 3000)
+    data = van_der_pol(u, 0, process=0.2, measurement=0.02, x0=(1.0, 0.0))
+    with pytest.warns(DataWarning, match="explains .* % of the measured one"):
+        fit = optid.fit(data, "hammerstein_ss.asivid", nx=2, block_rows=6, basis="linear",
+                        feedback_basis="polynomial:3")
+    assert fit.figures["share of the feedback that the simulated one explains"] < 0.1
+
+
 def test_innovation_form_predicts_better_than_the_simulation():
     rng = np.random.default_rng(0)
     u, x, y = rng.standard_normal((4000, 1)), np.zeros(2), np.empty((4000, 1))

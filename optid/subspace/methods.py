@@ -189,6 +189,24 @@ def signal_rank(projection: Projection) -> int:
     return int(np.sum(values > 10 * len(projection.statistics.gram) * np.finfo(float).eps * values[0]))
 
 
+def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:
+    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output.
+
+    Args:
+        projection: with simulated feedback functions among its signals.
+        expansion: the signals.
+    """
+    statistics, shares, start = projection.statistics, [], 0
+    simulated = np.concatenate([[0], statistics.at(expansion.zeta_simulated, [0])])
+    for family in expansion.feedback:
+        own = statistics.at(expansion.zeta[start : start + family.size], [0])
+        triangle = statistics.triangle(np.concatenate([simulated, own]))
+        part, whole = triangle[1 : simulated.size, simulated.size :], triangle[1:, simulated.size :]
+        shares.append((float(np.sum(part**2) / np.sum(whole**2)), expansion.output_names[family.output]))
+        start += family.size
+    return min(shares)
+
+
 def simulate_clipped(
     records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array, ez: Array, d: Array
 ) -> list[Array]:
