@@ -21,6 +21,8 @@ from formulations.rule import Rule
 from optid.errors import StructureError
 from optid.program import View
 
+__all__ = ["damped", "disc", "sector", "strip"]
+
 MARGIN = 1e-6  # by how much a region is shrunk, so that a binding constraint leaves the poles inside
 CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping ratio
 

@@ -15,6 +15,8 @@ from formulations.shape import output_index, through_matrices
 from optid.errors import StructureError
 from optid.program import View
 
+__all__ = ["impulse_response", "no_effect", "positive_real", "step_response"]
+
 HORIZON = 50  # samples over which the sign of a response is imposed
 REAL = 1e-9  # least eigenvalue in the inequality of positive realness, relative to the size of C
 
