@@ -74,7 +74,7 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
         return True
     problem = cp.Problem(cp.Minimize(0), found)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate proof of a conflict is one: cones without interior have no other
+        warnings.simplefilter("ignore")  # an inaccurate proof of a conflict is one as well
         problem.solve(solver=cp.CLARABEL)
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
