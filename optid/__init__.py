@@ -37,6 +37,8 @@ _HOME = {
     "fit_by_holdout": "selection",
     "Fit": "fitting",
     "validate": "validation",
+    "compare_models": "validation",
+    "fit_by_horizon": "validation",
     "order": "model_order",
     "OrderStudy": "model_order",
     "load": "io",

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from optid import __version__, plots
 from optid.data import Data
 from optid.errors import DataError, DataWarning
-from optid.showing import estimates, summary, wording
+from optid.showing import comparing, estimates, summary, wording
 from optid.showing.printing import describe
 from optid.showing.svg import inline
 from optid.validation import Validation, validate
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from optid.fitting import Fit
+    from optid.validation.comparison import Comparison
 
 
 def write(fit: "Fit", path: str | Path, test: Data | None = None, *, command: str = "") -> Path:
@@ -51,15 +52,78 @@ def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
     """Return the page that `write` writes."""
     if fit.model is None:
         raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
-    environment = Environment(
+    return _template("report.html.j2").render(_content(fit, test, command))
+
+
+def write_comparison(found: "Comparison", path: str | Path, *, command: str = "") -> Path:
+    """Write several models on one self-contained HTML page.
+
+    Args:
+        found: what `optid.compare_models` returned.
+        path: the file, replaced when it exists.
+        command: the command line behind it.
+
+    Returns:
+        The path.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    path.write_text(_template("comparison.html.j2").render(_compared(found, command)), encoding="utf-8")
+    return path
+
+
+def _template(name: str) -> Any:
+    return Environment(
         loader=PackageLoader("optid"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-    )
-    return environment.get_template("report.html.j2").render(_content(fit, test, command))
+    ).get_template(name)
+
+
+def _versions() -> list[tuple[str, str]]:
+    return [
+        ("optid", __version__),
+        *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
+        ("Python", platform.python_version()),
+        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+    ]
+
+
+def _compared(found: "Comparison", command: str) -> dict[str, Any]:
+    figures = []
+    if any(found.simulated):
+        caption = "Measured and simulated outputs; every simulation starts from the initial state that fits best."
+        figures.append(_figure("simulations", lambda: comparing.simulations(found), caption))
+    caption = "Fit against how many samples ahead is predicted; dotted: the simulation, which knows no output."
+    figures.append(_figure("horizons", lambda: comparing.horizons(found), caption))
+    figures.append(_figure("poles", lambda: comparing.poles(found), "Poles of the linear parts."))
+    several = len(found.names) > 1
+    return {
+        "version": __version__,
+        "title": f"{len(found.names)} models on one record" if several else f"Validation of a {found.models[0].title}",
+        "lead": " · ".join(part for part in (found.data.name, f"{found.data.n_samples} samples") if part),
+        "fits": comparing.comparison_table(found),
+        "facts": comparing.facts_table(found),
+        "figures": figures,
+        "validation": [
+            {
+                "title": name,
+                "equation": [_breakable(line) for line in model.equation().splitlines()],
+                "tables": summary.validation_tables(checked),
+                "notes": checked.notes,
+            }
+            for name, model, checked in zip(found.names, found.models, found.validations)
+        ],
+        "call": command or f"optid.compare_models(models, data, horizon={found.horizon})",
+        "versions": _versions(),
+        "text": str(found),
+        "sections": [("fits", "Fits"), ("figures", "Figures"), ("validation", "Models"), ("reproduce", "Reproduce")],
+    }
 
 
 def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
@@ -93,12 +157,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "channels": summary.channel_table(fit),
         "solver": summary.solver_facts(fit),
         "call": "\n".join(part for part in (command, summary.call(fit)) if part),
-        "versions": [
-            ("optid", __version__),
-            *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
-            ("Python", platform.python_version()),
-            ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-        ],
+        "versions": _versions(),
         "text": describe(fit),
         "sections": [
             (id, name)

@@ -263,8 +263,12 @@ def fit(
 
 @app.command(cls=Command)
 def validate(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A model file written by fit --model.")],
-    data: Annotated[list[Path], typer.Argument(metavar="DATA...", help="Files of the record.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="MODEL... DATA...", help="Model files (.json) written by fit --model, then files of the record."
+        ),
+    ],
     inputs: Inputs = None,
     outputs: Outputs = None,
     dt: Dt = None,
@@ -273,24 +277,31 @@ def validate(
     columns: Columns = None,
     delimiter: Delimiter = ",",
     decimal: Decimal = ".",
+    horizon: Annotated[
+        int, typer.Option("--horizon", metavar="N", rich_help_panel=RESULT, help="Predict so many samples ahead, too.")
+    ] = 1,
+    report: Report = None,
 ) -> None:
-    """Validate a saved model on another record: fit, simulation, residual tests.
+    """Validate saved models on another record: fits, residual tests; several models side by side.
 
-    Inputs, outputs and sampling time are those of the model where they are not given.
+    Inputs, outputs and sampling time are those of the first model where they are not given.
     """
-    from optid.cli.arguments import read_record
+    from optid.cli import arguments as words
     from optid.io import load
     from optid.showing.printing import describe_validation
 
+    words.check_folders(report)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
-        loaded = load(model)
-        record: Any = read_record(
+        paths, data = words.models_and_data(files)
+        models = dict(zip(words.distinct_names(paths), map(load, paths)))
+        first = next(iter(models.values()))
+        record: Any = words.read_record(
             data,
             {
-                "inputs": inputs or list(loaded.inputs),
-                "outputs": outputs or list(loaded.outputs),
-                "dt": loaded.dt if dt is None else dt,
+                "inputs": inputs or list(first.inputs),
+                "outputs": outputs or list(first.outputs),
+                "dt": first.dt if dt is None else dt,
                 "time": time,
                 "experiment": experiment,
                 "columns": columns,
@@ -299,11 +310,24 @@ def validate(
             },
         )
         waiting.step("validating")
-        text = describe_validation(loaded, record)
-    say(f"{loaded}\n\n{text}")
+        found: Any = None
+        if len(models) > 1 or report is not None:
+            from optid.validation import compare_models
+
+            found = compare_models(models, record, horizon)
+        text = str(found) if len(models) > 1 else f"{first}\n\n{describe_validation(first, record, horizon)}"
+        if report is not None:
+            from optid.report import write_comparison
+
+            waiting.step("writing the report")
+            write_comparison(found, report, command=shlex.join(["optid", *sys.argv[1:]]))
+    say(text)
+    said = " ".join(text.split())
     for sentence in heard:
-        if sentence not in text:
+        if " ".join(sentence.split()) not in said:
             note(sentence)
+    if report is not None:
+        say(f"report written to {report}")
 
 
 @app.command(cls=Command)

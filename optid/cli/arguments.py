@@ -59,6 +59,25 @@ def example_record(name: str, seed: int, formulation: str) -> tuple[Data, dict[s
     return chosen.data, arguments
 
 
+def models_and_data(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Tell model files from data files: the first is a model, and so are all others that end in .json.
+
+    Raises:
+        DataError: no data file.
+    """
+    models = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
+    data = [path for path in files if path not in models]
+    if not data:
+        raise DataError(f"give a data file after the model{'s' if len(models) > 1 else ''}")
+    return models, data
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files without folder and ending where these differ, the whole paths where they do not."""
+    names = [path.stem for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
 def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
     """Cut a record in an estimation and a validation part.
 

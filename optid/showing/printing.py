@@ -70,11 +70,11 @@ def describe(fit: "Fit") -> str:
     return "\n".join([*lines, _rule("=")])
 
 
-def describe_validation(model: Any, data: "Data") -> str:
+def describe_validation(model: Any, data: "Data", horizon: int = 1) -> str:
     """Return the validation of a model on a record as text."""
     from optid.validation import validate
 
-    return str(validate(model, data))
+    return str(validate(model, data, horizon=horizon))
 
 
 def describe_checks(checked: "Validation") -> str:

@@ -1,0 +1,191 @@
+"""Several models on one page, prediction horizons, and what validation says of models with feedback."""
+
+import re
+import shutil
+import subprocess
+import warnings
+
+import numpy as np
+import pytest
+from systems import by_hand, inputs, mimo, siso
+from typer.testing import CliRunner
+
+import optid
+from optid import report
+from optid.cli.app import app
+from optid.data import Data
+from optid.errors import DataError, DataWarning, StructureError
+from optid.models import HammersteinARX, Nonlinearity
+from optid.models.hammerstein_ss import HammersteinSS
+from optid.validation import compare_models, fit_by_horizon, fit_percent, validate
+from optid.validation.correlations import between_outputs
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        yield
+
+
+def record(model, count=400, seed=1, noise=0.1):
+    u = inputs(model, count, seed)
+    e = noise * np.random.default_rng(seed + 100).normal(size=(count, model.l))
+    return Data(u, by_hand(model, u, noise=e), dt=model.dt, name="rig")
+
+
+def worse(model: HammersteinARX) -> HammersteinARX:
+    return HammersteinARX(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
+
+
+def feedback_model() -> HammersteinSS:
+    """One input and output, a cubic in the feedback."""
+    g = Nonlinearity(optid.Polynomial(3).fitted(-2, 2), [0.0, 0.0, 0.4])
+    return HammersteinSS([[0.6, 0.2], [-0.1, 0.5]], [[1.0], [0.3]], [[1.0, 0.0]], E=[[-0.3], [0.1]], feedback=(g,))
+
+
+# -- horizons ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_curve_is_the_fit_of_predictions_over_common_samples():
+    model = siso()
+    data = record(model)
+    curve = fit_by_horizon(model, data, [1, 4, 9])
+    last = model.predict(data, 9)
+    for fit, h in zip(curve.fits, (1, 4, 9)):
+        kept = np.where(np.isnan(last), np.nan, model.predict(data, h))
+        assert fit == pytest.approx(fit_percent(data.y, kept))
+    assert np.all(np.diff(curve.fits[:, 0]) < 0) and curve.simulation[0] < curve.fits[0, 0]
+    text = str(curve)
+    assert f"{curve.fits[1, 0]:.2f}" in text and "simulation" in text
+    with pytest.raises(StructureError, match="horizon = 0"):
+        fit_by_horizon(model, data, [0])
+    with pytest.raises(DataError, match="100 samples ahead"):
+        fit_by_horizon(model, data.window(0, 50), [100])
+
+
+def test_a_horizon_is_validated_beside_one_step():
+    model, data = mimo(), record(mimo())
+    found = validate(model, data, horizon=3)
+    assert found.horizon == 3 and set(found.predictors) == {"one step", "3 steps", "simulation"}
+    assert found.ahead["y2"].fit == pytest.approx(fit_percent(data.y, model.predict(data, 3))[1])
+    assert not validate(model, data).ahead
+
+
+def test_every_experiment_is_measured():
+    model = mimo()
+    parts = [record(model, 300, 1), record(model, 200, 2)]
+    found = validate(model, Data.join(*parts))
+    for k, part in enumerate(parts):
+        assert found.experiments["one step"]["y1"][k].fit == pytest.approx(fit_percent(part.y, model.predict(part))[0])
+    assert not validate(model, parts[0]).experiments
+
+
+# -- tests between outputs ---------------------------------------------------------------------------------------------
+
+
+def test_the_residual_of_one_output_that_follows_another_is_found():
+    rng = np.random.default_rng(0)
+    p_values = []
+    for _ in range(120):
+        e, other = rng.normal(size=400), rng.normal(size=400)
+        p_values.append(between_outputs([e + 0.8 * other], [other], "y1", "y2", 10).p_value)
+    assert 0.3 < np.mean(p_values) < 0.7  # correlation at the same instant is no evidence
+    e[3:] += 0.3 * other[:-3]
+    late = between_outputs([e], [other], "y1", "y2", 10)
+    assert not late.passed and late.lags[np.argmax(np.abs(late.values))] == 3
+    z, v = ((x - x.mean()) / x.std() for x in (e, other))
+    assert late.values[2] == pytest.approx(np.mean(z[3:] * v[:-3]))
+
+
+# -- models with feedback ----------------------------------------------------------------------------------------------
+
+
+def test_the_three_simulators_of_a_model_with_feedback():
+    model = feedback_model()
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1, 1, 500)
+    data = Data(u, model.simulate(u) + 0.05 * rng.normal(size=500))
+    found = validate(model, data, horizon=4)
+    assert list(found.predictors) == ["one step", "4 steps", "measured feedback", "simulation"]
+    expected = fit_percent(data.y, model.simulate_measured_feedback(data, x0="fit"))[0]
+    assert found.measured_feedback["y"].fit == pytest.approx(expected)
+    assert found.structure is None and "measured feedback" in str(found)
+    assert max(map(len, str(found).splitlines())) <= 80
+
+
+# -- several models ----------------------------------------------------------------------------------------------------
+
+
+def test_models_are_compared_over_the_samples_that_all_predict():
+    model = siso()
+    data = record(model)
+    short = HammersteinARX([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
+    found = compare_models({"true": model, "poor": worse(model), "late": short}, data, horizon=2)
+    common = np.isnan(short.predict(data))
+    for i, one in enumerate((model, worse(model), short)):
+        kept = np.where(common, np.nan, one.predict(data))
+        assert found.fits["one step"][i] == pytest.approx(fit_percent(data.y, kept))
+    assert found.best() == "true" and found.best("2 steps") == "true" and "Best simulation: true" in str(found)
+    with pytest.raises(StructureError, match="no model has the prediction 'measured feedback'"):
+        found.best("measured feedback")
+    with pytest.raises(StructureError, match="no model"):
+        compare_models({}, data)
+
+
+def test_models_without_names_are_named_by_what_they_are():
+    model, data = siso(), record(siso())
+    names = compare_models([model, worse(model)], data).names
+    assert names == ("Hammerstein ARX model (na 2, nb 2, nk 0) #1", "Hammerstein ARX model (na 2, nb 2, nk 0) #2")
+
+
+def test_a_model_that_runs_away_is_compared_by_what_it_predicts():
+    model, data = siso(), record(siso())
+    unstable = HammersteinARX([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
+    u = np.vstack([data.u] * 5)
+    long = Data(u, np.vstack([data.y] * 5), dt=model.dt)
+    found = compare_models({"true": model, "wild": unstable}, long)
+    assert np.isfinite(found.fits["simulation"][0]).all() and not found.simulated[1]
+    assert np.isfinite(found.fits["one step"]).all()
+
+
+def test_the_page_is_complete_and_makes_no_request(tmp_path):
+    model = mimo()
+    data = record(model)
+    hostile = compare_models({"<b>bold</b>": model, "other & $x$": worse(model)}, data, horizon=5)
+    source = report.write_comparison(hostile, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<b>bold" not in source and "&lt;b&gt;bold" in source
+    assert not re.search(r"url\((?!#)", source) and "http" not in source and "<script" not in source
+    ids = re.findall(r'\bid="([^"]+)"', source)
+    assert len(ids) == len(set(ids)) and source.count("<svg ") == 3
+    assert f"{hostile.fits['5 steps'][0, 1]:.2f} %" in source
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome on PATH")
+def test_a_browser_renders_the_comparison_without_a_complaint(tmp_path):
+    path = report.write_comparison(compare_models([siso(), worse(siso())], record(siso())), tmp_path / "page.html")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom"]
+    options += [f"--user-data-dir={tmp_path}", "--host-resolver-rules=MAP * ~NOTFOUND"]
+    result = subprocess.run(
+        [str(CHROMIUM), *options, path.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "CONSOLE" not in result.stderr and result.stdout.count("<svg ") == 3
+
+
+def test_the_command_line_compares(tmp_path):
+    model, data = siso(), record(siso())
+    csv = tmp_path / "data.csv"
+    np.savetxt(csv, np.hstack([data.u, data.y]), delimiter=",", header="u,y", comments="")
+    paths = [m.save(tmp_path / f"{name}.json") for name, m in (("good", model), ("poor", worse(model)))]
+    words = ["validate", *map(str, paths), str(csv), "--horizon", "5", "--report", str(tmp_path / "page.html")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "Best simulation: good" in result.output and "5 steps" in result.output
+    assert "2 models on one record" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    alone = CliRunner().invoke(app, ["validate", str(paths[0]), str(csv), "--report", str(tmp_path / "one.html")])
+    assert alone.exit_code == 0 and model.equation() in alone.output
+    missing = CliRunner().invoke(app, ["validate", *map(str, paths)])
+    assert missing.exit_code == 2 and "give a data file after the models" in missing.output
