@@ -19,7 +19,8 @@ from optid.model_order import RankTest, order_test
 from optid.plants import NOISE_CASES, TWO_MODES
 from optid.subspace.expansion import expand
 
-CASES = {name: (*noise, 0.0) for name, noise in NOISE_CASES.items()} | {"strong, coloured": (*NOISE_CASES["strong"], 0.9)}
+CASES = {name: (*noise, 0.0) for name, noise in NOISE_CASES.items()}
+CASES["strong, coloured"] = (*NOISE_CASES["strong"], 0.9)
 
 
 def one(case: str, n: int, seed: int, alpha: int = 8) -> RankTest:

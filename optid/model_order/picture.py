@@ -17,7 +17,6 @@ def draw(study: "OrderStudy") -> "Figure":
         study: what `optid.order` returned.
     """
     import matplotlib
-    import matplotlib
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

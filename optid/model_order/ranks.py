@@ -38,7 +38,7 @@ class RankTest:
     """Singular values of R22 and what they would be, were the order n0 = 0, 1, ..., r - 1.
 
     Attributes:
-        singular_values: (r,) of R22 / sqrt(j), in units of the outputs.
+        singular_values: (r,) of R22 / sqrt(j), in units of the output, or without unit where the outputs are scaled.
         statistics: (r,) T(n0), the sum of the squares of those after the first n0.
         expected: (r,) expectation of T(n0) if the order is n0; it falls like 1 / j.
         thresholds: (r,) quantile of T(n0) at the level if the order is n0.
@@ -114,6 +114,7 @@ def rank_test(
     rows: int,
     level: float | None = None,
     largest: int | None = None,
+    scale: Array | None = None,
 ) -> RankTest:
     """Test the ranks of R22.
 
@@ -126,6 +127,7 @@ def rank_test(
         rows: block rows of the instruments, regressors and outputs together.
         level: probability of rejecting the true order; min(0.01, 10 / j) when not given.
         largest: largest order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.
+        scale: (y,) size of every row of Y, by which it is divided: several outputs in different units; None for ones.
 
     Raises:
         StructureError: windows no longer than `rows`, positions beyond them, a level not between 0 and 1.
@@ -152,12 +154,15 @@ def rank_test(
             f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a longer "
             "record, fewer block rows or fewer basis functions."
         )
-    r22, noise, shocks, floor = _projections(statistics, z, phi, y, width)
+    sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
+    if sizes.shape != (y.size,) or not (sizes > 0).all():
+        raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
+    r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
     left, values, right = np.linalg.svd(r22)
     gram_of = _shifted(statistics, width, rows)
-    scale = j / (j - z.size)  # residuals of a regression on the instruments
+    unbiased = j / (j - z.size)  # residuals of a regression on the instruments
     lags = range(reach + 1)
-    covariance_e = [scale * left.T @ (noise.T @ gram_of(lag) @ noise) @ left for lag in lags]
+    covariance_e = [unbiased * left.T @ (noise.T @ gram_of(lag) @ noise) @ left for lag in lags]
     covariance_z = [right @ (shocks.T @ gram_of(lag) @ shocks) @ right.T for lag in lags]
     tails = np.cumsum((values**2)[::-1])[::-1]
     expected, thresholds, p_values = np.zeros((3, values.size))
@@ -182,16 +187,22 @@ def choose_order(
     rows: int,
     level: float | None = None,
     largest: int | None = None,
+    scale: Array | None = None,
 ) -> tuple[int, str]:
     """Return the order of `rank_test`, at least 1, and the reason: the rule behind nx="auto". Arguments as there."""
-    test = rank_test(statistics, instruments, regressors, outputs, rows=rows, level=level, largest=largest)
+    test = rank_test(statistics, instruments, regressors, outputs, rows=rows, level=level, largest=largest, scale=scale)
     if test.order == 0:
         return 1, "1: no singular value is more than noise; the outputs may not depend on the inputs at all"
     return test.order, test.reason
 
 
 def _projections(
-    statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp], width: int
+    statistics: HankelStatistics,
+    z: NDArray[np.intp],
+    phi: NDArray[np.intp],
+    y: NDArray[np.intp],
+    width: int,
+    sizes: Array,
 ) -> tuple[Array, Array, Array, float]:
     """R22, the windows' weights (width, .) that give e_t and orthonormal z_t, and the floor, per window."""
     from scipy.linalg import solve_triangular
@@ -214,8 +225,8 @@ def _projections(
     noise[y, np.arange(y.size)] = 1
     noise[phi] -= gain.T
     noise[z] -= orthonormal @ (r22 @ q2.T).T
-    size = float(np.linalg.norm(triangle[:, order.size - y.size :]))
-    return r22, noise, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
+    size = float(np.linalg.norm(triangle[:, order.size - y.size :] / sizes))
+    return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
 
 
 def _shifted(statistics: HankelStatistics, width: int, rows: int):

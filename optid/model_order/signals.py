@@ -69,8 +69,14 @@ def order_test(
     at, both, future = statistics.at, range(2 * alpha), range(alpha, 2 * alpha)
     z = np.concatenate([[0], at(expansion.eta, both), at(expansion.zeta_simulated, both)])
     phi = np.concatenate([[0], at(expansion.eta, future), at(expansion.zeta, future[:-1])])
-    return rank_test(statistics, z, phi, at(expansion.y, future), rows=2 * alpha, level=level,
-                     largest=(alpha - 1) * expansion.l)
+    y = at(expansion.y, future)
+    spread = None
+    if expansion.l > 1:  # outputs in different units count alike
+        energy = np.diag(statistics.gram)[y] / statistics.windows - (statistics.gram[0, y] / statistics.windows) ** 2
+        each = np.sqrt(np.maximum(energy.reshape(alpha, expansion.l).mean(axis=0), 1e-300))
+        spread = np.tile(each, alpha)
+    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l,
+                     scale=spread)
 
 
 def with_simulated_outputs(
