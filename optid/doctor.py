@@ -10,7 +10,7 @@ import numpy as np
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import DataError, DataWarning
-from optid.experiment.rules import Check, check_condition, check_levels, check_lines
+from optid.experiment.rules import Check, check_condition, check_instruments, check_levels, check_lines
 
 OUTLIER = 10.0  # robust standard deviations
 LEAST_KEPT = 0.5
@@ -146,4 +146,16 @@ def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:
         warnings.warn(sentence, DataWarning, stacklevel=4)
     if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
         found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
+    return found
+
+
+def examine_instruments(condition: float) -> list[str]:
+    """Say how well the instruments of a subspace method reach its regressors.
+
+    Args:
+        condition: condition number of R11, the regressors projected on the instruments.
+    """
+    found = _told(check_instruments(condition))
+    for sentence in found:
+        warnings.warn(sentence, DataWarning, stacklevel=4)
     return found

@@ -6,7 +6,7 @@ from problems import BASIS
 
 import optid
 from optid import plants, signals
-from optid.doctor import examine
+from optid.doctor import examine, examine_instruments
 from optid.errors import DataError, DataWarning
 from optid.experiment.lines import longest_run, many_lines, remaining_shares
 from optid.experiment.rules import check_condition, check_instruments, check_levels, check_lines
@@ -118,4 +118,22 @@ def test_fit_names_a_single_sinusoid():
         optid.fit(data, na=1, nb=5, basis="polynomial:4")
     with pytest.warns(DataWarning, match="single sinusoid"):  # who sets a tolerance asks for a singular regressor
         examine(data, [QUARTIC], {"block_rows": None, "tolerance": 1e-6})
+    with pytest.raises(DataError, match="'u' is a single sinusoid.*30 are to be determined.*10 lags of 3"):
+        optid.fit(data, "hammerstein_ss.asivid", nx=2)  # block rows and basis by default
     assert examine(data, [QUARTIC], {"nb": [2]}) == [] == examine(data, [QUARTIC], {"nb": []})
+
+
+def test_instruments_that_hardly_reach_are_told():
+    assert examine_instruments(1e5) == []
+    with pytest.warns(DataWarning, match="instruments hardly reach the regressors: cond.R11. = 1.0e\\+09"):
+        assert len(examine_instruments(1e9)) == 1
+
+
+def test_a_fit_by_subspace_is_held_to_the_condition_of_its_instruments():
+    """A chirp that is so slow that ten of its samples are too much alike."""
+    u = signals.chirp(4000, f0=0.001, f1=0.07)
+    data = plants.van_der_pol(2 * u, process=0.005, measurement=0.02)
+    with pytest.warns(DataWarning, match="cond.R11."):
+        fit = optid.fit(data, "hammerstein_ss.asivid", nx=2, basis="polynomial:3", feedback_basis="polynomial:3",
+                        block_rows=10, noise="white", iterations=0, prove=False)
+    assert any("cond(R11)" in sentence for sentence in fit.findings)
