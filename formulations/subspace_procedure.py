@@ -10,11 +10,12 @@ import numpy as np
 from formulations.equation_error import model_meta
 from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
+from formulations.simulation_bound import simulation_bound
 from formulations.stability import stable
-from optid.bases import fitted_bases, parse
-from optid.bases.basis import Basis
+from optid.bases import fitted_bases
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.experiment.expansion import feedback_bases
 from optid.models import Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.solution import Bound, Solution, Status
@@ -104,26 +105,6 @@ class Plan:
             raise StructureError(f"feedthrough={self.feedthrough!r}: True or False, or one of them per input "
                                  f"({', '.join(self.data.inputs)}).")
         return tuple(bool(one) for one in given)
-
-
-def feedback_bases(data: Data, given: Any) -> list[Basis | None]:
-    """Return one basis with an interval, or None, per output."""
-    several = list(given) if isinstance(given, list | tuple) else [given] * data.l
-    if len(several) != data.l:
-        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
-                             "one each, None for an output that is not fed back.")
-    found: list[Basis | None] = []
-    for o, one in enumerate(several):
-        if one is None or one == "none":
-            found.append(None)
-            continue
-        family: Any = parse(one) if isinstance(one, str) else one
-        if not hasattr(family, "fitted"):
-            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
-                                 "Polynomial(4) or its name, 'polynomial:4'")
-        y = np.concatenate([e.y[:, o] for e in data.experiments])
-        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
-    return found
 
 
 def prepared(plan: Plan) -> tuple[Expansion, int]:
@@ -216,7 +197,8 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     if remark:
         figures["noise model"] = remark
     status, reason = (Status.INACCURATE, doubt) if doubt else (_status(solution), solution.reason)
-    return Evidence(model, solution.objective, _bound(solution), status, reason, figures)
+    bound = simulation_bound(plan.records, step, solution.objective, len(gamma) // data.l, _said(solution))
+    return Evidence(model, solution.objective, bound, status, reason, figures)
 
 
 def preliminary(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma: np.ndarray, scale: np.ndarray
@@ -279,7 +261,9 @@ def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.nda
     closed = plan.observer == "kalman" or (plan.observer == "auto" and unstable)
     gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
     form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / scale)
-    return observer_problem(records, form, instruments=expansion.simulated)
+    # where past outputs may be instruments, the noise is white and least squares has the smaller variance
+    coloured = expansion.simulated and not plan.instruments.endswith("past")
+    return observer_problem(records, form, instruments=coloured)
 
 
 def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.ndarray], Expansion]:
@@ -347,11 +331,9 @@ def _ratios(step: ObserverProblem) -> dict[str, float]:
     return found
 
 
-def _bound(solution: Solution) -> Bound:
+def _said(solution: Solution) -> str:
     said = "the (A, C) step minimises no criterion of the whole model"
-    if solution.proof:
-        said += "; for this (A, C) the coefficients are proved optimal"
-    return Bound(-np.inf, False, "none", said)
+    return said + "; for this (A, C) the coefficients are proved optimal" if solution.proof else said
 
 
 def _status(solution: Solution) -> Status:
