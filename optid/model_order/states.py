@@ -1,8 +1,11 @@
 """Criteria for the number of states: prediction errors of every order from one matrix of moments.
 
 The state of order n is the best n combinations of past inputs and outputs for predicting the future (canonical
-variates); its one-step prediction errors are a quadratic form of the same moments, on the record itself and on a part
-held out. Source: Larimore 1990 (canonical variate analysis with AIC); small-sample correction: Hurvich and Tsai 1989.
+variates). Its errors when it predicts 1, ..., alpha samples ahead are a quadratic form of the same moments, on the
+record itself and on a part held out. One step ahead would not do: one combination of the past, the predictor itself,
+predicts one sample of one output as well as the whole state does.
+Windows that do not overlap are independent given their states, so that N / alpha times the log determinant of the
+errors of a window is the likelihood. Source: Larimore 1990; small-sample correction: Hurvich and Tsai 1989.
 """
 
 from dataclasses import dataclass
@@ -23,8 +26,9 @@ class StateCriteria:
 
     Attributes:
         aic, aicc, bic: (k,) Akaike's criterion, with its small-sample correction, and Schwarz's.
-        fit: (k,) one-step fit in % on the part held out, mean over the outputs; NaN where nothing was.
-        windows: number of prediction errors per output.
+        fit: (k,) fit in % on the part held out, mean over the outputs and over 1, ..., alpha samples ahead; NaN where
+            nothing was.
+        windows: number of prediction errors per output and horizon.
     """
 
     aic: Array
@@ -63,12 +67,12 @@ def state_criteria(
     covariances, j = _errors(statistics, statistics, expansion, alpha, largest), statistics.windows
     n = np.arange(largest + 1, dtype=float)
     k = n * (2 * l + expansion.p + expansion.q) + l * (expansion.p + 1)
-    likelihood = j * np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
+    likelihood = j / alpha * np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
     aic = likelihood + 2 * k
     spare = np.maximum(j * l - k - 1, 1)
     fit = np.full(n.size, np.nan)
     if train is not None and test is not None:
-        y = test.at(expansion.y, [alpha])
+        y = test.at(expansion.y, range(alpha, 2 * alpha))
         spread = np.diag(test.gram)[y] / test.windows - (test.gram[0, y] / test.windows) ** 2
         errors = np.array([np.diag(covariance) for covariance in _errors(train, test, expansion, alpha, largest)])
         fit = 100 * np.mean(1 - np.sqrt(np.maximum(errors, 0) / np.maximum(spread, 1e-300)), axis=1)
@@ -78,15 +82,16 @@ def state_criteria(
 def _errors(
     fitted: HankelStatistics, judged: HankelStatistics, expansion: Expansion, alpha: int, largest: int
 ) -> list[Array]:
-    """Covariances (l, l) of the one-step prediction errors on `judged` of the states and predictors of `fitted`."""
+    """Covariances (alpha l, alpha l) of the errors in the future of `judged` of states and predictors of `fitted`."""
     from scipy.linalg import cholesky, solve_triangular
 
     at = fitted.at
     signals = [*expansion.eta, *expansion.zeta]
     past = np.concatenate([at([*signals, *expansion.y], [i]) for i in range(alpha)])
-    drive = np.concatenate([[0], at(signals, range(alpha, 2 * alpha))])
-    future, now = at(expansion.y, range(alpha, 2 * alpha)), np.concatenate([[0], at(expansion.eta, [alpha])])
-    target = at(expansion.y, [alpha])
+    drive = np.concatenate(
+        [[0], at(expansion.eta, range(alpha, 2 * alpha)), at(expansion.zeta, range(alpha, 2 * alpha - 1))]
+    )
+    future = at(expansion.y, range(alpha, 2 * alpha))
     order = np.concatenate([drive, past, future])
     gram = fitted.gram[np.ix_(order, order)] / fitted.windows
     gram[np.diag_indices_from(gram)] *= 1 + ROUNDING
@@ -100,14 +105,14 @@ def _errors(
     found = []
     ours, theirs = fitted.gram / fitted.windows, judged.gram / judged.windows
     for n in range(largest + 1):
-        regressors = np.zeros((len(ours), now.size + n))
-        regressors[now, np.arange(now.size)] = 1
-        regressors[:, now.size :] = states[:, :n]
+        regressors = np.zeros((len(ours), drive.size + n))
+        regressors[drive, np.arange(drive.size)] = 1
+        regressors[:, drive.size :] = states[:, :n]
         inner = regressors.T @ ours @ regressors
         inner[np.diag_indices_from(inner)] *= 1 + ROUNDING
-        error = -regressors @ np.linalg.solve(inner, regressors.T @ ours[:, target])
-        error[target, np.arange(target.size)] += 1
+        error = -regressors @ np.linalg.solve(inner, regressors.T @ ours[:, future])
+        error[future, np.arange(future.size)] += 1
         covariance = error.T @ theirs @ error
-        covariance[np.diag_indices_from(covariance)] += ROUNDING * np.diag(theirs)[target]
+        covariance[np.diag_indices_from(covariance)] += ROUNDING * np.diag(theirs)[future]
         found.append(covariance)
     return found

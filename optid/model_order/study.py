@@ -34,7 +34,7 @@ class OrderStudy:
         data: name of the record.
         block_rows: future block rows.
         ranks: test of the singular values.
-        states: criteria by number of states, on one-step prediction errors.
+        states: criteria by number of states, on prediction errors.
         lags: scan of na, nb, nk, or None when `notes` says why.
         nx: recommended number of states.
         na, nb, nk: recommended lags, nb and nk by input; None without a scan.
