@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
+import optid
 from optid.certificate.hankel import CRITERIA, attach, hankel_bounds
 from optid.errors import RankError, StructureError
 from optid.solution import Bound, Status
@@ -176,3 +177,26 @@ def test_exact_data_are_bounded_by_nothing():
 def test_bad_arguments(call, error, words):
     with pytest.raises(error, match=words):
         call(np.random.default_rng(0).normal(size=(100, 2)))
+
+
+def state_space_record(count=400, noise=0.2):
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-1, 1, (count, 1))
+    y = simulate(*random_model(rng, 3, 1, 1), u, np.ones(3), np.zeros(3), np.array([1.5]))
+    return optid.Data(u=u, y=y + noise * rng.normal(size=y.shape), dt=1.0)
+
+
+@pytest.mark.parametrize("nx", [1, 2, 3])
+def test_every_subspace_fit_by_simulation_carries_its_bound(nx):
+    fit = optid.fit(state_space_record(), "hammerstein_ss.sid", nx=nx, block_rows=6, observer="none")
+    bound = fit.solution.bound
+    assert bound.method.startswith("Hankel") and 0 < bound.value <= fit.solution.objective and not bound.proved
+    simulated = fit.model.simulate(fit.data, x0="fit")
+    error = np.sum((fit.data.experiments[0].y - simulated) ** 2)
+    assert bound.value <= error
+    assert error == pytest.approx(fit.solution.objective, rel=1e-6)  # what it bounds is the simulation error
+
+
+def test_a_fit_in_innovation_form_carries_none():
+    fit = optid.fit(state_space_record(), "hammerstein_ss.sid", nx=2, block_rows=6, observer="kalman")
+    assert fit.solution.bound.value == -np.inf and "no simulation error" in fit.solution.bound.reason

@@ -1,0 +1,45 @@
+"""The Hankel bound on the objective of a subspace fit, where that objective is a simulation error."""
+
+import numpy as np
+
+from optid.certificate.hankel import hankel_bounds
+from optid.errors import OptidError
+from optid.solution import Bound
+from optid.subspace.observer import ObserverProblem
+
+WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
+
+
+def simulation_bound(records: list[np.ndarray], step: ObserverProblem, error: float, block_rows: int, said: str
+                     ) -> Bound:
+    """Return the bound that holds for every model of the order with these functions, or none with the reason.
+
+    The objective of the step in B, D, E and x0 is the squared error of the simulator with measured feedback where no
+    observer gain corrects the state and no instruments stand for the feedback; for anything else the bound does not
+    hold and is not given.
+
+    Args:
+        records: raw channels [u | y] per experiment.
+        step: the step the objective belongs to.
+        error: its value.
+        block_rows: of the fit; the bound is the best of one, two and four times as many.
+        said: what else there is to say about optimality.
+    """
+    form = step.form
+    if np.any(form.gain) or step.instrumented:
+        return Bound(-np.inf, False, "none", f"{said}; its objective is no simulation error, which the Hankel bound is "
+                                             "about")
+    x = form.expansion.with_simulated(False)
+    count, signals = sum(len(record) for record in records), x.p + x.q + x.l
+    longest = max(len(record) for record in records)
+    tried = [a for a in (block_rows, 2 * block_rows, 4 * block_rows)
+             if a > 1 and 2 * a * signals < longest and count * (a * signals) ** 2 <= WORK]
+    if not tried:
+        return Bound(-np.inf, False, "none", said)
+    try:
+        bounds = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=form.n,
+                               block_rows=tried, weights=form.weights)
+        found = bounds.bound(form.n, error, "measured feedback")
+    except OptidError as reason:
+        return Bound(-np.inf, False, "none", f"{said}; no Hankel bound: {reason}")
+    return Bound(found.value, False, found.method, f"{said}; {found.reason}", multipliers=bounds)
