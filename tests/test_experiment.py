@@ -206,7 +206,19 @@ def test_the_share_that_is_not_linear_is_that_of_the_record():
     assert feedback_bases(small, "none") == [None, None]
 
 
+def test_a_record_with_gaps_and_two_experiments_serves_as_well():
+    parts = [linear_record(3000, seed=s) for s in (1, 2)]
+    y = [p.y.copy() for p in parts]
+    y[0][50:60], y[1][700] = np.nan, np.nan
+    found = design(optid.Data([p.u for p in parts], y, dt=0.1), n=1000, feedback_basis="polynomial:3")
+    whole = design(optid.Data([p.u for p in parts], [p.y for p in parts], dt=0.1), n=1000, band=found.promise.band,
+                   feedback_basis="polynomial:3")
+    assert found.promise.condition == pytest.approx(whole.promise.condition, rel=0.3)
+    assert found.promise.outputs[0] == pytest.approx(whole.promise.outputs[0], rel=0.1)
+
+
 @pytest.mark.parametrize("call, error, words", [
+    (lambda: design(optid.Data(np.ones(4000), PENDULUM.y)), DataError, "cannot be told apart"),
     (lambda: design(PENDULUM, "prbs"), StructureError, "'prbs' is refused: two levels"),
     (lambda: design(PENDULUM, "sinusoid"), StructureError, "'sinusoid' is refused: .*2 p \\+ 1"),
     (lambda: design(PENDULUM, "multisin"), StructureError, "Did you mean 'multisine'"),
