@@ -6,11 +6,13 @@
 
 with the noise-free output x and the values w of the nonlinearities at every sample as variables: multiple shooting with
 one sample between the nodes (Bock 1981), so that the past of x is the state. A row of the constraints has at most
-na + m nb + 2 unknowns in products of no more than two, and is no steeper for a pole near or outside the unit circle
-than for any other. The first n outputs of an experiment, whose lags reach before it, are free: they are its initial
-state. The optima are those of ``hammerstein_oe.exact``; the ways there differ. Named variables: ``a``, ``b``, ``mu``,
-``offset``, ``x`` (with several experiments ``x[1]``, ``x[2]``, ...), and the expression ``Theta = mu bᵀ``; constraints,
-on x too, need not be convex. With several inputs the per-channel names carry the input, as in ``mu[valve]``.
+na + m nb + 2 unknowns in products of no more than two. The poles are kept inside the unit circle exactly: A is built up
+from reflection coefficients between -1 and 1, ``A_m(q) = A_(m-1)(q) + kappa_m q^-m A_(m-1)(q^-1)`` (Levinson 1947);
+without that x could satisfy the equations backwards in time. The first n outputs of an experiment, whose lags reach
+before it, are free: they are its initial state. The optima are those of ``hammerstein_oe.exact``; the ways there
+differ. Named variables: ``a``, ``b``, ``mu``, ``offset``, ``x`` (with several experiments ``x[1]``, ``x[2]``, ...),
+and the expression ``Theta = mu bᵀ``; constraints, on x too, need not be convex. With several inputs the per-channel
+names carry the input, as in ``mu[valve]``.
 
 Work and memory grow with the samples, not with the parameters: it is the way for constraints on states and for
 difficult starts. IPOPT uses the sparsity, and takes records up to the limit in seconds; Uno and fatrop factorise
@@ -27,7 +29,7 @@ from formulations.equation_error import model_meta
 from formulations.hammerstein_arx import GAUGES
 from formulations.hammerstein_oe import OutputError, check_excited, check_rows, checked_record, plant_layout
 from formulations.noise_models import one_output
-from formulations.output_error_starts import blank, equation_error, stable_poles, with_poles
+from formulations.output_error_starts import blank, equation_error, iterated, stable_poles, with_poles
 from optid.bases import fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
@@ -39,6 +41,9 @@ from optid.regressors.sensitivities import Unknowns, simulate
 from optid.solution import Bound
 
 Array = np.ndarray
+
+REFLECTION = 1 - 1e-7
+"""Largest modulus of a reflection coefficient."""
 
 LIMIT = 20_000
 """Samples up to which the programme is posed: beyond, factorisations and CVXPY's own work take minutes."""
@@ -114,6 +119,8 @@ class _Shooting:
             derived |= own
             expressions[f"x{label}"] = self.variables[f"x{label}"]
             residuals.append(self.variables[f"residual{label}"])
+        if layout.na:
+            structural["stability"] = self._stable()
         structural["gauge"] = tuple(self._gauge(c) for c in range(layout.m))
         start = self._start()
         reference = {name: start[name] for name in ("a", "offset") if name in start}
@@ -154,6 +161,23 @@ class _Shooting:
         constraints[f"residual{label}"] = (r == derived[f"residual{label}"],)
         return constraints, derived
 
+    def _stable(self) -> tuple[Any, ...]:
+        """Return the constraints that build A up from reflection coefficients between -1 and 1."""
+        a, na = self.variables["a"], self.layout.na
+        kappa = self.variables["kappa"] = cp.Variable(na, name="kappa")
+        constraints: list[Any] = [kappa <= REFLECTION, kappa >= -REFLECTION]
+        below = None
+        for m in range(1, na + 1):
+            name = f"a of order {m}"
+            level = a if m == na else cp.Variable(m, name=name)
+            if m < na:
+                self.variables[name] = level
+            constraints.append(level[m - 1] == kappa[m - 1])
+            if below is not None:
+                constraints += [level[i] == below[i] + kappa[m - 1] * below[m - 2 - i] for i in range(m - 1)]
+            below = level
+        return tuple(constraints)
+
     def _gauge(self, c: int) -> Any:
         b, gauge = self.variables[self.key("b", c)], self.criterion.gauge
         if gauge == "norm":
@@ -163,13 +187,14 @@ class _Shooting:
         return cp.sum(b) == 1 + (cp.sum(self.variables["a"]) if "a" in self.variables else 0)
 
     def _start(self) -> dict[str, Array]:
-        """The equation error's estimate with stable poles, and its simulation."""
+        """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
         criterion, unknowns = self.criterion, self.criterion.unknowns
         first = equation_error(self.data, unknowns)
-        first = blank(self.data, unknowns) if first is None else first
-        a = stable_poles(first[unknowns.slices["a"]])
-        point = unknowns.unpack(criterion.normalised(
-            with_poles(criterion, unknowns, criterion.normalised(first), a, "ARX").x))
+        first = criterion.normalised(blank(self.data, unknowns) if first is None else first)
+        found = [with_poles(criterion, unknowns, first, stable_poles(first[unknowns.slices["a"]]), "ARX")]
+        others = [iterated(criterion, self.data, unknowns, found[0].x, method) for method in ("sm", "iv")]
+        best = min([*found, *(one for one in others if one is not None)], key=lambda one: one.value)
+        point = unknowns.unpack(criterion.normalised(best.x))
         start = {"a": point.a, "offset": np.array([point.offset])}
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
             sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
@@ -181,6 +206,11 @@ class _Shooting:
             start[f"residual{label}"] = x[there] - e.y[there, 0]
             for c, table in enumerate(tables):
                 start[f"{self.key('w', c)}{label}"] = table @ start[self.key("mu", c)]
+        level = point.a
+        start["kappa"] = np.zeros(self.layout.na)
+        for m in range(self.layout.na, 0, -1):  # the recursion backwards
+            start[f"a of order {m}"], start["kappa"][m - 1] = level, level[-1]
+            level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
         return {name: start[name] for name in self.variables}
 
     def recover(self, values: Values) -> HammersteinTF:

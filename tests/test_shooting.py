@@ -109,6 +109,38 @@ def test_units():
     assert scaled.model.theta() == pytest.approx(fit.model.theta(), rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_small_and_large_units(factor):
+    data = plain()
+    fit = optid.fit(Data(data.u, factor * data.y), shooting.exact, solver="ipopt", **ORDERS)
+    reference = optid.fit(data, "hammerstein_oe.exact", **ORDERS)
+    assert fit.solution.objective == pytest.approx(factor**2 * reference.solution.objective, rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "channels", "orders"), [
+    ("lab_hydraulic_actuator", ("u_valve", "y_pressure"), {"na": 3, "nb": 2, "basis": "triangular:6"}),
+    ("daisy_robotarm", ("u", "y"), {"na": 4, "nb": 4, "basis": "linear"}),
+    ("nlid_reflex", ("u", "y"), {"na": 2, "nb": 3, "basis": "triangular:6"}),
+])
+def test_measured_records(real_data, name, channels, orders):
+    """Plants with poles near the unit circle, of which the equations alone would allow some outside."""
+    data = optid.read(real_data / f"{name}.csv", inputs=channels[:1], outputs=channels[1:], dt=1.0).window(0, 800)
+    ours = quiet(data, shooting.exact, nk=1, solver="ipopt", **orders)
+    theirs = quiet(data, "hammerstein_oe.exact", nk=1, **orders)
+    assert ours.model.is_stable and ours.solution.status is Status.LOCAL
+    assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
+
+
+def test_poles_on_the_edge_are_held():
+    """A record that grows is best explained by a pole outside; the programme stops on the circle."""
+    u = np.random.default_rng(0).uniform(-1, 1, 80)
+    y = np.zeros(80)
+    for k in range(1, 80):
+        y[k] = 1.03 * y[k - 1] + u[k - 1]
+    fit = quiet(Data(u, y), shooting.exact, na=1, nb=1, nk=1, basis="linear", solver="ipopt", raises=False)
+    assert fit.model.a[0] == pytest.approx(-1.0, abs=1e-5) and fit.model.is_stable
+
+
 def test_refusals():
     data = plain((200,))
     with pytest.raises(StructureError, match="30000 samples.*up to 20000.*hammerstein_oe.exact"):

@@ -303,7 +303,10 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
         The solver's claim with values and multipliers in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
     form = smooth(program.problem)
-    solver = _compiled(name, form, options(name, settings))
+    chosen = options(name, settings)
+    if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
+        chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
+    solver = _compiled(name, form, chosen)
     lower, upper = form.bounds
     row_lower, row_upper = form.row_bounds
     found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
