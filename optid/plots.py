@@ -6,6 +6,7 @@ Long records are thinned to the extremes of every bin, so that figures stay smal
 import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, ParamSpec, cast
 
 import matplotlib
@@ -167,7 +168,7 @@ def certificate(fit: "Fit") -> Figure:
     threshold = max(THRESHOLD, 1.01 * gap) if fit.solution.proof else THRESHOLD
     panels.draw_gap(axes[-1], gap, threshold)
     reason = bound.reason if bound is not None and bound.reason else "no bound"
-    axes[0].set_title((reason[0].upper() + reason[1:]).replace("$", r"\$"))
+    axes[0].set_title("\n".join(wrap(reason[0].upper() + reason[1:], 95)).replace("$", r"\$"))
     return figure
 
 

@@ -194,6 +194,38 @@ def test_a_solver_is_chosen_by_one_word():
     assert result.exit_code == 0 and "scs" in result.output
 
 
+# -- options of the formulation ----------------------------------------------------------------------------------------
+
+
+def test_a_formulation_brings_its_options_along(csv, tmp_path):
+    words = ["--inputs", "u1", "u2", "--outputs", "y1", "--formulation", "hammerstein_ss.sid", "--nx", "1",
+             "--block-rows", "6", "--basis", "polynomial:3", "--feedthrough", "true", "true",
+             "--no-offset"]  # fmt: skip
+    result = run("fit", csv, *words, "--model", tmp_path / "m.json")
+    assert result.exit_code == 0, result.output
+    data = optid.read(csv, inputs=["u1", "u2"], outputs=["y1"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)
+        expected = optid.fit(data, "hammerstein_ss.sid", nx=1, block_rows=6, basis="polynomial:3",
+                             feedthrough=[True, True], offset=False)  # fmt: skip
+    assert optid.load(tmp_path / "m.json").to_dict() == expected.model.to_dict()
+    assert "Block rows: 6" in result.output
+
+
+def test_help_lists_the_options_of_the_formulation_named():
+    text = run("fit", "-f", "hammerstein_ss.asivid", "--help").output
+    for option in ("--nx", "--block-rows", "--feedback-basis", "--no-offset", "Arguments of hammerstein_ss.asivid"):
+        assert option in text
+    assert "--nx" not in run("fit", "--help").output and "--nx" not in run("fit", "-f", "arx", "--help").output
+
+
+def test_an_option_that_the_formulation_does_not_take_is_explained(csv):
+    text = " ".join(run("fit", csv, "-f", "arx", "--nx", 3).output.replace("\u2502", " ").split())
+    assert "formulation arx takes no --nx; its own options are --na --nb --nk" in text
+    assert "Formulations that do:" in text and "hammerstein_ss.sid" in text
+    assert "no formulation is called 'arrx'" in " ".join(run("fit", csv, "-f", "arrx", "--nx", 3).output.split())
+
+
 # -- validate and listings ---------------------------------------------------------------------------------------------
 
 

@@ -110,7 +110,8 @@ def poles(found: "Comparison") -> Figure:
         panels.draw_poles(ax, np.zeros(0))
         marks = "x+o^sd"
         for i, (label, model, (colour, _)) in enumerate(zip(found.names, found.models, LINES * len(found.names))):
-            text, values = label.replace("$", r"\$"), np.asarray(model.poles)
+            text = label.replace("$", r"\$")
+            values: Any = np.asarray(model.poles)
             hollow: dict[str, Any] = {"markerfacecolor": "none", "linestyle": ""}
             ax.plot(values.real, values.imag, marks[i % len(marks)], color=colour, label=text, **hollow)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower left", ncols=1)

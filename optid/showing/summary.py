@@ -226,13 +226,14 @@ def model_facts(fit: "Fit") -> Facts:
 def _gauge(model: Any) -> str:
     """Say how the scale between f and the linear part is fixed; "" where the word says nothing."""
     positive = all(b.flat[0] >= 0 for b in getattr(model, "b", ()))
-    return {
-        "norm": "norm of b is one, "
-        + ("its first coefficient positive" if positive else "its sign follows from the constraints"),
+    sign = "its first coefficient positive" if positive else "its sign follows from the constraints"
+    known = {
+        "norm": f"norm of b is one, {sign}",
         "gain": "static gain of the linear part is one",
         "b0": "first coefficient of b is one",
         "none": "",
-    }.get(model.gauge, model.gauge)
+    }
+    return known.get(model.gauge, str(model.gauge))
 
 
 def noise_table(fit: "Fit") -> Table | None:
