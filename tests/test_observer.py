@@ -76,7 +76,7 @@ def test_step_is_least_squares_on_the_recursion(gain, feedback, offset):
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C) if gain else np.zeros((2, 2)), expansion, 2, (True, False), offset,
                         np.array([1.0, 3.0]))
-    step = observer_problem(records, form, chunk=17)
+    step = observer_problem(records, form, chunk=20)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])

@@ -24,6 +24,9 @@ from optid.subspace.expansion import Expansion
 CHUNK = 4096
 """Samples whose regressors are formed at once."""
 
+HELD = 1 << 22
+"""Numbers held at once at most: models with many functions and states take shorter chunks."""
+
 INSTRUMENTED = 2.0
 """Instruments at least, per unknown, that a two-stage least-squares step needs rows for."""
 
@@ -221,8 +224,8 @@ class _Regressors:
     """Rows of the regression for one run: [x0 | d | D | B | E simulated | E] and the target."""
 
     def __init__(self, form: ObserverForm, instruments: bool, chunk: int) -> None:
-        self.form, self.chunk = form, chunk
-        x = form.expansion
+        self.form, x = form, form.expansion
+        self.chunk = min(chunk, max(64, HELD // (form.l * form.n * (x.p + 2 * x.q + form.l + 1))))
         self.injected = bool(np.any(form.gain))
         self.y = slice(x.m, x.m + x.l)
         self.feeds = form.n * x.q
