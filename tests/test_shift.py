@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import optid
 from formulations.pole_regions import damped, disc, sector, strip
 from formulations.shift import constrained_shift
 from formulations.stability import stable
 from optid.backends import Answer, find
-from optid.errors import StructureError
+from optid.errors import DataWarning, InfeasibleError, StructureError
 from optid.infeasibility import explain
 from optid.solution import Status
 from optid.solving import Evidence, run
@@ -175,3 +176,45 @@ def test_a_back_end_without_an_answer_is_reported():
 def test_bad_matrices(up, down, words):
     with pytest.raises(StructureError, match=words):
         solved(up, down, [strip(2.0, 3.0)])
+
+
+def slow_record():
+    rng = np.random.default_rng(2)
+    u, x, y = rng.normal(size=(300, 1)), np.zeros(2), np.zeros((300, 1))
+    for k in range(300):
+        y[k] = x[0] + 0.05 * rng.normal()
+        x = np.array([[0.9, 0.3], [-0.3, 0.9]]) @ x + u[k]
+    return optid.Data(u=u, y=y, dt=1.0)
+
+
+@pytest.mark.parametrize("word, inside", [
+    ("stable:0.8", lambda z: abs(z) <= 0.8 + 1e-5), ("disc:0.4,0.5", lambda z: abs(z - 0.4) <= 0.5 + 1e-5),
+    ("strip:high=0.7", lambda z: z.real <= 0.7 + 1e-5), ("sector:0.2", lambda z: abs(np.angle(z)) <= 0.2 + 1e-4),
+    ("damped:0.6", lambda z: abs(z) <= np.exp(-0.75 * abs(np.angle(z))) + 1e-5),
+])
+def test_every_region_holds_in_a_fit(word, inside):
+    fit = optid.fit(slow_record(), "hammerstein_ss.sid", nx=2, block_rows=8, constraints=[word])
+    assert all(inside(z) for z in fit.model.poles)
+    assert fit.figures["suboptimality of A under the pole constraints"] > 0
+    assert [price.name for price in fit.prices] == [fit.arguments["constraints"][0].name]
+
+
+def test_a_fit_says_so_where_the_semidefinite_programme_was_inaccurate():
+    def sloppy(program, settings):
+        answer = find("clarabel").run(program, settings)
+        if not program.name.startswith("shift"):
+            return answer
+        values = {name: value * (1.0005 if name in ("Q", "A") else 1.0) for name, value in answer.values.items()}
+        return Answer(answer.status, answer.word, values, answer.duals)
+
+    with pytest.warns(DataWarning) as caught:
+        fit = optid.fit(slow_record(), "hammerstein_ss.sid", nx=2, block_rows=8, constraints=["stable:0.8"],
+                        solver=sloppy)
+    assert fit.solution.status is Status.INACCURATE
+    assert any("inaccurate" in str(w.message) for w in caught)
+
+
+def test_a_fit_names_regions_that_exclude_each_other():
+    with pytest.raises(InfeasibleError, match="contradict each other"):
+        optid.fit(slow_record(), "hammerstein_ss.sid", nx=2, block_rows=8,
+                  constraints=["strip:0.5,0.9", "disc:0.0,0.3"])
