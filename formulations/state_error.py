@@ -46,9 +46,13 @@ class StateError:
     limit: float = STABLE
     checks: tuple[Callable[[Any], str], ...] = ()
 
-    @cached_property
+    @property
     def energy(self) -> float:
         """Weighted sum of squares of the outputs about their means."""
+        return self._energy
+
+    @cached_property
+    def _energy(self) -> float:
         y = np.vstack([e.y for e in self.data.experiments])
         y = np.nan_to_num(y - np.nanmean(y, axis=0))
         return float(np.sum((y @ self.weight) * y))
@@ -151,7 +155,8 @@ class StateError:
             raise StructureError("a start has other basis functions than the fit: give it the same bases")
         mus = [np.ones(1) if not free else f.mu for f, free in zip(model.nonlinearities, unknowns.free)]
         scale = [1.0 if free else float(f.mu[0]) for f, free in zip(model.nonlinearities, unknowns.free)]
-        nus, columns = [np.ones(family.size) for family in x.feedback], np.zeros((unknowns.n, len(x.feedback)))
+        nus: list[Any] = [np.ones(family.size) for family in x.feedback]
+        columns = np.zeros((unknowns.n, len(x.feedback)))
         constant, injection = np.array(model.offset_x), np.array(model.L)
         for f, (g, family) in enumerate(zip(model.feedback, x.feedback)):
             nu = np.linalg.lstsq(family.vectors, g.mu)[0]

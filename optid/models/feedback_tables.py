@@ -56,7 +56,7 @@ def tabulated(functions: Sequence[Nonlinearity]) -> Tables:
         numbers[j, : part.shape[0], depth - part.shape[1] :] = part
     plain = list(zip(*(r[:-1] for r in rows))) or [()] * 6
     kinds = [np.int64, float, float, np.int64, np.int64, float]
-    return Tables(*(np.array(column, dtype=kind) for column, kind in zip(plain, kinds)), numbers)
+    return Tables._make([*(np.array(column, dtype=kind) for column, kind in zip(plain, kinds)), numbers])
 
 
 def _row(f: Nonlinearity) -> tuple[int, float, float, int, int, float, Array]:
@@ -83,4 +83,4 @@ def _pieces(basis: Triangular | PiecewiseConstant | BSpline, mu: Array) -> Array
     inside = (np.arange(degree + 1) + 0.5) / (degree + 1)
     points = low + (np.arange(basis.p)[:, None] + inside) * (high - low) / basis.p
     values = (basis.values(points.ravel()) @ mu).reshape(points.shape)
-    return np.linalg.solve(np.vander(inside), values.T).T
+    return np.asarray(np.linalg.solve(np.vander(inside), values.T).T, dtype=float)

@@ -143,8 +143,10 @@ class HammersteinSS:
     @cached_property
     def parts(self) -> simulation.Parts:
         """Matrices and tables as the compiled recursions read them."""
-        matrices = (np.array(part, order="C") for part in (self.A, self.C, self.E, self.L, self.K))
-        return simulation.Parts(*matrices, np.array(self.output_of, dtype=np.int64), tabulated(self.feedback))
+        matrices = [np.array(part, order="C") for part in (self.A, self.C, self.E, self.L, self.K)]
+        return simulation.Parts._make(
+            [*matrices, np.array(self.output_of, dtype=np.int64), tabulated(self.feedback)]
+        )
 
     # -- what it says --------------------------------------------------------------------------------------------
 

@@ -92,4 +92,4 @@ def _slope(model: "HammersteinSS", y: Array) -> Array:
 def _solved(matrix: Array, right: Array) -> Array:
     if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
         raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
-    return np.linalg.solve(matrix, right)
+    return np.asarray(np.linalg.solve(matrix, right), dtype=float)

@@ -214,7 +214,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array) -> tuple[Array, floa
                 raise DataError(
                     f"{job.label}The effect of the initial state leaves the range of numbers: {radius(job.model)}"
                 )
-            root = np.linalg.qr(np.vstack([root, rows]), mode="r")
+            root = np.asarray(np.linalg.qr(np.vstack([root, rows]), mode="r"))
             largest = max(largest, float(np.abs(turn).max()))
             informs = float(np.abs(turn).max()) > FORGOTTEN * largest
     return root, cost
@@ -313,9 +313,9 @@ def _ahead(job: Run, stretch: Stretch, x: Array, horizon: int, starts: int, targ
     nothing = np.zeros((x.size, 0)), np.zeros((horizon, job.model.l, 0))
     for k in range(starts):
         state, count = x.copy(), min(horizon, len(stretch.y) - k)
-        one = Stretch(*(part[k : k + 1] for part in stretch[:4]), *stretch[4:])
+        one = Stretch._make([*(part[k : k + 1] for part in stretch[:4]), *stretch[4:]])
         _march_in_python(job.model, parts, one, x, nothing[0], np.empty((1, job.model.l)), nothing[1])
-        free = Stretch(*(part[k : k + count] for part in stretch[:4]), *stretch[4:])
+        free = Stretch._make([*(part[k : k + count] for part in stretch[:4]), *stretch[4:]])
         free = free._replace(feedback=np.full_like(free.feedback, np.nan), y=np.full_like(free.y, np.nan))
         found = np.empty((count, job.model.l))
         ended, at = _march_in_python(job.model, parts, free, state, nothing[0], found, nothing[1])

@@ -187,13 +187,13 @@ class Places(NamedTuple):
     C: int
     K: int
     offset: int
-    mu: Array
-    b: Array
-    d: Array
-    functions: Array
-    nu: Array
-    e: Array
-    coordinates: Array
+    mu: Any
+    b: Any
+    d: Any
+    functions: Any
+    nu: Any
+    e: Any
+    coordinates: Any
 
 
 class Signals(NamedTuple):
@@ -218,7 +218,7 @@ class Signals(NamedTuple):
     eta: Array
     g: Array
     zeta: Array
-    closed: Array
+    closed: Any
     slopes: Array
 
 
@@ -300,7 +300,7 @@ class _Roots:
     def __init__(self, weight: Array) -> None:
         self.covariance = np.linalg.inv(weight)
 
-    def of(self, missing: Array) -> Array:
+    def of(self, missing: Any) -> Array:
         here, size = np.flatnonzero(~missing), missing.size
         root = np.zeros((size, size))
         if here.size:
@@ -379,7 +379,7 @@ def _places(unknowns: StateUnknowns) -> Places:
 
     inputs, families = range(x.m), range(len(x.feedback))
 
-    def listed(names: Any) -> Array:
+    def listed(names: Any) -> Any:
         return np.array([first(name) for name in names], dtype=np.int64)
 
     d = [first(f"b{c}") + n if direct else -1 for c, direct in enumerate(unknowns.feedthrough)]
