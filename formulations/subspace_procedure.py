@@ -135,7 +135,8 @@ def identified(plan: Plan) -> Procedure:
     projection = _projected(plan, records, expansion, alpha, instruments)
     nx, reason = _order(plan, projection, records, expansion)
     figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-               "instruments": instruments, "singular values": projection.range.values,
+               "windows": projection.statistics.windows, "instruments": instruments,
+               "singular values": projection.range.values,
                "condition of R11": projection.blocks.condition}
     if expansion.simulated:
         share, output = weakest_feedback(projection, expansion)

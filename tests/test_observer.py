@@ -117,6 +117,15 @@ def test_gaps_restart_the_state_and_eliminate_it():
     np.testing.assert_allclose(step.least_squares(), np.delete(best, [2, 3]), atol=1e-8)
 
 
+def test_an_experiment_may_begin_with_a_gap():
+    records = records_of(np.random.default_rng(2), [60, 50])
+    expansion = expansion_of(records)
+    form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2))
+    expected = observer_problem([records[0], records[1][3:]], form).least_squares()
+    records[1][:3, 1] = np.nan
+    np.testing.assert_allclose(observer_problem(records, form).least_squares(), expected, atol=1e-10)
+
+
 def test_instruments_are_two_stage_least_squares():
     rng = np.random.default_rng(3)
     records = [np.hstack([record, rng.uniform(-1, 1, (len(record), 2))]) for record in records_of(rng, [90, 70])]

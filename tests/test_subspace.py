@@ -101,6 +101,15 @@ def test_offsets_gaps_and_experiments_do_not_disturb_recovery():
     assert max(np.abs(e).max() for e in errors) < 1e-2  # the tables of the simulator
 
 
+def test_many_gaps_are_told_of():
+    data = example1(1500, 0.05, 0.1)
+    u = data.u.copy()
+    u[np.random.default_rng(0).random(1500) < 0.1, 0] = np.nan
+    with pytest.warns(DataWarning, match="missing samples leave"):
+        found = optid.fit(Data(u=u, y=data.y), "hammerstein_ss.asivid", **KNOWN).model
+    assert gap(without_injection(found).A, A) < 0.05
+
+
 def test_sid_recovers_a_linear_system_of_unknown_order():
     rng = np.random.default_rng(0)
     u, x = rng.standard_normal((600, 2)), np.zeros(3)

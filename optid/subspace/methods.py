@@ -1,5 +1,6 @@
 """The (A, C) step of the subspace methods: instruments, projection, preliminary models, simulated feedback."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.bases.basis import Array
-from optid.errors import StructureError
+from optid.errors import DataWarning, StructureError
 from optid.subspace.expansion import Expansion
 from optid.subspace.hankel import HankelStatistics, hankel_statistics
 from optid.subspace.realisation import Range, estimate_range
@@ -22,6 +23,9 @@ CHUNK = 8192
 
 BEYOND = 0.2
 """Simulated outputs are clipped to the range of the record, wider by this share of it on either side."""
+
+KEPT = 0.5
+"""Share of the windows left by missing samples below which the user is told."""
 
 PER_ROW = 2.0
 """Windows per row of the Hankel matrix that are wanted; block rows are chosen so that a record has them."""
@@ -118,6 +122,9 @@ def project(
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     statistics.check()
+    if statistics.windows < KEPT * statistics.candidates:
+        warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "
+                      f"{2 * block_rows} samples: fewer block rows keep more.", DataWarning, stacklevel=2)
     z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = _spread(statistics, expansion, offset)

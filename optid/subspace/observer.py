@@ -6,11 +6,11 @@ With an observer gain L and F = A - L C the outputs
 
 are linear in the unknowns, whatever the poles of A. L = 0 minimises the simulation error with measured feedback;
 a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Every complete run
-of samples has its own initial state; those of runs that begin in the middle of an experiment are eliminated.
+of samples has its own initial state; those of all but the first run of an experiment are eliminated.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,6 @@ CHUNK = 4096
 
 HELD = 1 << 22
 """Numbers held at once at most: models with many functions and states take shorter chunks."""
-
-INSTRUMENTED = 2.0
-"""Instruments at least, per unknown, that a two-stage least-squares step needs rows for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,6 @@ class ObserverProblem:
         rows: equations used.
         candidates: equations there would be, were no sample missing.
         instrumented: whether the normal equations are those of instruments.
-        scale: energy of the weighted outputs about their means.
     """
 
     form: ObserverForm
@@ -119,7 +115,6 @@ class ObserverProblem:
     rows: int
     candidates: int
     instrumented: bool = False
-    energy: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def condition(self) -> float:
@@ -176,16 +171,16 @@ def observer_problem(
     regressors = _Regressors(form, instruments, chunk)
     extra = regressors.extra
     total = form.experiments * form.n + regressors.common + extra  # [x0 | eta, d | zeta simulated | zeta] and y
-    root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, np.zeros((3, form.l))
+    root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, 0.0
     own = slice(form.experiments * form.n, total + 1)
     for e, record in enumerate(records):
         y = record[:, regressors.y]
         candidates += y.size
-        for start, run in _runs(record, regressors.needed):
-            part, used, sums = regressors.compress(run)
+        for i, run in enumerate(_runs(record, regressors.needed)):
+            part, used, squares = regressors.compress(run)
             rows += used
-            energy += sums
-            if start == 0:
+            energy += squares
+            if i == 0:
                 wide = np.zeros((len(part), total + 1))
                 wide[:, e * form.n : (e + 1) * form.n] = part[:, : form.n]
                 wide[:, own] = part[:, form.n :]
@@ -206,18 +201,16 @@ def observer_problem(
     triangle = np.triu(np.linalg.qr(np.column_stack([turned, system[:, -1]]), mode="r"))
     size = form.size
     remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
-    spread = energy[2] - energy[1] ** 2 / np.maximum(energy[0], 1)
-    problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear,
-                      float(np.sum(energy[2] * form.weights**2)))
-    return ObserverProblem(form, problem, rows, candidates, bool(extra), spread)
+    problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear, energy)
+    return ObserverProblem(form, problem, rows, candidates, bool(extra))
 
 
-def _runs(record: Array, needed: NDArray[np.bool_]) -> Iterator[tuple[int, Array]]:
-    """Yield the start and the samples of every stretch in which the channels needed are complete."""
+def _runs(record: Array, needed: NDArray[np.bool_]) -> Iterator[Array]:
+    """Yield every stretch of samples in which the channels needed are complete."""
     present = ~np.isnan(record[:, needed]).any(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
     for start, stop in edges.reshape(-1, 2):
-        yield int(start), record[start:stop]
+        yield record[start:stop]
 
 
 class _Regressors:
@@ -238,8 +231,8 @@ class _Regressors:
         if instruments:
             self.needed[x.m + x.l :] = True
 
-    def compress(self, run: Array) -> tuple[Array, int, Array]:
-        """Return the triangular factor of the rows of a run with its target, the rows used, and sums of the outputs."""
+    def compress(self, run: Array) -> tuple[Array, int, float]:
+        """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy."""
         from optid.subspace.kernels import adjoint_responses
 
         form, x = self.form, self.form.expansion
@@ -249,7 +242,7 @@ class _Regressors:
         free = form.c[:, :, None].copy()  # (F^T)^k C_o^T, the effect of x0
         transposed = np.ascontiguousarray((form.a - form.gain @ form.c).T)
         size = n + self.common + self.extra + 1
-        root, used, sums = np.zeros((size, size)), 0, np.zeros((3, l))
+        root, used, energy = np.zeros((size, size)), 0, 0.0
         for start in range(0, len(run), self.chunk):
             raw = run[start : start + self.chunk]
             y = raw[:, self.y]
@@ -259,13 +252,12 @@ class _Regressors:
             adjoint_responses(transposed, np.zeros_like(form.c), np.zeros((count, 1)), free, initial)
             out = out.reshape(count, l, n, width)
             present = ~np.isnan(y)
-            values = np.where(present, y, 0.0)
-            sums += [present.sum(axis=0), values.sum(axis=0), (values**2).sum(axis=0)]
+            energy += float(np.nansum((form.weights * y) ** 2))
             for o in range(l):
                 rows = self._rows(o, signals, initial[:, o], out[:, o], y[:, o])[present[:, o]]
                 used += len(rows)
                 root = add_to_root(root, form.weights[o] * rows)
-        return root, used, sums
+        return root, used, energy
 
     def _signals(self, raw: Array) -> Array:
         """Return [eta | (zeta simulated |) zeta | 1 (| y)]."""
