@@ -18,7 +18,15 @@ import numpy as np
 
 from formulations.equation_error import flat, model_meta, per_channel
 from formulations.hammerstein_arx import GAUGES
-from formulations.output_error_starts import blank, equation_error, iterated, perturbed, stable_poles, with_poles
+from formulations.output_error_starts import (
+    blank,
+    equation_error,
+    iterated,
+    perturbed,
+    stable_poles,
+    subspace,
+    with_poles,
+)
 from formulations.prediction_error import Descent, Posed, agreement, best_of, descend, refine
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
@@ -320,8 +328,12 @@ def _starts(criterion: OutputError, count: int, seed: int) -> dict[str, Array]:
     first = blank(data, unknowns) if first is None else first
     base = with_poles(criterion, unknowns, criterion.normalised(first), stable_poles(first[at]), "ARX")
     found = {"ARX": base.x}
-    for name, method in (("Steiglitz-McBride", "sm"), ("instruments", "iv")):
-        if len(found) < count:
+    for name, method in (("Steiglitz-McBride", "sm"), ("subspace", ""), ("instruments", "iv")):
+        if len(found) < count and name == "subspace":
+            a = subspace(data, unknowns)
+            if a is not None:
+                found[name] = with_poles(criterion, unknowns, base.x, a, name).x
+        elif len(found) < count:
             one = iterated(criterion, data, unknowns, base.x, method)
             if one is not None:
                 found[name] = one.x

@@ -14,11 +14,17 @@ from optid.data import Data
 from optid.errors import DataWarning, OptidError
 from optid.rank_one.bilinear import minimise
 from optid.regressors.sensitivities import PlantPoint, Unknowns, instruments
+from optid.subspace.expansion import expand
+from optid.subspace.methods import default_block_rows, project
+from optid.subspace.realisation import realise
 
 Array = np.ndarray
 
 PASSES = 8
 """Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""
+
+WIDE = 6
+"""Functions, over all inputs, up to which the subspace start is worth its cost."""
 
 RADIUS = 0.98
 """Poles of a start lie inside this radius, so that its simulation forgets within the record."""
@@ -35,10 +41,34 @@ def equation_error(data: Data, unknowns: Unknowns) -> Array | None:
     except OptidError:
         return None
     values = problem.linear_part(point.w)
-    pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, mu, b in zip(unknowns.free, point.mus, point.bs)]
+    mus, bs = [], []
+    for free, mu, b in zip(unknowns.free, point.mus, point.bs):
+        mus.append(np.asarray(mu if free else np.ones(1), dtype=float))
+        bs.append(np.ravel(np.asarray(b if free else b * mu[0], dtype=float)))
     x0 = np.zeros((unknowns.experiments, unknowns.memory))
-    return unknowns.pack(PlantPoint(values.get("a", np.zeros(0)), tuple(mu for mu, _ in pairs),
-                                    tuple(np.ravel(b) for _, b in pairs), float(values["offset"][0]), x0))
+    a, offset = values.get("a", np.zeros(0)), float(values["offset"][0])
+    return unknowns.pack(PlantPoint(a, tuple(mus), tuple(bs), offset, x0))
+
+
+def subspace(data: Data, unknowns: Unknowns) -> Array | None:
+    """Return A from the subspace of the expanded inputs (past instruments); None where the record does not carry it.
+
+    Wide expansions are left out: their block Hankel matrices cost more than all other starts together.
+    """
+    layout = unknowns.layout
+    if not layout.na or sum(basis.size for basis in layout.bases) > WIDE:
+        return None
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    try:
+        expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # as in `equation_error`
+            found = project(records, expansion, default_block_rows(records, expansion, layout.na), instruments="past")
+        poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
+    except (OptidError, np.linalg.LinAlgError):
+        return None
+    a = np.real(np.poly(poles))[1:]
+    return stable_poles(a) if a.size == layout.na and np.all(np.isfinite(a)) else None
 
 
 def blank(data: Data, unknowns: Unknowns) -> Array:
@@ -51,7 +81,8 @@ def blank(data: Data, unknowns: Unknowns) -> Array:
         mus.append(line if free else np.ones(1))
     bs = tuple(np.full(nb, 1 / np.sqrt(nb)) for nb in layout.nb)
     x0 = np.zeros((unknowns.experiments, unknowns.memory))
-    return unknowns.pack(PlantPoint(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], tuple(mus), bs, 0.0, x0))
+    a = np.asarray(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], dtype=float)
+    return unknowns.pack(PlantPoint(a, tuple(mus), bs, 0.0, x0))
 
 
 def stable_poles(a: Array, radius: float = RADIUS) -> Array:
@@ -71,7 +102,7 @@ def with_poles(criterion, unknowns: Unknowns, x: Array, a: Array, start: str) ->
     moved[unknowns.slices["a"]] = a
     held = np.zeros(unknowns.shared, dtype=bool)
     held[unknowns.slices["a"]] = True
-    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-6, start=start)
+    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3, start=start)
 
 
 def iterated(criterion, data: Data, unknowns: Unknowns, x: Array, method: str) -> Descent | None:

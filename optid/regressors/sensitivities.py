@@ -146,7 +146,7 @@ class Linearised:
     def follow(self, step: Array) -> Array:
         """Return the steps (E n,) of the initial states that belong to a step (p,) of the shared unknowns."""
         moves = [-np.linalg.lstsq(x, s @ step + e, rcond=1e-12)[0] for x, s, e in self.states]
-        return np.concatenate([*moves, np.zeros(0)])
+        return np.asarray(np.concatenate([*moves, np.zeros(0)]), dtype=float)
 
     @cached_property
     def whole(self) -> tuple[Array, Array]:
@@ -381,10 +381,11 @@ def _factor(gram: Array) -> Array:
     size[size == 0] = 1.0
     scaled = gram / np.outer(size, size)
     try:
-        return np.linalg.cholesky(scaled).T * size
+        return np.asarray(np.linalg.cholesky(scaled).T * size, dtype=float)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(scaled)
-        return np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r") * size
+        root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"), dtype=float)
+        return root * size
 
 
 def _eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
