@@ -3,8 +3,9 @@
 Prints, for every entry of the tables, the median over the seeds of the error of the simulation with measured feedback
 (P2, in % of the root mean square of the output, x0 fitted on the validation record), the reference, and the goal: at
 most 1.1 times the reference and 0.1 point. No model of any order may be unstable. One setting for everything:
-`hammerstein_ss.asivid` with past outputs among the instruments and the block rows of the reference. The polynomials of
-the oscillator, whose damping is one, are continued beyond the range of the record, those of the pendulum are held.
+`hammerstein_ss.asivid` with past outputs among the instruments, CVA weighting and the block rows of the reference. The
+polynomials of the oscillator, whose damping is one, are continued beyond the range of the record, those of the pendulum
+are held.
 
 The references are one record each, and some entries lie below what the best model of the class reaches on other
 records: `--floor` prints that beside, the median error of `hammerstein_ss.exact`, which minimises the simulation error
@@ -24,7 +25,7 @@ from montecarlo import mapped
 import optid
 from optid import plants
 
-ASIVID = {"noise": "white", "iterations": 0, "prove": False}
+ASIVID = {"noise": "white", "weighting": "cva", "prove": False}
 VAN_DER_POL = {(0.0, 3): 1.2, (0.0, 4): 1.2, (0.02, 3): 7.0, (0.02, 4): 7.0}
 PENDULUM = {
     "chirp": {2: (99, 21), 3: (0.7, 2.5), 4: (0.5, 1.9), 6: (0.9, 1.9), 8: (0.5, 1.8)},

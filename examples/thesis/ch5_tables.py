@@ -32,7 +32,7 @@ def identified(kind: str, method: str, train: optid.Data, nx: int) -> optid.Hamm
     if kind == "sinusoid":
         return subspace(train, "sivid", instruments="inputs+past", tolerance=0.1, split="lumped", **settings)
     return subspace(train, "sid" if method == "LSID" else "asivid", noise="white", **settings,
-                    **({"iterations": 0} if method == "ASIVID" else {}))
+                    **({"weighting": "cva"} if method == "ASIVID" else {}))
 
 
 def main() -> dict[str, float]:
