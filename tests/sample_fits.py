@@ -52,3 +52,23 @@ def linear_fit(**options: Any) -> Fit:
     for k in range(2, 300):
         y[k] = 0.5 * y[k - 1] - 0.2 * y[k - 2] + 2 * u[k - 1] - 3
     return optid.fit(optid.Data(u, y, 0.1, name="linear"), "arx", na=2, nb=1, nk=1, **options)
+
+
+@cache
+def feedback_fit() -> Fit:
+    """A Van der Pol oscillator with measurement noise: a state-space model with nonlinear feedback."""
+    from optid.plants import van_der_pol
+
+    u = np.random.default_rng(0).uniform(-2, 2, 1500)
+    data = van_der_pol(u, 1, measurement=0.02, process=0.005)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return optid.fit(data, "hammerstein_ss.asivid", nx=2, basis="polynomial:3", feedback_basis="polynomial:3")
+
+
+@cache
+def output_error_fit() -> Fit:
+    """The dead zone record, fitted by its simulation error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return optid.fit(example("dead_zone").data, "hammerstein_oe.exact", na=2, nb=2, basis="triangular:8")

@@ -209,7 +209,7 @@ def test_a_stream_needs_a_record_to_draw(tmp_path):
 
 @pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
 def test_colours_are_told_apart_by_every_kind_of_colour_vision(scheme):
-    sheet = (Path(plots.__file__).parent / "templates" / "report.html.j2").read_text(encoding="utf-8")
+    sheet = (Path(plots.__file__).parent / "templates" / "page.html.j2").read_text(encoding="utf-8")
     colours = [re.findall(rf"--{name}: (#[0-9a-f]{{6}})", sheet)[scheme] for name in ("blue", "orange", "green", "ink")]
     if scheme == 0:  # the figures and the page share their light colours
         assert colours == [panels.BLUE, panels.ORANGE, panels.GREEN, panels.INK]

@@ -3,7 +3,7 @@ import warnings
 
 import numpy as np
 import pytest
-from sample_fits import example_fit, linear_fit, mimo_fit, two_by_two
+from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, output_error_fit, two_by_two
 
 import optid
 from optid.showing.printing import describe, describe_validation
@@ -22,6 +22,8 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
         lambda: example_fit("two_inputs"),
         mimo_fit,
         linear_fit,
+        feedback_fit,
+        output_error_fit,
         lambda: example_fit("dead_zone", "hammerstein_arx.nuclear", weight=0.5),
     ],
 )
@@ -178,3 +180,27 @@ def test_a_channel_whose_sign_the_constraint_fixes_says_so():
     fit = example_fit("two_inputs")
     assert fit.model.b[0][0] < 0
     assert "its sign follows from the constraints" in describe(fit)
+
+
+def test_a_state_space_model_with_feedback_shows_its_three_simulators_and_its_noise():
+    fit = feedback_fit()
+    text = describe(fit)
+    assert "Hammerstein state-space model with nonlinear feedback of y from u" in text
+    head = next(line for line in text.splitlines() if line.startswith("output ") and "measured feedback" in line)
+    assert head.split() == ["output", "one", "step", "measured", "feedback", "simulation"]
+    fits = (fit.one_step_fit[0], fit.measured_feedback_fit[0], fit.simulation_fit[0])
+    assert all(f"{value:.2f} %" in text for value in fits)
+    innovation = float(np.sqrt(fit.model.noise.innovation[0, 0]))
+    noise = rows(text, "\nNoise\n"[1:])["y"]
+    assert float(noise[0]) == pytest.approx(innovation, rel=1e-3) and noise[2] in ("white", "coloured")
+    assert "Feedback nonlinearity g, basis polynomial" in text and "Singular values:" in text
+    assert "No standard errors: they follow from compressed least squares" in " ".join(text.split())
+    assert "no model of this structure can lower" not in " ".join(text.split())
+
+
+def test_an_output_error_model_shows_the_errors_of_every_coefficient():
+    fit = output_error_fit()
+    text, table = describe(fit), rows(describe(fit), "Parameters")
+    assert "Hammerstein output-error model of y from u" in text
+    assert list(table) == [name for name, _ in fit.model.coefficients()]
+    assert fit.one_step_fit == pytest.approx(fit.simulation_fit, abs=1e-6)

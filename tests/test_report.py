@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sample_fits import example_fit, linear_fit, mimo_fit, two_by_two
+from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_two
 
 import optid
 from optid import report
@@ -65,10 +65,11 @@ def pages() -> dict[str, str]:
         "thruster": report.render(example_fit("thruster")),
         "mimo": report.render(mimo_fit(), two_by_two(seed=5)),
         "linear": report.render(linear_fit()),
+        "feedback": report.render(feedback_fit()),
     }
 
 
-@pytest.mark.parametrize("name", ["thruster", "mimo", "linear"])
+@pytest.mark.parametrize("name", ["thruster", "mimo", "linear", "feedback"])
 def test_nothing_is_loaded_from_anywhere(pages, name):
     page = Page(pages[name])
     for attribute in ("src", "href", "xlink:href", "data", "action", "srcset"):
@@ -78,7 +79,7 @@ def test_nothing_is_loaded_from_anywhere(pages, name):
     assert "https://" not in pages[name]
 
 
-@pytest.mark.parametrize("name", ["thruster", "mimo", "linear"])
+@pytest.mark.parametrize("name", ["thruster", "mimo", "linear", "feedback"])
 def test_identifiers_are_unique_and_every_reference_has_its_target(pages, name):
     page = Page(pages[name])
     ids = page.values("id")
@@ -218,3 +219,11 @@ def test_light_and_dark_differ_and_a_phone_needs_no_sideways_scrolling(pages, tm
     )
     width, room = map(int, re.search(r"<title>(\d+) of (\d+)</title>", result.stdout).groups())
     assert 300 < width <= room <= 360
+
+
+def test_a_state_space_model_shows_singular_values_noise_and_feedback(pages):
+    text = Page(pages["feedback"]).text
+    for words in ("Singular values from which the order is read", "Spectral density of the noise", "measured feedback",
+                  "Feedback nonlinearity g", "On the way to it"):  # fmt: skip
+        assert words in text
+    assert pages["feedback"].count("<svg ") == 7
