@@ -16,6 +16,7 @@ RELAXATION = 1.7
 CHECK = 10  # iterations between measurements of the gap
 BALANCE = 1.2  # ratio of residuals beyond which the step size changes
 FACTOR = 1.3  # by how much
+FIRST = 60, 3.0  # iterations in which the size of the step is found, and the factor there
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,8 @@ def minimise(problem: NuclearProblem, weight: float, *, tolerance: float = 1e-7,
             break
         outside, moved = np.linalg.norm(reached - low_rank), np.linalg.norm(low_rank - before)
         sizes = np.linalg.norm(scaled) / max(float(np.linalg.norm(low_rank)), 1e-300)
-        factor = 1.0 if count > limit // 2 else _rebalanced(float(outside * np.sqrt(sizes)), float(moved))
+        change = FIRST[1] if count <= FIRST[0] else FACTOR
+        factor = 1.0 if count > limit // 2 else _rebalanced(float(outside * np.sqrt(sizes)), float(moved), change)
         step, scaled = step * factor, scaled / factor
     assert best is not None
     return best
@@ -106,12 +108,12 @@ def _measured(problem: NuclearProblem, v: Array, theta: Array, multipliers: Arra
     return Minimum(v, theta, point, value, bound, count, found.gap <= tolerance)
 
 
-def _rebalanced(outside: float, moved: float) -> float:
+def _rebalanced(outside: float, moved: float, change: float) -> float:
     """Factor of the step size: up where the constraint lags behind, down where the matrix does.
 
     Small factors, and a measure between that of absolute and that of relative residuals: either alone circles for
     thousands of iterations on some weights of the CD player.
     """
     if outside > BALANCE * moved:
-        return FACTOR
-    return 1.0 / FACTOR if moved > BALANCE * outside else 1.0
+        return change
+    return 1.0 / change if moved > BALANCE * outside else 1.0
