@@ -43,7 +43,7 @@ from optid.solving import Procedure
 
 Array = np.ndarray
 
-SEARCH = 20_000
+SEARCH = 5_000
 """Samples, from the middle of the record, on which starts are compared; the winner descends on the whole record."""
 
 PULLS = (1.0, 0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
