@@ -16,7 +16,8 @@ from optid.data import Data
 from optid.errors import RankError
 from optid.validation import validate
 from optid.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
-from optid.validation.structure import Design, FTest, structure_test
+from optid.validation.structure import FTest, structure_test
+from optid.validation.structure_design import Design
 
 SPEC = importlib.util.spec_from_file_location(
     "structure_benchmark", Path(__file__).parent.parent / "benchmarks" / "structure.py"
@@ -101,7 +102,7 @@ def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
     data = hammerstein(900)
     design = Design.of(data)
     whole = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
-    monkeypatch.setattr("optid.validation.structure.CHUNK", 100)
+    monkeypatch.setattr("optid.validation.structure_design.CHUNK", 100)
     parts = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
     assert parts == pytest.approx(whole, abs=1e-10) and len(whole) == 900 - len(design.filters) + 1
     several = structure_test(data)
