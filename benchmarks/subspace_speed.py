@@ -140,7 +140,7 @@ def hair_dryer() -> None:
     data = Data(u=columns[:, -2], y=columns[:, -1], dt=0.08)
     found = fit(data, "hammerstein_ss.sid", nx="gap", block_rows=15, offset=False)
     ours = " ".join(f"{value:.4f}" for value in found.figures["singular values"])
-    poles = ", ".join(f"{p.real:.4f}" + f"{p.imag:+.4f}i" * (abs(p.imag) > 1e-9) for p in found.model.poles)
+    poles = ", ".join(f"{p.real:.4f}" + f"{p.imag:+.4f}i" * int(abs(p.imag) > 1e-9) for p in found.model.poles)
     print("hair dryer, 15 block rows (SLICOT IB01AD):")
     print(f"  singular values {ours}\n  printed         {PRINTED}   {'equal' if ours == PRINTED else 'DIFFERENT'}")
     print(f"  order {found.figures['order']} (4); poles {poles} (0.9611, 0.7455, 0.4758 +- 0.2001i)")

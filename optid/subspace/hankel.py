@@ -145,8 +145,8 @@ def hankel_statistics(
         expand: turns raw channels (T, c) into signals (T, d), for instance the functions of a basis; chunk by chunk, so
             that the signals of a whole record never exist. None for the channels themselves.
         names: one name per signal.
-        centre: (d,) to be subtracted from the signals, or "mean" for their means over the samples present; it keeps the
-            digits of signals far from zero and changes nothing where the constant is an instrument and a regressor.
+        centre: (d,) to be subtracted from the signals, or "mean" for about their means; it keeps the digits of signals
+            far from zero and changes nothing where the constant is an instrument and a regressor.
         method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next windows, slower
             and with twice the digits; "auto" takes the Gram matrix and goes over to "qr" when `condition` is above 1e5.
         chunk: samples expanded at a time.
@@ -222,11 +222,11 @@ def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArra
 
 
 def _means(runs: Sequence[Array], expand: Expand, chunk: int) -> Array:
+    """Means over samples spread over the runs: a centre has to be near the signals, no more."""
     total, count = 0.0, 0
     for run in runs:
-        for start in range(0, len(run), chunk):
-            total = total + expand(run[start : start + chunk]).sum(axis=0)
-        count += len(run)
+        signals = expand(run[:: 1 + len(run) // chunk])
+        total, count = total + signals.sum(axis=0), count + len(signals)
     return np.asarray(total / count)
 
 
