@@ -10,7 +10,8 @@ here, errors drawn from the normal distribution of the bound), and the figures o
 record.
 
 Goals: mean delta_s of 100 seeds at most 0.85 % at sigma = 0.5 and 2.35 % at sigma = 2. The mean of a hundred has a
-standard error of 5 % of itself, so the means of every hundred seeds are printed too.
+standard error of 5 % of itself: the verdict is given for the first hundred and for all seeds, and the means of every
+hundred are printed.
 """
 
 import argparse
@@ -123,10 +124,11 @@ def main() -> None:
             means = [part.mean() for part in np.array_split(values[1], range(100, given.seeds, 100))]
             print(f"  mean delta_s of every hundred, {name}: {np.round(means, 3)}")
         print(f"  variances over those of the bound: {np.round(np.diag(np.cov(ours.T) / np.cov(bound.T)), 2)}")
-        mean, error = found[1].mean(), found[1].std() / np.sqrt(given.seeds)
-        word = "reached" if mean <= GOALS[sigma] else "missed"
-        print(f"  mean delta_s {mean:.3f} +- {error:.3f} %, goal {GOALS[sigma]:.2f} %: {word}; "
-              f"{1000 * seconds:.0f} ms of CPU a fit\n")
+        for name, part in (("the first hundred", found[1][:100]), ("all seeds", found[1])):
+            mean, error = part.mean(), part.std() / np.sqrt(part.size)
+            word = "reached" if mean <= GOALS[sigma] else "missed"
+            print(f"  mean delta_s of {name}: {mean:.3f} +- {error:.3f} %, goal {GOALS[sigma]:.2f} %: {word}")
+        print(f"  {1000 * seconds:.0f} ms of CPU a fit\n")
 
 
 if __name__ == "__main__":
