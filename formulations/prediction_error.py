@@ -42,13 +42,17 @@ NOWHERE = 1e-9
 """Relative violation that is rounding; a step to more than that pays for it."""
 
 STEPS = 100
+
+COMPARED = 1e-6
+"""Relative gain of a full step below which a start counts as arrived; only the best of them descends further."""
+
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
 
-BORDER = ("the errors still fall towards poles on the unit circle; choose other orders, or a constraint such as "
-          "stable:0.999")
+BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
+          "constraint such as stable:0.999")
 
-NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known, several starts are compared"
+NO_BOUND = "the errors are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 
 class Criterion(Protocol):
@@ -143,17 +147,21 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         if rejected > 20 or damping > 1e12:
             # at this size of the gain rounding decides whether a step descends
             settled = gain <= 1e3 * tolerance * at.value or at.value <= 1e4 * least
-            border = blocked and not settled
-            return Descent(x, at, count, settled, BORDER if border else "no step descends", start, border)
+            # what a descent creeps along without arriving is the border of the admissible set, also between refusals
+            reason = BORDER if blocked and not settled else "no step descends"
+            return Descent(x, at, count, settled, reason, start, not settled)
     return Descent(x, at, iterations, False, f"{iterations} steps did not suffice", start)
 
 
 def _gain(root: Array, at: Linearised) -> float:
     """By how much a full undamped step over the free unknowns would lower the sum of squares of the linear model."""
     size = np.linalg.norm(root, axis=0)
-    step = np.linalg.lstsq(root / np.where(size > 0, size, 1.0), at.pull, rcond=1e-13)[0]
-    rest = at.pull - root / np.where(size > 0, size, 1.0) @ step
-    return max(at.reach - float(rest @ rest), 0.0)
+    used = root[:, size > 0] / size[size > 0]
+    basis, triangle = np.linalg.qr(used)
+    diagonal = np.abs(np.diag(triangle))
+    if diagonal.size and np.min(diagonal) <= 1e-12:  # columns that add no direction must not add their rounding
+        basis = np.linalg.svd(used, full_matrices=False)[0][:, : np.linalg.matrix_rank(triangle, tol=1e-12)]
+    return float(np.sum((basis.T @ at.pull) ** 2)) + at.reach - float(at.pull @ at.pull)
 
 
 def best_of(criterion: Criterion, starts: Mapping[str, Array], iterations: int = STEPS) -> list[Descent]:
@@ -161,7 +169,7 @@ def best_of(criterion: Criterion, starts: Mapping[str, Array], iterations: int =
 
     There they are no local optima: an unstable model would be better still.
     """
-    found = [descend(criterion, x, iterations=iterations, tolerance=1e-9, start=name) for name, x in starts.items()
+    found = [descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name) for name, x in starts.items()
              if criterion.admissible(x)]
     return sorted(found, key=lambda one: (one.border, one.value))
 
@@ -253,7 +261,7 @@ def _reached(posed: Posed, x: Array) -> _Iterate | None:
 def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
                  ) -> Generator[Program, Solution, Evidence | None]:
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
-    criterion, floor = posed.criterion, criterion_floor(posed.criterion)
+    floor = criterion_floor(posed.criterion)
     previous: _Iterate | None = None
     damping, growth, weight, last = 0.0, 4.0, 0.0, np.inf
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
@@ -285,7 +293,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
-                reason = f"no step descends, although the last programme promised {last / here.at.value:.0e} of the value"
+                reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
                 return _evidence(posed, here, Status.LIMIT, reason, {**figures, "programmes": count})
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
