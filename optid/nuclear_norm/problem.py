@@ -213,11 +213,17 @@ class NuclearProblem:
         if self.left is not None:
             outer = np.eye(j) if self.right is None else self.right @ self.right.T
             inner = (self.left.T @ self.left).reshape(self.rows, self.l, self.rows, self.l)
-            whole, outputs = np.zeros((samples, self.l, samples, self.l)), np.arange(self.l)
+            whole = np.zeros((self.l, self.l, samples, samples))
             for i in range(self.rows):
                 for ii in range(self.rows):
-                    where = np.ix_(self.starts + i, outputs, self.starts + ii, outputs)
-                    whole[where] += outer[:, None, :, None] * inner[i, :, ii, :][None, :, None, :]
+                    where = np.ix_(self.starts + i, self.starts + ii)
+                    if self.starts[-1] - self.starts[0] == j - 1:  # without gaps: slices instead of copies
+                        first = self.starts[0]
+                        where = slice(first + i, first + i + j), slice(first + ii, first + ii + j)
+                    for o in range(self.l):
+                        for oo in range(self.l):
+                            whole[o, oo][where] += inner[i, o, ii, oo] * outer
+            whole = whole.transpose(2, 0, 3, 1)
             return whole.reshape(samples * self.l, samples * self.l), False
         single = np.zeros((samples, samples))
         if self.right is None:
