@@ -208,3 +208,9 @@ def test_validation_uses_it():
     y = model.simulate(u)
     y = y + 0.1 * y.std() * np.random.default_rng(0).normal(size=y.shape)
     assert validate(model, Data(u, y, dt=0.1)).structure == structure_test(Data(u, y, dt=0.1))
+
+
+def test_a_long_record_is_read_in_part(monkeypatch):
+    data = hammerstein(4000, 7)
+    monkeypatch.setattr("optid.validation.structure.SAMPLES", 2000)
+    assert structure_test(data) == structure_test(data.split(0.5)[0])

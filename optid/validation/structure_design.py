@@ -19,6 +19,9 @@ FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
 EXTRA = 3
 """Pulses beyond the order of the filters."""
 
+LONGEST = 600
+"""Samples after which the filters are cut, at most."""
+
 CHUNK = 16384
 PRESENT = 0.9
 """Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
@@ -51,7 +54,8 @@ class Design:
     def of(cls, data: Data) -> "Design":
         """Estimate delay and poles, and place the functions."""
         delay = delay_of(data)
-        filters = orthonormal_filters(poles_of(data, delay), EXTRA, delay, max(20, data.n_samples // 5))
+        longest = int(np.clip(data.n_samples // 5, 20, LONGEST))
+        filters = orthonormal_filters(poles_of(data, delay), EXTRA, delay, longest)
         energy = np.cumsum(np.sum(filters**2, axis=1))
         u = tuple(interpolated(e.u) for e in data.experiments)
         stacked = np.concatenate(u)
