@@ -43,7 +43,8 @@ def sid(
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
             alone (consistent under coloured measurement noise).
-        weighting: "moesp" or "cva".
+        weighting: of the singular value decomposition, "moesp", "cva" or "plain" (`optid.subspace.realisation`), or
+            "best" for the one whose (A, C) leaves the smallest error on the record.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         observer: for the step in B, D and x0: "none" minimises the simulation error, "kalman" a prediction error,

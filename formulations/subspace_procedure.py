@@ -34,13 +34,16 @@ from optid.subspace.methods import (
     weakest_feedback,
 )
 from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
-from optid.subspace.realisation import largest_gap, scaled_pair
+from optid.subspace.realisation import WEIGHTINGS, largest_gap, scaled_pair
 
 OBSERVERS = ("auto", "none", "kalman")
 NOISES = ("white", "coloured")
 SPLITS = ("exact", "lumped")
 ORDERS = ("auto", "gap")
 STABILITIES = ("auto", "free")
+BEST = "best"
+"""Word for the weighting that fits the record best."""
+
 WEAK = 0.1
 """Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
 
@@ -79,7 +82,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name, value, known in (("observer", self.observer, OBSERVERS), ("split", self.split, SPLITS),
-                                   ("stability", self.stability, STABILITIES)):
+                                   ("stability", self.stability, STABILITIES),
+                                   ("weighting", self.weighting, (*WEIGHTINGS, BEST))):
             one_of(name, value, known)
         if not isinstance(self.data, Data):
             raise DataError(f"{self.name} needs records in memory (optid.Data), not a {type(self.data).__name__}.")
@@ -134,8 +138,12 @@ def identified(plan: Plan) -> Procedure:
             instruments = instruments.replace("simulated", "inputs")
     projection = _projected(plan, records, expansion, alpha, instruments)
     nx, reason = _order(plan, projection, records, expansion)
+    chosen = {}
+    if plan.weighting == BEST:
+        projection, word = _best_weighting(plan, records, expansion, projection, nx)
+        chosen = {"weighting": word}
     figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-               "windows": projection.statistics.windows, "instruments": instruments,
+               "windows": projection.statistics.windows, "instruments": instruments, **chosen,
                "singular values": projection.range.values,
                "condition of R11": projection.blocks.condition}
     if expansion.simulated:
@@ -231,7 +239,26 @@ def _block_rows(plan: Plan, expansion: Expansion) -> int:
 def _projected(plan: Plan, records: list[np.ndarray], expansion: Expansion, alpha: int, instruments: str
                ) -> Projection:
     return project(records, expansion, alpha, instruments=instruments, offset=plan.offset, form=plan.form,
-                   tolerance=plan.tolerance, weighting=plan.weighting)
+                   tolerance=plan.tolerance, weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
+
+
+def _best_weighting(plan: Plan, records: list[np.ndarray], expansion: Expansion, projection: Projection, nx: int
+                    ) -> tuple[Projection, str]:
+    """Return the projection in the weighting whose (A, C) leaves the smallest error on the record, and its word.
+
+    None is best on all records: the canonical weighting has the smaller variance where the order suffices, the others
+    keep the outputs with most energy where it does not. A stable estimate comes before one that had to be moved.
+    """
+    found = []
+    for word in WEIGHTINGS:
+        tried = projection.weighted(word, expansion.l)
+        a, c, _ = scaled_pair(tried.gamma(nx), tried.scale)
+        inside = _inside(a)
+        form = _form(plan, records, expansion, inside, c, tried.scale)
+        error = observer_problem(records, form, instruments=False).problem.remainder
+        found.append((inside is not a, error, word, tried))
+    _, _, word, best = min(found, key=lambda one: one[:2])
+    return best, f"{word}: the smallest error on the record"
 
 
 def _order(plan: Plan, projection: Projection, records: list[np.ndarray], expansion: Expansion) -> tuple[int, str]:
@@ -256,12 +283,17 @@ def _order(plan: Plan, projection: Projection, records: list[np.ndarray], expans
     return nx, reason
 
 
-def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
-          scale: np.ndarray) -> ObserverProblem:
+def _form(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
+          scale: np.ndarray) -> ObserverForm:
     unstable = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) >= 1
     closed = plan.observer == "kalman" or (plan.observer == "auto" and unstable)
     gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
-    form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / scale)
+    return ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / scale)
+
+
+def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
+          scale: np.ndarray) -> ObserverProblem:
+    form = _form(plan, records, expansion, a, c, scale)
     # where past outputs may be instruments, the noise is white and least squares has the smaller variance
     coloured = expansion.simulated and not plan.instruments.endswith("past")
     return observer_problem(records, form, instruments=coloured)

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,10 @@ class Projection:
     def gamma(self, n: int) -> Array:
         """Return Gamma (block_rows l, n) in balanced coordinates in which the states have about unit size."""
         return self.range.gamma(n) / self.statistics.windows**0.25
+
+    def weighted(self, weighting: str, l: int) -> "Projection":  # noqa: E741
+        """Return the same decomposition in another weighting, as in `estimate_range`, of l outputs."""
+        return replace(self, range=estimate_range(self.blocks, l, weighting, self.scale))
 
 
 def positions(

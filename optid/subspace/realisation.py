@@ -8,7 +8,7 @@ from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.subspace.rq import RQ
 
-WEIGHTINGS = ("moesp", "cva")
+WEIGHTINGS = ("moesp", "cva", "plain")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,9 @@ def estimate_range(blocks: RQ, l: int, weighting: str = "moesp", scale: Array | 
     Args:
         blocks: the RQ decomposition.
         l: number of outputs.
-        weighting: "moesp" (none) or "cva" (the inverse root of the covariance of the future outputs with the regressors
-            removed, so that singular values are canonical correlations: Larimore 1990).
+        weighting: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of the future
+            outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990) or
+            "plain" (outputs in their units: at an order too low the larger ones come first).
         scale: (l,) size of every output, by which its rows are divided: outputs in small units are not lost.
 
     Raises:
@@ -52,7 +53,7 @@ def estimate_range(blocks: RQ, l: int, weighting: str = "moesp", scale: Array | 
     """
     if weighting not in WEIGHTINGS:
         raise StructureError(f"weighting={weighting!r}: use one of {', '.join(WEIGHTINGS)}.")
-    sizes = np.tile(np.ones(l) if scale is None else scale, len(blocks.r22) // l)
+    sizes = np.tile(np.ones(l) if scale is None or weighting == "plain" else scale, len(blocks.r22) // l)
     r22, unweighted = blocks.r22 / sizes[:, None], np.diag(sizes)
     if weighting == "cva":
         whole = np.concatenate([r22, blocks.residual / sizes[:, None]], axis=1)
