@@ -15,7 +15,7 @@ STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
                                                   ("hammerstein_arx.exact", "ridge"),
                                                   ("hammerstein_arx.nuclear", "weight")])
 def test_every_point_of_a_path_is_the_fit_with_that_weight(formulation, penalty):
-    data = record(count=300)
+    data = record(count=600)
     train, test = data.split(0.7)
     found = path(data, formulation, penalty=penalty, weights=[3.0, 0.1], **STRUCTURE)
     assert np.array_equal(found.weights, [0.1, 3.0])
