@@ -43,11 +43,12 @@ _HOME = {
     "OrderStudy": "model_order",
     "load": "io",
     "RecursiveARX": "recursion",
+    "Fault": "faults",
     "bootstrap": "resampling",
     "design": "experiment",
     "frequency_response": "experiment",
 }
-_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants"}
+_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "faults"}
 
 
 def __getattr__(name: str) -> Any:

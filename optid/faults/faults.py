@@ -1,0 +1,356 @@
+"""What breaks: the fault models (1.8)-(1.13) of the dissertation and the practical ones.
+
+Timing, for every kind: the onset theta is the first sample of the record that the fault can change. What enters through
+the state equation changes x(theta) first, so it is present in the step from theta - 1 to theta; what enters through the
+output equation, a direct feedthrough included, changes y(theta) first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+ADDITIVE = ("step", "jump", "ramp")
+PLACES = {
+    "step": ("actuator", "sensor", "process", "state"),
+    "jump": ("actuator", "sensor", "process", "state"),
+    "ramp": ("actuator", "sensor", "process", "state"),
+    "loss": ("actuator", "sensor"),
+    "stuck": ("actuator", "sensor"),
+    "frozen": ("actuator", "sensor"),
+    "hard_over": ("actuator", "sensor"),
+    "process_noise": ("process", "state"),
+    "sensor_noise": ("sensor",),
+    "schedule": ("process", "state"),
+}
+"""The places where each kind of fault can be."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fault:
+    """One fault. Build it with the class methods: `step`, `jump`, `ramp`, `loss`, `stuck`, `frozen`, ....
+
+    Attributes:
+        name: where: "actuator:u1", "sensor:y2", "process:load" (a direction in the state equation), "state".
+        kind: what, one of the keys of `PLACES`.
+        onset: first sample of the record that it can change.
+        end: first sample that it no longer changes; None where it stays.
+        size: size of an additive fault, share lost of a loss, value of a stuck one; None where the kind has none.
+        direction: (n,) or (n, d) direction in the state equation of a "process" fault; None where the name says it.
+        bias: constant added to f of a lost actuator, (1 - size) f(u) + bias.
+        std: standard deviation of the added noise.
+        scale: factor of the standard deviation of the noise that is there already, instead of std.
+        covariance: of the added noise, instead of std and scale.
+        A: (n, n), (N, n, n) or k -> (n, n): what replaces A from the onset on.
+        B: (n, r), (N, n, r) or k -> (n, r): what replaces B from the onset on.
+
+    Raises:
+        StructureError: an unknown kind, a name that does not fit the kind, an onset that is not a whole number from 0.
+    """
+
+    name: str
+    kind: str
+    onset: int
+    end: int | None = None
+    size: Any = None
+    direction: Any = None
+    bias: float = 0.0
+    std: float | None = None
+    scale: float | None = None
+    covariance: Any = None
+    A: Any = None
+    B: Any = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in PLACES:
+            raise StructureError(f"fault of kind {self.kind!r}: {nearest(self.kind, PLACES)}")
+        place = self.place
+        if place not in PLACES[self.kind]:
+            raise StructureError(
+                f"{self.name!r} cannot have a fault of kind {self.kind!r}: "
+                f"its name begins with {' or '.join(repr(p) for p in PLACES[self.kind])}, as in 'actuator:u1'."
+            )
+        for word, value in (("onset", self.onset), ("end", self.end)):
+            if value is not None and (value != int(value) or value < 0):
+                raise StructureError(f"{self.name}: {word} = {value!r}; the number of a sample, from 0, is needed.")
+        if self.end is not None and self.end <= self.onset:
+            raise StructureError(f"{self.name}: end = {self.end} is not after onset = {self.onset}.")
+
+    @property
+    def place(self) -> str:
+        """The part of the name before the colon."""
+        return self.name.partition(":")[0]
+
+    @property
+    def channel(self) -> str:
+        """The part of the name after the colon."""
+        return self.name.partition(":")[2]
+
+    def __str__(self) -> str:
+        """Say what breaks, where and when."""
+        until = "" if self.end is None else f" until {self.end}"
+        size = "" if self.size is None else f" {np.array2string(np.asarray(self.size), precision=4)}".replace("'", "")
+        return f"{self.name}: {self.kind.replace('_', ' ')}{size} from sample {self.onset}{until}"
+
+    def active(self, count: int) -> slice:
+        """Return the samples of a record of `count` that the fault can change.
+
+        Raises:
+            DataError: the onset lies beyond the record.
+        """
+        if self.onset >= count:
+            raise DataError(f"{self.name}: onset {self.onset} lies beyond the record of {count} samples.")
+        return slice(int(self.onset), count if self.end is None else min(int(self.end), count))
+
+    # -- additive ------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def step(
+        cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
+    ) -> "Fault":
+        """Return a constant offset from the onset on, (1.8) and (1.9).
+
+        Args:
+            name: "actuator:u1" adds to f(u1); "sensor:y1" to the reading; "process:load" to the state along the
+                direction; "state" to the whole state.
+            onset: first sample that it can change.
+            size: a number, or a vector with one entry per column of the place (several functions of an input, the n
+                states).
+            end: first sample that it no longer changes.
+            direction: (n,) of a "process" fault.
+        """
+        return cls(name, "step", onset, end, _size(name, size), _direction(name, direction))
+
+    @classmethod
+    def jump(cls, name: str, onset: int, size: ArrayLike, *, direction: ArrayLike | None = None) -> "Fault":
+        """Return an offset in one sample only: a jump of the state, a spike of a sensor. Arguments as `step`."""
+        return cls(name, "jump", onset, None, _size(name, size), _direction(name, direction))
+
+    @classmethod
+    def ramp(
+        cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
+    ) -> "Fault":
+        """Return a drift: slope at the onset, twice the slope one sample later, ....
+
+        Args:
+            name: as `step`.
+            onset: first sample that it can change.
+            slope: growth per sample; a number or a vector as the size of `step`.
+            end: first sample that it no longer changes.
+            direction: (n,) of a "process" fault.
+        """
+        return cls(name, "ramp", onset, end, _size(name, slope), _direction(name, direction))
+
+    drift = ramp
+
+    # -- multiplicative --------------------------------------------------------------------------------------------
+
+    @classmethod
+    def loss(cls, name: str, onset: int, fraction: float, *, bias: float = 0.0, end: int | None = None) -> "Fault":
+        """Return a loss of effectiveness, (1.10) and (1.11): (1 - fraction) f(u) + bias, or that of the output.
+
+        The noise of a sensor stays.
+
+        Args:
+            name: "actuator:u1" or "sensor:y1".
+            onset: first sample that it can change.
+            fraction: share lost, 0 to 1.
+            bias: constant added, in units of f (of the output for a sensor).
+            end: first sample that it no longer changes.
+
+        Raises:
+            StructureError: a fraction outside [0, 1].
+        """
+        if not 0 <= fraction <= 1:
+            raise StructureError(f"{name}: fraction = {fraction!r}; a share from 0 to 1 is needed.")
+        return cls(name, "loss", onset, end, float(fraction), bias=float(bias))
+
+    @classmethod
+    def stuck(cls, name: str, onset: int, value: Any = "last", *, end: int | None = None) -> "Fault":
+        """Return an actuator that no longer moves, or a sensor that repeats one reading without noise.
+
+        Args:
+            name: "actuator:u1" or "sensor:y1".
+            onset: first sample that it can change.
+            value: the input at which the actuator stands (the reading of the sensor), or "last": where the plant was
+                last driven from, the input two samples before the onset (the reading before the onset).
+            end: first sample that it no longer changes.
+        """
+        if not isinstance(value, str):
+            value = float(_finite(name, value, "value"))
+        elif value != "last":
+            raise StructureError(f"{name}: value = {value!r}; a number or 'last' is needed.")
+        return cls(name, "stuck", onset, end, value)
+
+    @classmethod
+    def frozen(cls, name: str, onset: int, *, end: int | None = None) -> "Fault":
+        """Return a sensor that repeats its last reading to the bit, or an actuator that keeps its last position."""
+        return cls(name, "frozen", onset, end, "last")
+
+    @classmethod
+    def hard_over(cls, name: str, onset: int, value: float | None = None, *, end: int | None = None) -> "Fault":
+        """Return a complete failure.
+
+        Args:
+            name: "actuator:u1" or "sensor:y1".
+            onset: first sample that it can change.
+            value: None for the complete loss of the dissertation (the channel contributes nothing, a sensor reads its
+                noise); a number for one that runs to a stop: the input (reading) there.
+            end: first sample that it no longer changes.
+        """
+        return cls(name, "hard_over", onset, end, None if value is None else float(_finite(name, value, "value")))
+
+    # -- noise -----------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def process_noise(
+        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+        covariance: ArrayLike | None = None, end: int | None = None, direction: ArrayLike | None = None,
+    ) -> "Fault":
+        """Return additional white noise in the state equation, (1.12).
+
+        Args:
+            name: "process:load" along a direction, or "process" in all states.
+            onset: first sample that it can change.
+            std: standard deviation of the added noise along the direction (of every state).
+            scale: instead, the factor by which the standard deviation of the noise that is there grows.
+            covariance: instead, (n, n).
+            end: first sample that it no longer changes.
+            direction: (n,).
+
+        Raises:
+            StructureError: not exactly one of std, scale and covariance, or one of them impossible.
+        """
+        std, scale, covariance = _noise(name, std, scale, covariance)
+        return cls(name, "process_noise", onset, end, None, _direction(name, direction), 0.0, std, scale, covariance)
+
+    @classmethod
+    def sensor_noise(
+        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+        covariance: ArrayLike | None = None, end: int | None = None,
+    ) -> "Fault":
+        """Return additional white noise of a sensor, (1.13); "sensor" alone is all of them. As `process_noise`."""
+        std, scale, covariance = _noise(name, std, scale, covariance)
+        return cls(name, "sensor_noise", onset, end, std=std, scale=scale, covariance=covariance)
+
+    # -- other dynamics ----------------------------------------------------------------------------------------------
+
+    @classmethod
+    def schedule(cls, onset: int = 0, *, A: Any = None, B: Any = None, end: int | None = None) -> "Fault":
+        """Return other matrices A(k) and B(k) of the state equation, (1.8) and (1.10).
+
+        Args:
+            onset: first sample that they can change: the step from onset - 1 to onset uses A(onset - 1).
+            A: (n, n), (N, n, n) for every sample k of the record, or a function of k; None leaves A as it is.
+            B: (n, r), (N, n, r) or a function of k; None leaves B as it is.
+            end: first sample that they no longer change.
+
+        Raises:
+            StructureError: neither A nor B.
+        """
+        if A is None and B is None:
+            raise StructureError("schedule: give A, B or both.")
+        return cls("process", "schedule", onset, end, A=A, B=B)
+
+
+def place_of(model: "HammersteinSS", name: str, direction: Any = None,
+             process: Mapping[str, ArrayLike] | None = None) -> tuple[Array, Array]:
+    """Return where an additive fault enters: the state equation (n, d) and the output equation (l, d).
+
+    Args:
+        model: the model.
+        name: "actuator:u1", "sensor:y1", "process:load", "process:x1", "process" or "state".
+        direction: (n,) or (n, d) of a "process" fault.
+        process: directions by name, where `direction` is not given.
+
+    Raises:
+        LookupFailed: no such channel or direction.
+        StructureError: a direction of another shape.
+    """
+    place, _, channel = name.partition(":")
+    n, l = model.nx, model.l  # noqa: E741
+    if place == "actuator":
+        columns = [i for i, c in enumerate(model.input_of) if c == channel_of(model.inputs, name)]
+        return np.array(model.B[:, columns]), np.array(model.D[:, columns])
+    if place == "sensor":
+        reading = range(l) if not channel else [channel_of(model.outputs, name)]
+        return np.zeros((n, len(reading))), np.eye(l)[:, list(reading)]
+    if place == "process" and direction is None and channel:
+        states = numbered(n)
+        if process is not None and channel in process:
+            direction = process[channel]
+        elif channel in states:
+            direction = np.eye(n)[:, states.index(channel)]
+        else:
+            raise LookupFailed(
+                f"{name!r}: no direction of this name. Give direction=(n,) with the fault, or "
+                f"process={{{channel!r}: (n,)}}; 'process:x1' is the first state. {nearest(channel, process or states)}"
+            )
+    if place == "process" and direction is not None:
+        columns = np.asarray(direction, dtype=float)
+        columns = columns[:, None] if columns.ndim == 1 else columns
+        if columns.ndim != 2 or len(columns) != n or not columns.any() or not np.isfinite(columns).all():
+            raise StructureError(
+                f"{name}: direction of shape {np.shape(direction)}; ({n},) is needed, finite and not zero."
+            )
+        return columns, np.zeros((l, columns.shape[1]))
+    if place in ("process", "state") and not channel:
+        return np.eye(n), np.zeros((l, n))
+    raise LookupFailed(
+        f"{name!r}: a fault is named 'actuator:<input>', 'sensor:<output>', 'process:<direction>' or 'state'."
+    )
+
+
+def channel_of(names: tuple[str, ...], name: str) -> int:
+    """Return the index of the channel that the name of a fault ends in.
+
+    Raises:
+        LookupFailed: no such channel.
+    """
+    channel = name.partition(":")[2]
+    if channel not in names:
+        raise LookupFailed(f"{name!r}: there is no channel {channel!r}. {nearest(channel, names)}")
+    return names.index(channel)
+
+
+def numbered(n: int) -> list[str]:
+    """Return the names of n states."""
+    return [f"x{i}" for i in range(1, n + 1)]
+
+
+def _finite(name: str, value: Any, word: str) -> Any:
+    if not np.all(np.isfinite(value)):
+        raise StructureError(f"{name}: {word} = {value!r} is not finite.")
+    return value
+
+
+def _size(name: str, size: ArrayLike) -> Array:
+    return _finite(name, np.atleast_1d(np.asarray(size, dtype=float)), "size")
+
+
+def _direction(name: str, direction: ArrayLike | None) -> Array | None:
+    return None if direction is None else _finite(name, np.asarray(direction, dtype=float), "direction")
+
+
+def _noise(name: str, std: Any, scale: Any, covariance: Any) -> tuple[float | None, float | None, Array | None]:
+    if sum(given is not None for given in (std, scale, covariance)) != 1:
+        raise StructureError(f"{name}: give one of std, scale and covariance.")
+    if std is not None and not (np.isfinite(std) and std >= 0):
+        raise StructureError(f"{name}: std = {std!r}; a number from 0 is needed.")
+    if scale is not None and not (np.isfinite(scale) and scale >= 1):
+        raise StructureError(f"{name}: scale = {scale!r}; a factor from 1 is needed: noise is added, not taken away.")
+    if covariance is None:
+        return None if std is None else float(std), None if scale is None else float(scale), None
+    matrix = np.atleast_2d(np.asarray(covariance, dtype=float))
+    if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] < \
+            -1e-9 * np.abs(matrix).max():
+        raise StructureError(f"{name}: covariance is not symmetric and positive semidefinite.")
+    return None, None, matrix

@@ -1,0 +1,303 @@
+"""Simulation of a plant that breaks."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.faults import ADDITIVE, Fault, channel_of, place_of
+from optid.models.experiments import one_or_all, records_of
+from optid.models.noise_covariances import NoiseCovariances
+from optid.models.state_simulation import check_inputs, state_like
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+
+class Trajectory(NamedTuple):
+    """A simulated record of a plant with faults.
+
+    Attributes:
+        y: (N, l) readings.
+        x: (N, n) states.
+    """
+
+    y: Array
+    x: Array
+
+
+class _Plan(NamedTuple):
+    """What the faults make of one record; see `optid.faults.kernels.march_faulty`."""
+
+    state: Array
+    output: Array
+    jolt: Array
+    start: Array
+    w: Array
+    gain: Array
+    shift: Array
+    v: Array
+    fixed: Array
+    hold: Array
+    A: Array
+    B: Array
+
+
+def inject(
+    model: "HammersteinSS",
+    u: Any,
+    faults: Fault | Sequence[Fault] = (),
+    *,
+    seed: int | None = 0,
+    x0: Any = "zero",
+    noise: NoiseCovariances | str = "model",
+    process: Mapping[str, ArrayLike] | None = None,
+    feedback: str = "measured",
+) -> Any:
+    """Simulate a plant with faults, several at once where wanted.
+
+    The noise of the healthy plant is the same with and without faults for the same seed. Losses and stuck actuators act
+    in the order given, offsets are added after them.
+
+    Args:
+        model: the plant.
+        u: inputs (N,) or (N, m), or a list of such arrays, or Data; no sample missing.
+        faults: what breaks; none for the healthy plant.
+        seed: of the noise.
+        x0: "zero", "rest" (the equilibrium at the first input) or the state (n,), of every experiment.
+        noise: "model" for `model.noise`, "none", or covariances (the one of the innovations is not used).
+        process: directions (n,) by name for faults "process:<name>" that bring none.
+        feedback: what a nonlinear feedback and the output injection L of the plant see: "measured" (the readings, as a
+            controller does), or "true" (the outputs with their noise, but without the faults of the sensors).
+
+    Returns:
+        (N, l) readings; a tuple of such arrays for several experiments.
+
+    Raises:
+        DataError: a missing input, an onset beyond the record, an output that leaves the range of numbers.
+        LookupFailed: a channel or direction that the model does not have.
+        StructureError: sizes that do not fit, no noise covariances, functions of the user in the feedback.
+    """
+    how: dict[str, Any] = {"x0": x0, "noise": noise, "process": process, "feedback": feedback}
+    records, _ = records_of(model, u)
+    seeds = np.random.SeedSequence(seed).spawn(len(records)) if len(records) > 1 else [seed]
+    return one_or_all([
+        trajectory(model, inputs, faults, seed=own, **how).y for (inputs, _, _), own in zip(records, seeds)
+    ])
+
+
+def trajectory(
+    model: "HammersteinSS",
+    u: ArrayLike,
+    faults: Fault | Sequence[Fault] = (),
+    *,
+    seed: Any = 0,
+    x0: Any = "zero",
+    noise: NoiseCovariances | str = "model",
+    process: Mapping[str, ArrayLike] | None = None,
+    feedback: str = "measured",
+) -> Trajectory:
+    """Simulate one record as `inject` does and return the states, too."""
+    from optid.faults.kernels import march_faulty
+    from optid.models.state_kernels import INSIDE, REFUSED
+
+    if feedback not in ("measured", "true"):
+        raise StructureError(f"feedback={feedback!r}: use 'measured' or 'true'.")
+    if not model.parts.tables.compiled:
+        raise StructureError(
+            "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
+        )
+    inputs = records_of(model, [np.asarray(u)])[0][0][0]
+    check_inputs(model, inputs, "")
+    broken = [faults] if isinstance(faults, Fault) else list(faults)
+    plan = _planned(model, inputs, broken, _covariances(model, noise), seed, process or {})
+    drive = plan.jolt + model.offset_x + np.einsum("kir,kr->ki", plan.B, plan.state, optimize=True)
+    direct = plan.output @ model.D.T + model.offset_y
+    x = _started(model, x0, inputs) + plan.start
+    states, readings = np.empty((len(inputs), model.nx)), np.empty((len(inputs), model.l))
+    table, which = (plan.A[:1], np.zeros(len(inputs), dtype=np.int64)) if plan.A.strides[0] == 0 else (
+        plan.A, np.arange(len(inputs)))
+    ended, at = march_faulty(
+        model.parts, np.ascontiguousarray(table), which, drive, direct, plan.w, plan.gain, plan.shift, plan.v,
+        plan.fixed, plan.hold, feedback == "true", x, states, readings,
+    )
+    if ended != INSIDE:
+        raise DataError(
+            f"At sample {at} the output leaves the interval of a feedback basis with outside='error'."
+            if ended == REFUSED else f"The faulty plant leaves the range of numbers at sample {at}: it is unstable."
+        )
+    return Trajectory(readings, states)
+
+
+def _planned(
+    model: "HammersteinSS", u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
+    process: Mapping[str, ArrayLike],
+) -> _Plan:
+    count, n, l = len(u), model.nx, model.l  # noqa: E741
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    healthy, *streams = (np.random.default_rng(s) for s in root.spawn(len(faults) + 1))
+    w, v = _noises(healthy, count, n, l, covariances)
+    f = model.expanded(u)
+    plan = _Plan(
+        f, f.copy(), np.zeros((count, n)), np.zeros(n), w, np.ones((count, l)), np.zeros((count, l)), v,
+        np.full((count, l), np.nan), np.zeros((count, l), dtype=bool),
+        np.broadcast_to(model.A, (count, n, n)), np.broadcast_to(model.B, (count, n, f.shape[1])),
+    )
+    for fault, stream in sorted(zip(faults, streams), key=lambda pair: pair[0].kind in ADDITIVE):
+        now = fault.active(count)
+        before = slice(max(now.start - 1, 0), now.stop - 1)
+        if fault.kind in ADDITIVE:
+            _add(model, plan, fault, now, before, process)
+        elif fault.kind == "schedule":
+            plan = _scheduled(model, plan, fault, before, count)
+        elif fault.kind == "process_noise":
+            where, _ = place_of(model, fault.name, fault.direction, process)
+            spread = _added(fault, where, None if covariances is None else covariances.Q)
+            plan.w[before] += _draw(stream, before.stop - before.start, spread) @ where.T
+        elif fault.kind == "sensor_noise":
+            _, where = place_of(model, fault.name)
+            spread = _added(fault, where, None if covariances is None else covariances.R)
+            plan.v[now] += _draw(stream, now.stop - now.start, spread) @ where.T
+        elif fault.place == "actuator":
+            _break_actuator(model, plan, fault, now, before, u)
+        else:
+            _break_sensor(model, plan, fault, now)
+    return plan
+
+
+def _add(
+    model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, process: Mapping[str, ArrayLike]
+) -> None:
+    into_state, into_output = place_of(model, fault.name, fault.direction, process)
+    size = np.asarray(fault.size)
+    if size.shape != (into_state.shape[1],):
+        raise StructureError(
+            f"{fault.name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
+            "each."
+        )
+    course = np.zeros(len(plan.shift))
+    course[now] = np.arange(1, now.stop - now.start + 1) if fault.kind == "ramp" else 1.0
+    if fault.kind == "jump":
+        course[now.start + 1 :] = 0.0
+    if fault.place == "actuator":  # through B(k), which may be scheduled
+        columns = [i for i, c in enumerate(model.input_of) if c == channel_of(model.inputs, fault.name)]
+        plan.output[:, columns] += np.outer(course, size)
+        plan.state[:-1, columns] += np.outer(course[1:], size)
+    else:
+        plan.shift[:] += np.outer(course, into_output @ size)
+        plan.jolt[:-1] += np.outer(course[1:], into_state @ size)
+    plan.start[:] += course[0] * (into_state @ size)
+
+
+def _scheduled(model: "HammersteinSS", plan: _Plan, fault: Fault, before: slice, count: int) -> _Plan:
+    changed = {}
+    for word, given, whole in (("A", fault.A, plan.A), ("B", fault.B, plan.B)):
+        if given is None:
+            continue
+        steps = range(before.start, before.stop)
+        values = np.array([given(k) for k in steps]) if callable(given) else np.asarray(given, dtype=float)
+        if not callable(given) and values.shape == (count, *whole.shape[1:]):
+            values = values[before]
+        if values.shape not in (whole.shape[1:], (len(steps), *whole.shape[1:])):
+            raise StructureError(
+                f"schedule: {word} has shape {values.shape}; {whole.shape[1:]} or {whole.shape} is needed."
+            )
+        if not np.isfinite(values).all():
+            raise StructureError(f"schedule: {word} has a value that is not finite.")
+        own = np.array(whole)
+        own[before] = values
+        changed[word] = own
+    return plan._replace(**changed)
+
+
+def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:
+    c = channel_of(model.inputs, fault.name)
+    columns = [i for i, of in enumerate(model.input_of) if of == c]
+    for values, samples in ((plan.output, now), (plan.state, before)):
+        for i in columns:
+            if fault.kind == "loss":
+                values[samples, i] = (1 - fault.size) * values[samples, i] + fault.bias
+            elif fault.size is None:
+                values[samples, i] = 0.0
+            else:
+                stop = u[max(now.start - 2, 0), c] if fault.size == "last" else fault.size
+                values[samples, i] = model.nonlinearities[i](stop)
+
+
+def _break_sensor(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice) -> None:
+    o = channel_of(model.outputs, fault.name)
+    if fault.kind == "loss":
+        plan.gain[now, o] *= 1 - fault.size
+        plan.shift[now, o] += fault.bias
+    elif fault.size is None:
+        plan.gain[now, o] = 0.0
+    elif fault.size == "last":
+        plan.hold[now, o] = True
+    else:
+        plan.fixed[now, o] = fault.size
+
+
+def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:
+    if isinstance(noise, NoiseCovariances):
+        if noise.S.shape != (model.nx, model.l):
+            raise StructureError(f"noise: S has shape {noise.S.shape}; {(model.nx, model.l)} is needed.")
+        return noise
+    if noise == "none":
+        return None
+    if noise != "model":
+        raise StructureError(f"noise={noise!r}: use 'model', 'none' or NoiseCovariances.")
+    if model.noise is None:
+        raise StructureError(
+            "The model has no noise covariances: estimate them with optid.noise.with_noise(model, data), or pass "
+            "noise='none' for a run without noise."
+        )
+    return model.noise
+
+
+def _noises(
+    rng: np.random.Generator, count: int, n: int, outputs: int, covariances: NoiseCovariances | None
+) -> tuple[Array, Array]:
+    if covariances is None:
+        return np.zeros((count, n)), np.zeros((count, outputs))
+    together = np.block([[covariances.Q, covariances.S], [covariances.S.T, covariances.R]])
+    drawn = _draw(rng, count, together)
+    return np.ascontiguousarray(drawn[:, :n]), np.ascontiguousarray(drawn[:, n:])
+
+
+def _draw(rng: np.random.Generator, count: int, covariance: Array) -> Array:
+    """Draw (count, d) Gaussian samples of a covariance that may be singular."""
+    sizes, axes = np.linalg.eigh(covariance)
+    if sizes[0] < -1e-8 * max(sizes[-1], 0.0):
+        raise StructureError("The covariance of the noise is not positive semidefinite.")
+    return rng.standard_normal((count, len(covariance))) @ (axes * np.sqrt(np.maximum(sizes, 0.0))).T
+
+
+def _added(fault: Fault, where: Array, present: Array | None) -> Array:
+    """Return the covariance (d, d) of the added noise along the columns of `where`."""
+    d = where.shape[1]
+    if fault.covariance is not None:
+        if fault.covariance.shape != (d, d):
+            raise StructureError(
+                f"{fault.name}: covariance of shape {fault.covariance.shape}; ({d}, {d}) is needed."
+            )
+        return fault.covariance
+    if fault.std is not None:
+        return fault.std**2 * np.eye(d)
+    assert fault.scale is not None
+    if present is None:
+        raise StructureError(f"{fault.name}: scale multiplies the noise of the model, and there is none; give std.")
+    along = np.linalg.pinv(where)
+    return (fault.scale**2 - 1) * along @ present @ along.T
+
+
+def _started(model: "HammersteinSS", x0: Any, u: Array) -> Array:
+    if not isinstance(x0, str):
+        return np.array(state_like(model, x0))
+    if x0 == "zero":
+        return np.zeros(model.nx)
+    if x0 != "rest":
+        raise StructureError(f"x0={x0!r}: use 'zero', 'rest' or an array ({model.nx},).")
+    return np.array(model.equilibrium(u[0])[0])

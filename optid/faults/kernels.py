@@ -1,0 +1,65 @@
+"""Compiled recursions of faulty plants and of what a fault leaves in the innovations."""
+
+import numpy as np
+from numba import njit
+
+from optid.models.state_kernels import INSIDE, LEFT, REFUSED, value_and_slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, true_feedback, x, states, outputs):
+    """Run a plant with faults.
+
+    Args:
+        parts: matrices and tables of the plant.
+        A: (M, n, n) the matrices that A(k) takes.
+        which: (N,) which of them governs the step from sample k to k + 1.
+        jolt: (N, n) what inputs, constants and faults add in the step from k to k + 1.
+        direct: (N, l) what inputs and constants add to the output.
+        w: (N, n) process noise.
+        gain: (N, l) factor of the output.
+        shift: (N, l) what is added to the output after it.
+        v: (N, l) measurement noise.
+        fixed: (N, l) reading that replaces the output, NaN where there is none.
+        hold: (N, l) whether the reading of the sample before is repeated.
+        true_feedback: whether the plant feeds back its outputs as they are, not as the broken sensors show them.
+        x: (n,) state, changed in place.
+        states: (N, n) written.
+        outputs: (N, l) written.
+
+    Returns:
+        how the run ended and the sample at which it did.
+    """
+    C, E, L = parts.C, parts.E, parts.L
+    n, l, s = x.size, C.shape[0], E.shape[1]  # noqa: E741
+    later, seen = np.empty(n), np.empty(l)
+    for k in range(outputs.shape[0]):
+        for o in range(l):
+            true = direct[k, o]
+            for i in range(n):
+                true += C[o, i] * x[i]
+            reading = gain[k, o] * true + shift[k, o] + v[k, o]
+            if not np.isnan(fixed[k, o]):
+                reading = fixed[k, o]
+            if hold[k, o] and k > 0:
+                reading = outputs[k - 1, o]
+            if not np.isfinite(reading):
+                return LEFT, k
+            outputs[k, o] = reading
+            seen[o] = true + v[k, o] if true_feedback else reading
+        for i in range(n):
+            states[k, i] = x[i]
+            later[i] = jolt[k, i] + w[k, i]
+            for j in range(n):
+                later[i] += A[which[k], i, j] * x[j]
+            for o in range(l):
+                later[i] += L[i, o] * seen[o]
+        for j in range(s):
+            fed, slope, refused = value_and_slope(parts.tables, j, seen[parts.output_of[j]])
+            if refused:
+                return REFUSED, k
+            for i in range(n):
+                later[i] += E[i, j] * fed
+        for i in range(n):
+            x[i] = later[i]
+    return INSIDE, outputs.shape[0]

@@ -1,0 +1,34 @@
+"""The standard plant of the faults, and others with known parameters."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from optid.bases import UserFunctions
+from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
+from optid.models.kalman import kalman_gain
+
+
+def noisy(A, B, C, Q, R, **changes):
+    """A linear model with the noise of the given covariances and its steady gain."""
+    steady = kalman_gain(A, C, Q, R)
+    cross = np.zeros((len(A), len(C)))
+    return HammersteinSS(A, B, C, K=steady.K, noise=NoiseCovariances(Q, R, cross, steady.innovation), **changes)
+
+
+def standard(folder: Path) -> tuple[HammersteinSS, np.ndarray]:
+    """The plant of fault_plant.json and the direction of its load."""
+    p = {key: np.array(value) for key, value in json.loads((folder / "fault_plant.json").read_text()).items()
+         if len(key) == 1}
+    span = (-1.2, 1.2)
+    f1 = UserFunctions((lambda u: u + 0.25 * u**3,), interval=span, outside="extrapolate", names=("f1",))
+    f2 = UserFunctions((lambda u: np.tanh(1.5 * u) + 0.15 * u,), interval=span, outside="extrapolate", names=("f2",))
+    functions = tuple(Nonlinearity(f, np.ones(1)) for f in (f1, f2))
+    return noisy(p["A"], p["B"], p["C"], p["Q"], p["R"], D=p["D"], nonlinearities=functions), p["E"][:, 0]
+
+
+def levels(count, seed, m=2, hold=5):
+    """Inputs uniform on [-1.2, 1.2], every level held."""
+    drawn = np.random.default_rng(seed).uniform(-1.2, 1.2, (-(-count // hold), m))
+    return np.repeat(drawn, hold, axis=0)[:count]
