@@ -42,7 +42,8 @@ def draw(study: "OrderStudy") -> "Figure":
         for name, word in (("aicc", "AICc"), ("bic", "BIC")):
             cost = getattr(states, name)
             criteria.plot(k, (cost - cost.min()) / states.windows, "o-", markersize=3, label=f"{word} per window")
-        criteria.set(title="prediction errors", xlabel="n", yscale="symlog")
+        criteria.set(title="prediction errors, above the best", xlabel="n")
+        criteria.set_yscale("symlog", linthresh=0.01)  # the first orders are far above, the others near the best
         criteria.set_ylim(bottom=0)
         if np.isfinite(states.fit).any():
             other = criteria.twinx()
@@ -50,7 +51,7 @@ def draw(study: "OrderStudy") -> "Figure":
             other.set_ylabel("hold-out fit, % (dashed)")
             other.grid(False)
         _draw_lags(study, lags)
-        for axes, where in ((values, "upper right"), (tails, "upper right"), (criteria, "center")):
+        for axes, where in ((values, "upper right"), (tails, "upper right"), (criteria, "lower right")):
             axes.legend(loc=where)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         title = f"recommended: nx = {study.nx}"
