@@ -48,7 +48,7 @@ _HOME = {
     "design": "experiment",
     "frequency_response": "experiment",
 }
-_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "faults"}
+_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "faults", "tracking"}
 
 
 def __getattr__(name: str) -> Any:
