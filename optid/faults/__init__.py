@@ -10,6 +10,10 @@ _HOME = {
     "Fault": "faults",
     "inject": "injection",
     "trajectory": "injection",
+    "whiten": "whitening",
+    "health": "whitening",
+    "predictor": "whitening",
+    "model_uncertainty": "nuisance",
 }
 
 

@@ -216,21 +216,22 @@ def _scheduled(model: "HammersteinSS", plan: _Plan, fault: Fault, before: slice,
 def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:
     c = channel_of(model.inputs, fault.name)
     columns = [i for i, of in enumerate(model.input_of) if of == c]
+    size: Any = fault.size
     for values, samples in ((plan.output, now), (plan.state, before)):
         for i in columns:
             if fault.kind == "loss":
-                values[samples, i] = (1 - fault.size) * values[samples, i] + fault.bias
-            elif fault.size is None:
+                values[samples, i] = (1.0 - np.asarray(size)) * values[samples, i] + fault.bias
+            elif size is None:
                 values[samples, i] = 0.0
             else:
-                stop = u[max(now.start - 2, 0), c] if fault.size == "last" else fault.size
+                stop = u[max(now.start - 2, 0), c] if size == "last" else size
                 values[samples, i] = model.nonlinearities[i](stop)
 
 
 def _break_sensor(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice) -> None:
     o = channel_of(model.outputs, fault.name)
     if fault.kind == "loss":
-        plan.gain[now, o] *= 1 - fault.size
+        plan.gain[now, o] *= 1.0 - np.asarray(fault.size)
         plan.shift[now, o] += fault.bias
     elif fault.size is None:
         plan.gain[now, o] = 0.0

@@ -63,3 +63,38 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
         for i in range(n):
             x[i] = later[i]
     return INSIDE, outputs.shape[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def respond(A, C, K, L, present, into_state, into_output, response):
+    """What additions to the state and to the output leave in the innovations of the steady predictor.
+
+    Args:
+        A: (n, n).
+        C: (l, n).
+        K: (n, l) gain.
+        L: (n, l) output injection of the plant.
+        present: (N, l) whether the reading is there; one that is missing corrects nothing.
+        into_state: (N, n, d) added to x(k).
+        into_output: (N, l, d) added to y(k).
+        response: (N, l, d) written.
+    """
+    n, l, d = A.shape[0], C.shape[0], into_state.shape[2]  # noqa: E741
+    x, later = np.zeros((n, d)), np.zeros((n, d))
+    for k in range(present.shape[0]):
+        for p in range(d):
+            for i in range(n):
+                x[i, p] += into_state[k, i, p]
+            for o in range(l):
+                now = into_output[k, o, p]
+                for i in range(n):
+                    now += C[o, i] * x[i, p]
+                response[k, o, p] = now
+            for i in range(n):
+                later[i, p] = 0.0
+                for j in range(n):
+                    later[i, p] += A[i, j] * x[j, p]
+                for o in range(l):
+                    later[i, p] += (-K[i, o] if present[k, o] else L[i, o]) * response[k, o, p]
+            for i in range(n):
+                x[i, p] = later[i, p]

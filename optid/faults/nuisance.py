@@ -1,0 +1,174 @@
+"""What an identified model does not know about itself, as noise in its innovations.
+
+The parameters of an identified model scatter with a covariance P. In a window of new data their error leaves Psi times
+itself in the whitened innovations, Psi being the sensitivity of the predictor. So the innovations of a healthy plant
+have the covariance I + Psi P Psi', by which they are whitened once more. P is the inverse of the information in the
+record the model was identified from. Turning the states, or moving a factor between f and B, changes no prediction:
+the information says nothing of such directions, Psi is zero along them, and the pseudo-inverse leaves them out.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Data, Experiment
+from optid.errors import DataError
+from optid.faults.whitening import Predictor, predictor
+from optid.models import state_simulation as simulation
+from optid.models.experiments import in_units_of
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+MATRICES = ("A", "B", "C", "D", "E", "L", "K", "offset_x", "offset_y")
+
+STEP = 1e-5
+"""Step of the central differences, relative to the parameter and to the size of its matrix."""
+
+KNOWN = 1e-12
+"""Directions with less than this share of the largest information are those that change no prediction."""
+
+DIFFUSE = 1e6
+"""Standard deviation, in sizes of its effect, of an initial state of which nothing is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M.
+
+    Attributes:
+        U: (N l, q) orthonormal.
+        s: (q,).
+    """
+
+    U: Array
+    s: Array
+
+    def __call__(self, r: Array) -> Array:
+        """Whiten (N, l) or (N, l, d)."""
+        flat = r.reshape(len(self.U), -1)
+        drop = 1 - 1 / np.sqrt(1 + self.s**2)
+        return np.asarray((flat - self.U @ (drop[:, None] * (self.U.T @ flat))).reshape(r.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class ModelUncertainty:
+    """The covariance of the parameters of an identified model.
+
+    Attributes:
+        model: the model, with the gain of its steady predictor.
+        predictor: that predictor.
+        root: (parameters, q) with covariance root root'.
+        readings: number of readings behind it, less one for each initial state estimated.
+    """
+
+    model: "HammersteinSS"
+    predictor: Predictor
+    root: Array
+    readings: int
+
+    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
+        """Return what the uncertainty leaves in the whitened innovations of a record.
+
+        Args:
+            part: the record, in raw units.
+            x0: (n,) its initial state.
+            present: (N, l) whether a reading is there.
+            free_start: whether the initial state was estimated from this very record, so that nothing is known of it.
+        """
+        by_parameter, by_start = _sensitivities(self.model, self.predictor, part, x0, present, self.root)
+        columns = [by_parameter]
+        if free_start:
+            sizes = np.linalg.norm(by_start, axis=0)
+            columns.append(DIFFUSE * by_start / np.where(sizes > 0, sizes, 1.0))
+        U, s, _ = np.linalg.svd(np.hstack(columns), full_matrices=False)
+        return Nuisance(U, s)
+
+
+def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
+    """Return the covariance of the parameters of a model, from the record it was identified from.
+
+    All entries of the matrices that are not zero throughout, the gain, the offsets and the coefficients of the
+    nonlinearities are uncertain; the initial states of the record are, too.
+
+    Args:
+        model: with noise covariances.
+        data: the record it was identified from.
+
+    Raises:
+        DataError: fewer than two readings for each direction of the parameters that changes the predictions.
+        StructureError: no noise covariances.
+    """
+    steady = predictor(model)
+    gained = replace(model, K=steady.K)
+    raw = in_units_of(model, data)
+    given = gained.initial_state(raw, "predict")
+    starts = given if isinstance(given, tuple) else (given,)
+    count = len(_parameters(gained)[0])
+    information, readings = np.zeros((count, count)), 0
+    for part, x0 in zip(raw.experiments, starts):
+        present = ~np.isnan(part.y)
+        by_parameter, by_start = _sensitivities(gained, steady, part, x0, present, np.eye(count))
+        basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
+        basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
+        rest = by_parameter - basis @ (basis.T @ by_parameter)
+        information += rest.T @ rest
+        readings += int(present.sum()) - basis.shape[1]
+    sizes = np.sqrt(np.diag(information))
+    sizes[sizes == 0] = 1.0
+    values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
+    known = values > KNOWN * values[-1]
+    if readings < 2 * int(known.sum()):
+        raise DataError(
+            f"{readings} readings (beside the initial states) do not determine the parameters well enough for a "
+            f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
+        )
+    root = axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
+    return ModelUncertainty(gained, steady, root, readings)
+
+
+def _parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
+    """Return the parameters, a step for each, and the way back."""
+    used = [name for name in MATRICES if np.any(getattr(model, name))]
+    functions = [*model.nonlinearities, *model.feedback]
+    parts = [np.ravel(getattr(model, name)) for name in used] + [np.ravel(f.mu) for f in functions]
+    steps = [STEP * (np.abs(part) + np.sqrt(np.mean(part**2)) + 1e-8) for part in parts if part.size]
+    edges = np.cumsum([0, *(part.size for part in parts)])
+
+    def back(theta: Array) -> "HammersteinSS":
+        cut = [theta[a:b] for a, b in zip(edges, edges[1:])]
+        changes: dict[str, Any] = {
+            name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)
+        }
+        moved = [replace(f, mu=part) for f, part in zip(functions, cut[len(used) :])]
+        inputs = len(model.nonlinearities)
+        return replace(model, nonlinearities=tuple(moved[:inputs]), feedback=tuple(moved[inputs:]), **changes)
+
+    return np.concatenate(parts), np.concatenate(steps), back
+
+
+def _sensitivities(
+    model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
+) -> tuple[Array, Array]:
+    """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
+    theta, steps, back = _parameters(model)
+    scaled = root / steps[:, None]
+    largest = np.abs(scaled).max(axis=0, initial=0.0)
+    largest[largest == 0] = 1.0
+
+    def white(changed: "HammersteinSS") -> Array:
+        job = simulation.prepared(changed, "predict", part.u, part.y, None, "")
+        errors = np.where(present, part.y - simulation.run(job, x0), 0.0)
+        return steady.whitened(errors, present).ravel()
+
+    columns = np.empty((present.size, root.shape[1]))
+    for j in range(root.shape[1]):
+        move = root[:, j] / largest[j]  # no parameter moves by more than its step
+        columns[:, j] = (white(back(theta + move)) - white(back(theta - move))) * (largest[j] / 2)
+    impulse = np.zeros((len(part.y), model.nx, model.nx))
+    impulse[0] = np.eye(model.nx)
+    start = steady.respond(impulse, np.zeros((len(part.y), model.l, model.nx)), present)
+    return columns, steady.whitened(start, present).reshape(present.size, model.nx)

@@ -1,0 +1,305 @@
+"""Innovations of the steady Kalman predictor in units of their own covariance: white and of unit size when healthy."""
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import DataError, DataWarning, StructureError
+from optid.models.experiments import in_units_of
+from optid.models.kalman import kalman_gain
+
+if TYPE_CHECKING:
+    from optid.faults.nuisance import ModelUncertainty, Nuisance
+    from optid.models import HammersteinSS
+
+LAGS = 20
+"""Lags of the whiteness test."""
+
+NOT_WHITE = 1e-3
+"""Thresholds are refused below this p-value."""
+
+OTHER_SCALE = 1.3
+"""Thresholds are refused above this ratio of the innovations to their predicted size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """The steady predictor of a model, x+ = A x + ... + K (y - C x - ...).
+
+    Attributes:
+        A: (n, n) of the model.
+        C: (l, n) of the model.
+        L: (n, l) output injection of the model.
+        K: (n, l) gain.
+        covariance: (l, l) of the innovations.
+        root: (l, l) lower triangular; root times an innovation has unit covariance.
+    """
+
+    A: Array
+    C: Array
+    L: Array
+    K: Array
+    covariance: Array
+    root: Array
+
+    @property
+    def F(self) -> Array:  # noqa: N802 - the field's letter
+        """A - K C, with which what is left of a past error decays."""
+        return np.asarray(self.A - self.K @ self.C)
+
+    @property
+    def settling(self) -> int:
+        """Samples after which a past error has fallen below 1e-6 of itself."""
+        radius = float(np.max(np.abs(np.linalg.eigvals(self.F)), initial=0.0))
+        return len(self.F) if radius == 0 else len(self.F) + int(np.ceil(np.log(1e-6) / np.log(min(radius, 1 - 1e-9))))
+
+    def respond(self, into_state: Array, into_output: Array, present: Array | None = None) -> Array:
+        """Return what additions to x(k) (N, n, d) and to y(k) (N, l, d) leave in the innovations, (N, l, d).
+
+        Args:
+            into_state: (N, n, d).
+            into_output: (N, l, d).
+            present: (N, l) whether a reading is there; all by default.
+        """
+        from optid.faults import kernels
+
+        shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
+        response = np.empty(into_output.shape)
+        parts = (self.A, self.C, self.K, self.L, into_state, into_output)
+        A, C, K, L, x, y = (np.ascontiguousarray(part, dtype=float) for part in parts)
+        kernels.respond(A, C, K, L, shown, x, y, response)
+        return response
+
+    def whitened(self, innovations: Array, present: Array | None = None) -> Array:
+        """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
+
+        Readings that are left of a sample are whitened by the covariance among themselves.
+        """
+        if present is None or present.all():
+            return np.einsum("ij,nj...->ni...", self.root, innovations)
+        result = np.zeros(innovations.shape)
+        patterns, which = np.unique(present, axis=0, return_inverse=True)
+        for number, pattern in enumerate(patterns):
+            rows, there = np.flatnonzero(which.ravel() == number), np.flatnonzero(pattern)
+            if there.size:
+                block = _root(self.covariance[np.ix_(there, there)])
+                result[np.ix_(rows, there)] = np.einsum("ij,nj...->ni...", block, innovations[np.ix_(rows, there)])
+        return result
+
+
+def predictor(model: "HammersteinSS") -> Predictor:
+    """Return the steady Kalman predictor of a model with noise covariances.
+
+    Raises:
+        StructureError: no noise covariances, or no stabilising gain.
+    """
+    if model.noise is None:
+        raise StructureError(
+            "The model has no noise covariances, and without them nothing says how large a deviation is: estimate "
+            "them with optid.noise.with_noise(model, data)."
+        )
+    noise = model.noise
+    steady = kalman_gain(model.A, model.C, noise.Q, noise.R, noise.S)
+    return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """Whitened innovations of one record.
+
+    Attributes:
+        r: (N, l), zero where a reading is missing; N(0, I) for a healthy plant.
+        innovations: (N, l) before whitening, NaN where a reading is missing.
+        present: (N, l) whether a reading is there.
+        predictor: the predictor behind them.
+        outputs: names of the outputs.
+        nuisance: what uncertain parameters of the model leave in the innovations, taken out of r; None for a model
+            that is taken as exact.
+    """
+
+    r: Array
+    innovations: Array
+    present: Array
+    predictor: Predictor
+    outputs: tuple[str, ...]
+    nuisance: "Nuisance | None" = None
+
+    def seen(self, signature: Array) -> Array:
+        """Return what a signature (N, l, d) of the innovations is in r: whitened like them."""
+        white = self.predictor.whitened(signature, self.present)
+        return white if self.nuisance is None else self.nuisance(white)
+
+
+def whiten(
+    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: "ModelUncertainty | None" = None,
+    scale: Predictor | None = None,
+) -> Any:
+    """Return the whitened innovations of a record; a tuple for several experiments.
+
+    A missing reading corrects no state and counts for nothing.
+
+    Args:
+        model: a model with noise covariances.
+        data: the record; detrended or scaled data are taken back to raw units.
+        x0: "fit" (least squares of the innovations), "zero", or the state (n,), one for each experiment.
+        uncertainty: of an identified model (`model_uncertainty`); its effect counts as noise.
+        scale: a predictor whose covariance replaces that of the model, as `Health.predictor` returns.
+
+    Raises:
+        DataError: a missing input, other channels or sampling time than the model's.
+        StructureError: no noise covariances.
+    """
+    steady = predictor(model) if scale is None else scale
+    gained = replace(model, K=steady.K)
+    raw = in_units_of(model, data)
+    parts = raw.experiments
+    states = gained.initial_state(raw, "predict") if isinstance(x0, str) and x0 == "fit" else x0
+    predicted = gained.predict(raw, x0=states)
+    predictions = predicted if isinstance(predicted, tuple) else (predicted,)
+    found = []
+    for number, (part, prediction) in enumerate(zip(parts, predictions)):
+        present = ~np.isnan(part.y)
+        innovations = part.y - prediction
+        r = steady.whitened(np.where(present, innovations, 0.0), present)
+        white = Whitened(r, innovations, present, steady, model.outputs)
+        if uncertainty is not None:
+            start = states if len(parts) == 1 else states[number]
+            start = np.zeros(model.nx) if isinstance(start, str) else np.asarray(start, dtype=float)
+            nuisance = uncertainty.nuisance(part, start, present, free_start=isinstance(x0, str) and x0 == "fit")
+            white = replace(white, r=nuisance(r), nuisance=nuisance)
+        found.append(white)
+    return found[0] if len(found) == 1 else tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Health:
+    """Whether the innovations of a healthy record are what the model says.
+
+    Attributes:
+        ratios: {output: size of its innovations over the predicted one}.
+        p_value: of the hypothesis that the innovations are white (portmanteau test of Hosking).
+        lags: its lags.
+        samples: complete samples behind both.
+        covariance: (l, l) of the whitened innovations; the identity is expected.
+    """
+
+    ratios: dict[str, float]
+    p_value: float
+    lags: int
+    samples: int
+    covariance: Array
+
+    @property
+    def ratio(self) -> float:
+        """The largest ratio, in any direction of the outputs."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
+
+    @property
+    def white(self) -> bool:
+        """Whether the whiteness test keeps its hypothesis."""
+        return not self.p_value < NOT_WHITE
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the innovations are of the size predicted."""
+        return self.ratio <= OTHER_SCALE
+
+    def __str__(self) -> str:
+        """Say both, with the numbers."""
+        sizes = ", ".join(f"{name} {ratio:.3f}" for name, ratio in self.ratios.items())
+        return (
+            f"innovations over {self.samples} samples: p-value of whiteness {self.p_value:.3g} ({self.lags} lags)\n"
+            f"size over the predicted one: {sizes}; largest {self.ratio:.3f}"
+        )
+
+    def predictor(self, steady: Predictor, *, rescale: bool = False) -> Predictor:
+        """Return the predictor that thresholds may be built on.
+
+        Args:
+            steady: the predictor that was judged.
+            rescale: take the covariance of the innovations from the healthy record where it is larger or smaller.
+
+        Raises:
+            DataError: innovations that are not white, or larger than predicted without `rescale`.
+
+        Warns:
+            DataWarning: innovations much smaller than predicted: thresholds are on the safe side.
+        """
+        if not self.white:
+            raise DataError(
+                f"The innovations of the healthy record are not white (p-value {self.p_value:.2g}): thresholds from "
+                "this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
+                "(empirical), or count the uncertainty of the identified model (model_uncertainty)."
+            )
+        if rescale:
+            covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
+            covariance = (covariance + covariance.T) / 2
+            return replace(steady, covariance=covariance, root=_root(covariance))
+        if not self.scaled:
+            raise DataError(
+                f"The innovations of the healthy record are {self.ratio:.2f} times as large as the model says "
+                f"({', '.join(f'{name} {ratio:.2f}' for name, ratio in self.ratios.items())}): the scale of the noise "
+                "is wrong. Pass rescale=True to take it from this record, or estimate the noise again."
+            )
+        if self.ratio < 1 / OTHER_SCALE:
+            warnings.warn(
+                f"The innovations are only {self.ratio:.2f} times as large as the model says: small faults will be "
+                "missed. rescale=True takes the scale from the healthy record.",
+                DataWarning,
+                stacklevel=2,
+            )
+        return steady
+
+
+def health(whitened: Any, lags: int = LAGS) -> Health:
+    """Judge the whitened innovations of a healthy record: are they white, and of the size predicted?
+
+    Args:
+        whitened: from `whiten`, one or several experiments.
+        lags: of the whiteness test; fewer in a short record.
+
+    Raises:
+        DataError: too few complete samples: 10 per output are needed.
+    """
+    from scipy.special import chdtrc
+
+    parts = [whitened] if isinstance(whitened, Whitened) else list(whitened)
+    complete: list[Any] = [part.present.all(axis=1) for part in parts]
+    rows = np.vstack([part.r[there] for part, there in zip(parts, complete)])
+    count, outputs = rows.shape
+    if count < 10 * outputs:
+        raise DataError(f"{count} complete samples are too few to judge the noise: {10 * outputs} are needed.")
+    covariance = rows.T @ rows / count
+    lags = max(1, min(lags, count // (4 * outputs)))
+    root = _root(covariance + 1e-300 * np.eye(outputs))
+    statistic = 0.0
+    signals = [np.where(there[:, None], part.r @ root.T, 0.0) for part, there in zip(parts, complete)]
+    for lag in range(1, lags + 1):
+        total, pairs = np.zeros((outputs, outputs)), 0
+        for signal, there in zip(signals, complete):
+            if len(signal) > lag:
+                total += signal[lag:].T @ signal[:-lag]
+                pairs += int(np.sum(there[lag:] & there[:-lag]))
+        statistic += float(np.sum(total**2)) / max(pairs, 1)
+    return Health(
+        dict(zip(parts[0].outputs, np.sqrt(_each(parts)).tolist())), float(chdtrc(outputs**2 * lags, statistic)), lags,
+        count, covariance,
+    )
+
+
+def _each(parts: list[Whitened]) -> Array:
+    """Mean square of the innovation of every output over its predicted variance."""
+    squares = np.nansum([np.nansum(part.innovations**2, axis=0) for part in parts], axis=0)
+    counts = np.sum([part.present.sum(axis=0) for part in parts], axis=0)
+    return np.asarray(squares / np.maximum(counts, 1) / np.diag(parts[0].predictor.covariance))
+
+
+def _root(covariance: Array) -> Array:
+    """Lower triangular inverse of the Cholesky factor."""
+    from scipy.linalg import solve_triangular
+
+    return np.asarray(solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True))

@@ -1,0 +1,178 @@
+"""Whitened innovations: a predictor run by hand, records with and without a fault, laws of healthy records."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fault_plants import levels, standard
+from state_systems import with_feedback
+from test_fault_injection import small
+
+from optid import Data
+from optid.errors import DataError, DataWarning, StructureError
+from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
+from optid.models.kalman import kalman_gain
+
+
+def with_gaps(y, seed=0, share=0.1):
+    return np.where(np.random.default_rng(seed).random(y.shape) < share, np.nan, y)
+
+
+def test_whitened_innovations_of_a_predictor_run_by_hand():
+    model, u = small(), levels(80, 0)
+    y = with_gaps(inject(model, u, seed=1))
+    steady = kalman_gain(model.A, model.C, model.noise.Q, model.noise.R)
+    found = whiten(model, Data(u, y), x0=[0.1, 0.2, 0.3])
+    x = np.array([0.1, 0.2, 0.3])
+    for k in range(80):
+        error = y[k] - (model.C @ x + model.D @ u[k] + model.offset_y)
+        there = ~np.isnan(y[k])
+        expected = np.zeros(2)
+        block = steady.innovation[np.ix_(there, there)]
+        expected[there] = np.linalg.solve(np.linalg.cholesky(block), error[there]) if there.any() else []
+        np.testing.assert_allclose(found.r[k], expected, atol=1e-10)
+        x = model.A @ x + model.B @ u[k] + model.offset_x + steady.K @ np.where(there, error, 0.0)
+
+
+@pytest.mark.parametrize("gaps", [0.0, 0.15])
+def test_signatures_are_the_difference_a_fault_makes(gaps):
+    model, u, onset = small(), levels(120, 0), 40
+    healthy = with_gaps(inject(model, u, seed=1), share=gaps)
+    faulty = healthy + inject(model, u, [Fault.step("actuator:u1", onset, 1.0)], seed=1) - inject(model, u, seed=1)
+    a, b = (whiten(model, Data(u, y), x0="zero") for y in (healthy, faulty))
+    into_state, into_output = np.zeros((120, 3, 1)), np.zeros((120, 2, 1))
+    into_state[onset:, :, 0], into_output[onset:, :, 0] = model.B[:, 0], model.D[:, 0]
+    signature = a.seen(a.predictor.respond(into_state, into_output, a.present))
+    np.testing.assert_allclose(signature[..., 0], b.r - a.r, atol=1e-10)
+    assert not signature[:onset].any() and np.abs(signature).max() > 1
+
+
+def test_a_missing_reading_is_fed_back_as_predicted():
+    model = with_feedback(feedback=(), E=None, output_of=())
+    u = levels(60, 0)
+    y = inject(model, u, seed=1)
+    faulty = inject(model, u, Fault.jump("state", 20, [1.0, -1.0, 0.5]), seed=1)
+    y[22, 0] = faulty[22, 0] = y[30] = faulty[30] = np.nan
+    a, b = (whiten(model, Data(u, r, dt=0.5, outputs=["p", "q"]), x0="zero") for r in (y, faulty))
+    into_state = np.zeros((60, 3, 1))
+    into_state[20, :, 0] = [1.0, -1.0, 0.5]
+    signature = a.seen(a.predictor.respond(into_state, np.zeros((60, 2, 1)), a.present))
+    # the plant feeds back the reading that was lost, so its share of the fault stays unknown to the predictor
+    np.testing.assert_allclose(signature[:23, :, 0], (b.r - a.r)[:23], atol=1e-10)
+
+
+def test_healthy_records_are_white_and_of_unit_size():
+    model = small()
+    found = [health(whiten(model, Data(u, with_gaps(inject(model, u, seed=s), s, 0.02))))
+             for s, u in ((s, levels(600, s)) for s in range(60))]
+    p = np.array([h.p_value for h in found])
+    assert np.mean(p < 0.1) < 0.25 and np.mean(p > 0.5) > 0.3 and all(h.white and h.scaled for h in found)
+    assert abs(np.mean([h.ratio for h in found]) - 1) < 0.06
+    assert "p-value" in str(found[0]) and max(map(len, str(found[0]).splitlines())) <= 80
+
+
+def test_several_experiments_are_judged_together():
+    model, u = small(), levels(300, 0)
+    parts = whiten(model, Data([u, u[:200]], list(inject(model, [u, u[:200]], seed=1))))
+    assert [len(part.r) for part in parts] == [300, 200]
+    assert health(parts).samples == 500
+
+
+def test_innovations_that_are_not_white_are_refused():
+    model, u = small(), levels(600, 0)
+    other = replace(model, A=model.A - 0.25 * np.eye(3))
+    steady, found = predictor(other), health(whiten(other, Data(u, inject(model, u))))
+    assert found.p_value < 1e-3
+    with pytest.raises(DataError, match="not white.*empirical.*model_uncertainty"):
+        found.predictor(steady, rescale=True)
+
+
+def scaled(model, factor):
+    noise = model.noise
+    return replace(model, noise=replace(noise, **{w: getattr(noise, w) * factor for w in ("Q", "R", "innovation")}))
+
+
+def test_a_wrong_scale_of_the_noise_is_an_error_unless_it_is_taken_from_the_record():
+    model, u = small(), levels(2000, 0)
+    optimistic, data = scaled(model, 1 / 1.5**2), Data(u, inject(model, u))
+    steady, found = predictor(optimistic), health(whiten(optimistic, data))
+    assert abs(found.ratio - 1.5) < 0.1
+    with pytest.raises(DataError, match=r"1\.[45]\d times as large.*rescale=True"):
+        found.predictor(steady)
+    right = found.predictor(steady, rescale=True)
+    np.testing.assert_allclose(right.covariance, model.noise.innovation, rtol=0.15, atol=1e-3)
+    np.testing.assert_allclose(right.root @ right.covariance @ right.root.T, np.eye(2), atol=1e-12)
+    again = health(whiten(optimistic, data, scale=right))
+    assert abs(again.ratio - 1) < 1e-6
+    pessimistic = scaled(model, 4.0)
+    with pytest.warns(DataWarning, match="small faults will be missed"):
+        health(whiten(pessimistic, data)).predictor(predictor(pessimistic))
+
+
+def test_bad_input():
+    model, u = small(), levels(60, 0)
+    with pytest.raises(StructureError, match="noise covariances"):
+        whiten(replace(model, noise=None), Data(u, np.zeros((60, 2))))
+    with pytest.raises(DataError, match="too few"):
+        health(whiten(model, Data(u[:15], inject(model, u[:15]))))
+    with pytest.raises(DataError, match="determine"):
+        model_uncertainty(model, Data(u[:10], inject(model, u[:10])))
+
+
+# -- the uncertainty of an identified model ----------------------------------------------------------------------------
+
+
+def drawn(uncertainty, seed):
+    """A model of the distribution."""
+    from optid.faults.nuisance import _parameters
+
+    theta, _, back = _parameters(uncertainty.model)
+    return back(theta + uncertainty.root @ np.random.default_rng(seed).standard_normal(uncertainty.root.shape[1]))
+
+
+def test_directions_that_change_no_prediction_are_left_out(real_data):
+    model, _ = standard(real_data)
+    u = levels(400, 0)
+    found = model_uncertainty(model, Data(u, inject(model, u)))
+    # 16 similarity transformations and a factor between each f and its column are not parameters of the predictions
+    assert found.root.shape[1] == found.root.shape[0] - 16 - 2
+
+
+def test_model_errors_count_as_noise(real_data):
+    """Innovations of models drawn from their distribution: too large without it, of unit size with it."""
+    model, _ = standard(real_data)
+    long, u = levels(150, 0), levels(200, 1)
+    identified = model_uncertainty(model, Data(long, inject(model, long)))
+    naive, aware = [], []
+    for seed in range(60):
+        wrong = drawn(identified, seed)
+        data = Data(u, inject(model, u, seed=seed + 100))
+        own = replace(identified, model=wrong)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            naive.append(np.sum(whiten_with(wrong, data, identified).r ** 2))
+            aware.append(np.sum(whiten_with(wrong, data, identified, own).r ** 2))
+    freedom = 400 - 4  # the initial state takes four
+    assert np.mean(naive) > 1.05 * freedom
+    assert abs(np.mean(aware) / freedom - 1) < 4 * np.sqrt(2 / freedom / 60)
+
+
+def whiten_with(model, data, identified, uncertainty=None):
+    """Whiten by the gain that the model carries, which is as uncertain as its matrices."""
+    steady = replace(identified.predictor, A=model.A, C=model.C, K=model.K)
+    return whiten(model, data, scale=steady, uncertainty=uncertainty)
+
+
+def test_a_known_initial_state_keeps_its_information(real_data):
+    model, _ = standard(real_data)
+    u = levels(300, 0)
+    data = Data(u, inject(model, u))
+    found = model_uncertainty(model, data)
+    free, known = (whiten(model, data, x0=x0, uncertainty=found) for x0 in ("fit", "zero"))
+    assert free.nuisance.s.max() > 1e5 and known.nuisance.s.max() < 10
+    # the explicit inverse root of I + M M'
+    U, s = known.nuisance.U, known.nuisance.s
+    values, axes = np.linalg.eigh(np.eye(600) + (U * s**2) @ U.T)
+    plain = whiten(model, data, x0="zero").r
+    np.testing.assert_allclose(known.r.ravel(), axes @ ((axes.T @ plain.ravel()) / np.sqrt(values)), atol=1e-8)
