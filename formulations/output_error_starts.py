@@ -122,7 +122,7 @@ def iterated(criterion, data: Data, unknowns: Unknowns, x: Array, method: str) -
     p, na = unknowns.shared, unknowns.layout.na
     at, best = unknowns.slices["a"], None
     for _ in range(PASSES if na else 0):
-        gram = instruments(data, unknowns, unknowns.unpack(x))
+        gram = instruments(data, unknowns, unknowns.unpack(x), functions=criterion.functions)
         regressors = np.arange(p)
         regressors[at] = p + np.arange(na)
         tested = regressors if method == "sm" else np.arange(p)

@@ -8,7 +8,7 @@ the final iterate, and solved by the back end that was asked for: that it offers
 optimal" means here.
 """
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -48,6 +48,10 @@ COMPARED = 1e-6
 
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
+
+EXPLAINED = 0.1
+"""Share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
+where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best."""
 
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as stable:0.999")
@@ -164,14 +168,29 @@ def _gain(root: Array, at: Linearised) -> float:
     return float(np.sum((basis.T @ at.pull) ** 2)) + at.reach - float(at.pull @ at.pull)
 
 
-def best_of(criterion: Criterion, starts: Mapping[str, Array], iterations: int = STEPS) -> list[Descent]:
+def best_of(criterion: Criterion, starts: Mapping[str, Array] | Iterable[tuple[str, Array]], iterations: int = STEPS,
+            *, enough: int | None = None) -> list[Descent]:
     """Descend from every start; the best comes first, those that end at the border of stability last.
 
     There they are no local optima: an unstable model would be better still.
+
+    Args:
+        criterion: the errors.
+        starts: points by name, or pairs that are estimated as they are asked for.
+        iterations: at most, for each.
+        enough: number of starts after which, when all of them ended at the same optimum and it leaves little of the
+            record unexplained, no more are asked for.
     """
-    found = [descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name) for name, x in starts.items()
-             if criterion.admissible(x)]
-    return sorted(found, key=lambda one: (one.border, one.value))
+    found: list[Descent] = []
+    for name, x in starts.items() if isinstance(starts, Mapping) else starts:
+        if criterion.admissible(x):
+            found.append(descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name))
+            found.sort(key=lambda one: (one.border, one.value))
+        if len(found) == enough and not any(one.border for one in found) and (
+                found[0].value <= EXPLAINED * criterion.energy):
+            if agreement(found, 1e-12 * criterion.energy)[0] == enough:
+                break
+    return found
 
 
 def agreement(found: Sequence[Descent], floor: float) -> tuple[int, str]:
@@ -240,6 +259,8 @@ class _Iterate:
         x = posed.criterion.normalised(x)
         at = posed.criterion.linearise(x)
         program = posed.pose(x, at, 0.0)
+        if not program.user_constraints:
+            return cls(x, at, program, 0.0, 0.0)
         program.assign(program.view.reference)
         outside = measure_violation(program)[0]
         amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))

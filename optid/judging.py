@@ -11,7 +11,7 @@ from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 from cvxpy.constraints.zero import Equality, Zero
 
-from optid.program import Program, Values
+from optid.program import Program, RankOneForm, Values
 from optid.solution import Residuals
 
 ZERO = 1e-9  # a variable smaller than this has no size of its own to measure by
@@ -31,21 +31,20 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
     """
     program.assign(values)
     violation, worst = measure_violation(program)
-    if program.rank_one is not None and not program.user_constraints:
-        objective, stationarity = _rank_one_residuals(program)
+    form = program.rank_one or program.least_squares
+    if form is not None and not program.user_constraints:
+        objective, stationarity = _rank_one_residuals(program, form)
         return objective, Residuals(violation, worst, stationarity, 0.0)
     objective = float(np.asarray(program.objective.expr.value))
     stationarity, complementarity = _first_order(program, duals, objective)
     return objective, Residuals(violation, worst, stationarity, complementarity)
 
 
-def _rank_one_residuals(program: Program) -> tuple[float, float]:
+def _rank_one_residuals(program: Program, form: RankOneForm) -> tuple[float, float]:
     """Objective and stationarity of an unconstrained rank-one programme from its compressed numbers.
 
     The gauge has multiplier zero, because moving the scale between mu and b does not change the objective.
     """
-    form = program.rank_one
-    assert form is not None
     problem = form.problem
     flat = {name: _flat(variable) for name, variable in program.variables.items()}
     w = np.concatenate([flat[name] for name in form.linear] or [np.zeros(0)])

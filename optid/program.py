@@ -172,6 +172,9 @@ class Program:
             variables; they are recomputed at every point before it is judged.
         rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
         nuclear: nuclear-norm structure for the ADMM, or None.
+        least_squares: a `RankOneForm` without products, where the objective without the user's constraints is such a
+            sum of squares and the structural constraints only fix directions that do not change it; it is judged from
+            these numbers then.
         certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
@@ -191,6 +194,7 @@ class Program:
     derived: Mapping[str, cp.Expression] = field(default_factory=dict)
     rank_one: RankOneForm | None = None
     nuclear: NuclearForm | None = None
+    least_squares: RankOneForm | None = None
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
     note: str = ""
@@ -309,7 +313,8 @@ class Program:
             return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
-                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None, certify=None,
+                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None,
+                       least_squares=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
@@ -336,7 +341,8 @@ class Program:
                                      "only equalities and inequalities can be softened")
         rest = {key: group for key, group in self.constraints.items() if key != name}
         return replace(self, objective=cp.Minimize(self.objective.expr + weight * penalty), constraints=rest,
-                       rank_one=None, nuclear=None, certify=None, note=f"constraint {name!r} is a penalty here")
+                       rank_one=None, nuclear=None, least_squares=None, certify=None,
+                       note=f"constraint {name!r} is a penalty here")
 
     def without(self, *names: str) -> "Program":
         """Return the programme without the named constraints."""

@@ -310,6 +310,21 @@ def test_more_starts_never_give_a_worse_optimum():
     assert values[1] <= values[0] * (1 + 1e-9) and values[2] <= values[1] * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
+    staged = []
+    for seed in range(6):
+        data = record(siso(basis=BASIS), noise=noise, seed=seed)
+        with monkeypatch.context() as all_of_them:
+            fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+            all_of_them.setattr(hammerstein_oe, "SUFFICIENT", None)
+            whole = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+        assert len(whole.figures["simulation errors of the starts"]) == 6
+        staged.append(len(fit.figures["simulation errors of the starts"]))
+        assert abs(fit.solution.objective - whole.solution.objective) < 1e-9 * whole.solution.objective
+    assert staged == [3 if noise == 0.1 else 6] * 6
+
+
 def test_long_records_are_searched_in_part():
     true = siso(basis=BASIS)
     data = record(true, count=60_000, noise=0.2)

@@ -7,7 +7,7 @@ import optid
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.models import HammersteinARX, Nonlinearity
 from optid.regressors.layout import Layout
-from optid.regressors.sensitivities import PlantPoint, Unknowns, instruments, linearise, simulate
+from optid.regressors.sensitivities import PlantPoint, Unknowns, expanded, instruments, linearise, simulate
 
 
 def case(seed=0, constant=True):
@@ -152,3 +152,29 @@ def test_every_basis(basis):
     slopes = jacobian(data, unknowns, x)
     matrix, _ = linearise(data, unknowns, point, chunk=13).whole
     assert np.allclose(matrix.T @ matrix, slopes.T @ slopes, atol=1e-6 * np.max(slopes.T @ slopes))
+
+
+def test_kept_basis_functions_change_nothing():
+    data, unknowns, point = case()
+    table = expanded(data, unknowns.layout)
+    assert expanded(data, unknowns.layout, limit=data.n_samples) is None
+    kept = linearise(data, unknowns, point, functions=table, chunk=50).whole
+    for ours, theirs in zip(kept, linearise(data, unknowns, point, chunk=50).whole):
+        assert np.array_equal(ours, theirs)
+    assert np.array_equal(instruments(data, unknowns, point, functions=table), instruments(data, unknowns, point))
+
+
+@pytest.mark.parametrize("method", ["gram", "qr"])
+def test_gauge_changes_the_factor_of_one_experiment_in_its_own_direction_alone(method):
+    data, unknowns, point = case()
+    data = data.select(experiments=[0])
+    unknowns = Unknowns(unknowns.layout, 1, unknowns.free)
+    point = PlantPoint(point.a, point.mus, point.bs, point.offset, point.x0[:1])
+    row = scale_row(unknowns, point)
+    free = linearise(data, unknowns, point, method=method)
+    fixed = linearise(data, unknowns, point, gauge=row, method=method)
+    more = fixed.root.T @ fixed.root - free.root.T @ free.root
+    weight = more[unknowns.slices["b0"].start, unknowns.slices["b0"].start] / point.bs[0][0] ** 2
+    assert weight > 0 and np.max(np.abs(more - weight * row.T @ row)) < 1e-8 * np.max(np.abs(free.root)) ** 2
+    assert fixed.value == pytest.approx(free.value, rel=1e-10)
+    assert not free.condition < 1e12 and fixed.condition < 1e6

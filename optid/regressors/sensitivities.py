@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 CHUNK = 4096
 """Samples whose sensitivities are formed at a time: they stay in the processor's cache."""
 
+TABLE = 1 << 18
+"""Values of basis functions that are kept between linearisations: as many as stay in the processor's cache."""
+
 CONDITION_LIMIT = 1e6
 """Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
 
@@ -161,8 +164,24 @@ class Linearised:
         return matrix, errors
 
 
+def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, ...] | None:
+    """Return the basis functions (N, P) of all inputs side by side for every experiment, None beyond a limit.
+
+    Descents on short records evaluate them once instead of at every point.
+
+    Args:
+        data: the record.
+        layout: orders and bases.
+        limit: numbers that are kept at most.
+    """
+    if data.n_samples * sum(basis.size for basis in layout.bases) > limit:
+        return None
+    return tuple(np.hstack([basis.values(e.u[:, c]) for c, basis in enumerate(layout.bases)]) for e in data.experiments)
+
+
 def linearise(data: "Data", unknowns: Unknowns, point: PlantPoint, *, gauge: Array | None = None,
-              method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK) -> Linearised:
+              method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK,
+              functions: Sequence[Array] | None = None) -> Linearised:
     """Simulate a model over all experiments and compress its errors with their sensitivities.
 
     Args:
@@ -173,12 +192,15 @@ def linearise(data: "Data", unknowns: Unknowns, point: PlantPoint, *, gauge: Arr
             They are given weight in the factor, so that it is not singular; at the point they contribute nothing.
         method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
         chunk: samples at a time.
+        functions: what `expanded` returned for the record.
     """
     use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
-    parts = [_experiment(data, unknowns, point, i, use, chunk) for i in range(unknowns.experiments)]
-    found = assembled(parts, unknowns.memory, unknowns.shared, gauge, use)
+    alone = unknowns.experiments == 1  # then the gauge takes part before the factorisation, which so is regular
+    parts = [_experiment(data, unknowns, point, i, use, chunk, gauge if alone else None, functions)
+             for i in range(unknowns.experiments)]
+    found = assembled(parts, unknowns.memory, unknowns.shared, None if alone else gauge, use)
     if method == "auto" and not found.condition < CONDITION_LIMIT:
-        return linearise(data, unknowns, point, gauge=gauge, method="qr", chunk=chunk)
+        return linearise(data, unknowns, point, gauge=gauge, method="qr", chunk=chunk, functions=functions)
     return found
 
 
@@ -194,8 +216,9 @@ def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None
         method: how the parts were compressed.
     """
     states, rest = zip(*(_eliminated(part.factor, n) for part in parts))
-    stacked = np.vstack([*rest, *_weighted(gauge, rest, p)])
-    triangle = np.linalg.qr(stacked, mode="r")
+    rows_of_gauge = _weighted(gauge, sum(np.sum(part[:, :p] ** 2, axis=0) for part in rest))
+    together = len(rest) > 1 or len(rows_of_gauge)
+    triangle = np.linalg.qr(np.vstack([*rest, *rows_of_gauge]), mode="r") if together else rest[0]
     full = np.zeros((p + 1, p + 1))
     full[: len(triangle)] = triangle
     condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
@@ -203,7 +226,8 @@ def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None
     return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, method)
 
 
-def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK) -> Array:
+def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK,
+                functions: Sequence[Array] | None = None) -> Array:
     """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors] without initial states.
 
     It holds the normal equations of Steiglitz-McBride and of the refined instrumental variable: in both the measured
@@ -211,7 +235,7 @@ def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int 
     """
     total = np.zeros((unknowns.shared + unknowns.layout.na + 1,) * 2)
     for i in range(unknowns.experiments):
-        part = _experiment(data, unknowns, point, i, "gram", chunk, measured=True)
+        part = _experiment(data, unknowns, point, i, "gram", chunk, None, functions, measured=True)
         _, rest = _eliminated(part.factor, unknowns.memory)
         total += rest.T @ rest
     return total
@@ -234,8 +258,17 @@ class Compressed:
     rows: int
 
 
-def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str) -> Compressed:
-    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left."""
+def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
+               first: int = 0) -> Compressed:
+    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
+
+    Args:
+        blocks: (rows, columns) and the number of errors in each.
+        columns: number of columns.
+        method: "gram" or "qr".
+        gauge: (rows, p) directions without effect, which are given weight; None for none.
+        first: column of their first unknown.
+    """
     total, rows = np.zeros((columns, columns)), 0
     for block, count in blocks:
         rows += count
@@ -244,25 +277,32 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str) -
             total[used, used] = add_to_root(total[used, used], block) if used.start else add_to_root(total, block)
         else:
             total[used, used] += block.T @ block
+    if gauge is not None and len(gauge):
+        span = slice(first, first + gauge.shape[1])
+        energy = np.sum(total[:, span] ** 2, axis=0) if method == "qr" else np.diag(total)[span]
+        extra = np.zeros((len(gauge), columns))
+        extra[:, first:] = _weighted(gauge, energy)[0]
+        total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
     return Compressed(total if method == "qr" else _factor(total), rows)
 
 
 def _experiment(data: "Data", unknowns: Unknowns, point: PlantPoint, index: int, method: str, chunk: int,
-                measured: bool = False) -> Compressed:
+                gauge: Array | None, functions: Sequence[Array] | None, measured: bool = False) -> Compressed:
     e = data.experiments[index]
     columns = unknowns.memory + unknowns.shared + measured * unknowns.layout.na + 1
-    found = _blocks(e.u, e.y[:, 0], unknowns, point, point.x0[index], chunk, measured)
-    return compressed(found, columns, method)
+    table = None if functions is None else functions[index]
+    found = _blocks(e.u, e.y[:, 0], unknowns, point, point.x0[index], chunk, measured, table)
+    return compressed(found, columns, method, gauge, unknowns.memory)
 
 
-def _blocks(u: Array, y: Array, unknowns: Unknowns, point: PlantPoint, x0: Array, chunk: int, measured: bool
-            ) -> Iterator[tuple[Array, int]]:
+def _blocks(u: Array, y: Array, unknowns: Unknowns, point: PlantPoint, x0: Array, chunk: int, measured: bool,
+            functions: Array | None) -> Iterator[tuple[Array, int]]:
     """Yield [x0 | shared | (measured) | errors] of every chunk with zeros where the output is missing, and its rows."""
     run = _Run(unknowns, point, x0, chunk)
     n, na, at = unknowns.memory, unknowns.layout.na, unknowns.slices
     history = np.zeros((na, 2))  # simulated and measured output through 1 / A
     for start in range(0, len(u), chunk):
-        output = run.advance(u[start : start + chunk])
+        output = run.advance(u[start : start + chunk], None if functions is None else functions[start : start + chunk])
         target, count = y[start : start + chunk], len(output)
         missing = np.isnan(target)
         past = np.empty((na + count, 2 if measured else 1))
@@ -305,8 +345,8 @@ class _Run:
         self.functions: list[Array] = []
         self.count, self.started, self.peak, self.forgotten = 0, False, 0.0, False
 
-    def advance(self, u: Array) -> Array:
-        """Filter the next chunk (T, m) and return the simulated output (T,)."""
+    def advance(self, u: Array, functions: Array | None = None) -> Array:
+        """Filter the next chunk (T, m) of the input, or its basis functions, and return the simulated output (T,)."""
         n, layout, point = self.unknowns.memory, self.unknowns.layout, self.point
         if self.started and not self.forgotten:
             tail = float(np.max(np.abs(self.filtered[len(self.filtered) - n :, self.impulse]), initial=0.0))
@@ -314,7 +354,9 @@ class _Run:
         self.count = len(u)
         table = np.empty((n + self.count, self.impulse + 1))
         table[:n] = self.filtered[len(self.filtered) - n :]
-        for c, (basis, span) in enumerate(zip(layout.bases, self.spans)):
+        if functions is not None:
+            table[n:, : self.step] = functions
+        for c, (basis, span) in enumerate(zip(layout.bases if functions is None else (), self.spans)):
             table[n:, span] = basis.values(u[:, c])
         table[n:, self.step], table[n:, self.impulse] = 1.0, 0.0
         table[n, self.impulse] += not self.started
@@ -393,10 +435,10 @@ def _eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Arra
     return (factor[:n, :n], factor[:n, n:-1], factor[:n, -1]), factor[n:, n:]
 
 
-def _weighted(gauge: Array | None, rest: Sequence[Array], p: int) -> list[Array]:
-    """Rows that give the directions without effect a weight of the size of the others."""
+def _weighted(gauge: Array | None, energy: Array) -> list[Array]:
+    """Rows [gauge | 0] that give the directions without effect a weight of the size of the others, of given energy."""
     if gauge is None or not len(gauge):
         return []
-    energy = np.sqrt(sum(np.sum(part[:, :p] ** 2, axis=0) for part in rest))
-    lengths = np.abs(gauge) @ energy / np.maximum(np.sum(np.abs(gauge), axis=1), 1e-300)
+    sizes = np.abs(gauge)
+    lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
     return [np.hstack([gauge * np.where(lengths > 0, lengths, 1.0)[:, None], np.zeros((len(gauge), 1))])]
