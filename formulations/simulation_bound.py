@@ -1,10 +1,11 @@
-"""The Hankel bound on the objective of a subspace fit, where that objective is a simulation error."""
+"""The Hankel bound on the objective of a state-space fit, where that objective is a simulation error."""
 
 import numpy as np
 
 from optid.certificate.hankel import hankel_bounds
 from optid.errors import OptidError
 from optid.solution import Bound
+from optid.subspace.expansion import Expansion
 from optid.subspace.observer import ObserverProblem
 
 WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
@@ -29,7 +30,23 @@ def simulation_bound(records: list[np.ndarray], step: ObserverProblem, error: fl
     if np.any(form.gain) or step.instrumented:
         return Bound(-np.inf, False, "none", f"{said}; its objective is no simulation error, which the Hankel bound is "
                                              "about")
-    x = form.expansion.with_simulated(False)
+    return bounded(records, form.expansion, form.n, form.weights, error, block_rows, said)
+
+
+def bounded(records: list[np.ndarray], expansion: Expansion, n: int, weights: np.ndarray, error: float,
+            block_rows: int, said: str) -> Bound:
+    """Return the bound on a squared error of the simulator with measured feedback, or none with the reason.
+
+    Args:
+        records: raw channels [u | y] per experiment.
+        expansion: the signals.
+        n: order of the model.
+        weights: (l,) by which every output was multiplied in the error.
+        error: its value.
+        block_rows: as in `simulation_bound`.
+        said: as in `simulation_bound`.
+    """
+    x = expansion.with_simulated(False)
     count, signals = sum(len(record) for record in records), x.p + x.q + x.l
     longest = max(len(record) for record in records)
     tried = [a for a in (block_rows, 2 * block_rows, 4 * block_rows)
@@ -37,9 +54,9 @@ def simulation_bound(records: list[np.ndarray], step: ObserverProblem, error: fl
     if not tried:
         return Bound(-np.inf, False, "none", said)
     try:
-        bounds = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=form.n,
-                               block_rows=tried, weights=form.weights)
-        found = bounds.bound(form.n, error, "measured feedback")
+        bounds = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=n, block_rows=tried,
+                               weights=weights)
+        found = bounds.bound(n, error, "measured feedback")
     except OptidError as reason:
         return Bound(-np.inf, False, "none", f"{said}; no Hankel bound: {reason}")
     return Bound(found.value, False, found.method, f"{said}; {found.reason}", multipliers=bounds)

@@ -28,6 +28,7 @@ import numpy as np
 
 from formulations.equation_error import flat
 from formulations.prediction_error import Descent, Posed, best_of, descend, refine
+from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.subspace_procedure import Plan, feedback_bases, identified
 from optid.bases import fitted_bases
@@ -41,6 +42,7 @@ from optid.noise import with_noise
 from optid.program import Program, Values, View
 from optid.regressors.sensitivities import Linearised
 from optid.regressors.state_sensitivities import StateUnknowns
+from optid.solution import Status
 from optid.solving import Evidence, Procedure
 from optid.subspace.expansion import expand
 
@@ -207,7 +209,19 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     posing = Posing(plan.name, error, constraints)
     x = posing.signed(best.x)
     evidence = yield from refine(posing.posed(), replace(best, x=x), {"order": nx, **figures}, x)
-    return _with_noise(evidence, error)
+    return _with_bound(_with_noise(evidence, error), error, plan.records)
+
+
+def _with_bound(evidence: Evidence | None, error: StateError, records: list[Array]) -> Evidence | None:
+    """Add the Hankel bound where the objective is a simulation error with one weight per output."""
+    weight, unknowns = error.weight, error.unknowns
+    diagonal = not np.any(weight - np.diag(np.diag(weight)))
+    if evidence is None or evidence.model is None or unknowns.innovations or not diagonal:
+        return evidence
+    bound = bounded(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
+                    2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several starts are "
+                    "compared")
+    return replace(evidence, bound=bound, reason=bound.reason if evidence.status is Status.LOCAL else evidence.reason)
 
 
 def _with_noise(evidence: Evidence | None, error: StateError) -> Evidence | None:

@@ -291,6 +291,21 @@ def test_poles_may_leave_the_circle_where_that_is_allowed():
     assert free.solution.objective < 0.5 * stable_one.solution.objective
 
 
+@pytest.mark.parametrize("weighting", ["scale", "variance"])
+def test_simulation_errors_carry_the_hankel_bound(weighting):
+    _, data = system(samples=1500, noise=0.3, seed=5)
+    fits = {n: optid.fit(data, "ss.exact", nx=n, weighting=weighting, block_rows=8) for n in (1, 2)}
+    for n, fit in fits.items():
+        bound, objective = fit.solution.bound, fit.solution.objective
+        assert not bound.proved and 0 < bound.value < objective
+        assert f"no model of order {n}" in str(fit).replace("\n  ", " ")
+        simulated = fit.model.simulate(data, x0="fit")
+        weight = np.diag(fit.figures["weight of the outputs"])
+        assert np.sum((data.y - simulated) ** 2 * weight) == pytest.approx(objective, rel=1e-3)  # x0 is unweighted
+    predicted = optid.fit(data, "ss.exact", nx=2, criterion="prediction", block_rows=8)
+    assert predicted.solution.bound.value == -np.inf  # the bound says nothing of one-step errors
+
+
 def test_a_start_of_the_user_is_taken():
     model, data = system(noise=0.05)
     fit = optid.fit(data, linear, nx=2, initial=model, block_rows=5)
