@@ -14,6 +14,9 @@ _HOME = {
     "health": "whitening",
     "predictor": "whitening",
     "model_uncertainty": "nuisance",
+    "dictionary": "signatures",
+    "Dictionary": "signatures",
+    "Candidate": "signatures",
 }
 
 

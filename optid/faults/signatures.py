@@ -1,0 +1,359 @@
+"""The dictionary: what every possible fault leaves in the whitened innovations, and which of them look the same."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
+from optid.faults.faults import channel_of, place_of
+from optid.faults.whitening import Predictor, predictor
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+ADDITIVE = ("bias", "drift", "jump")
+"""Kinds whose signature depends on nothing but the model and the time since the onset."""
+
+KINDS = {
+    "bias": ("actuator", "sensor", "process"),
+    "drift": ("actuator", "sensor", "process"),
+    "jump": ("state",),
+    "loss": ("actuator",),
+    "stuck": ("actuator",),
+    "frozen": ("sensor",),
+    "noise": ("sensor", "process"),
+}
+"""The places where each kind can be."""
+
+SAME = 1e-3
+"""Two signatures at an angle with a smaller sine cannot be told apart by any record."""
+
+NEAR = 0.3
+"""Two signatures at an angle with a smaller sine need a large fault to be told apart."""
+
+UNSEEN = 1e-9
+"""A signature below this share of what it could be is none."""
+
+FORGOTTEN = 1e-4
+"""A signature that falls below this share of its largest value is transient."""
+
+LONGEST = 4000
+"""Samples over which signatures are compared at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A fault that may be the answer; several where no record can tell them apart.
+
+    Attributes:
+        name: where, as in `Fault`.
+        kind: one of `KINDS`.
+        into_state: (n, d) where it enters the state equation.
+        into_output: (l, d) where it enters the output equation.
+        columns: the functions of the input that a loss or a stuck actuator concerns.
+        members: labels of all faults that leave the same trace, its own first.
+        places: names of the parts that these faults are in.
+        bounded_deflection: whether the trace dies out: waiting does not help.
+    """
+
+    name: str
+    kind: str
+    into_state: Array
+    into_output: Array
+    columns: tuple[int, ...] = ()
+    members: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+    bounded_deflection: bool = False
+
+    @property
+    def own_label(self) -> str:
+        """The name, and the kind where the name does not say it."""
+        return self.name if self.kind in ("bias", "jump") else f"{self.name} {self.kind}"
+
+    @property
+    def label(self) -> str:
+        """What an answer calls it: the whole group where it is one."""
+        return " | ".join(self.members or (self.own_label,))
+
+    @property
+    def additive(self) -> bool:
+        """Whether the signature depends on the model and the onset alone."""
+        return self.kind in ADDITIVE
+
+    @property
+    def dimension(self) -> int:
+        """Number of magnitudes to estimate."""
+        return 1 if self.kind == "loss" else 1 + len(self.columns) if self.kind == "stuck" else self.into_state.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Dictionary:
+    """All faults that are thought possible; build it with `dictionary`.
+
+    Attributes:
+        model: the healthy model.
+        predictor: its steady predictor.
+        candidates: the faults that can be told apart, in the order given.
+        excluded: {label: why} of those that no output ever sees.
+        sines: (c, c) sine of the smallest angle between the signatures of candidates c with the same onset; NaN where
+            one of them depends on the input.
+        unknown: whether "none of these" is an answer.
+    """
+
+    model: "HammersteinSS"
+    predictor: Predictor
+    candidates: tuple[Candidate, ...]
+    excluded: Mapping[str, str]
+    sines: Array = field(repr=False)
+    unknown: bool = True
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What the candidates are called."""
+        return tuple(c.label for c in self.candidates)
+
+    @property
+    def ambiguity_groups(self) -> list[tuple[str, ...]]:
+        """The groups of faults that no record can tell apart."""
+        return [c.members for c in self.candidates if len(c.members) > 1]
+
+    @property
+    def near(self) -> list[tuple[str, str, float]]:
+        """Pairs that can be told apart only when the fault is large, with the sine of their angle."""
+        rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
+        return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
+
+    def __getitem__(self, name: str) -> Candidate:
+        """Return the candidate of a label, of a member of a group, or of a place with one kind.
+
+        Raises:
+            LookupFailed: none or several.
+        """
+        for candidate in self.candidates:
+            if name == candidate.label or name in candidate.members:
+                return candidate
+        here = [c for c in self.candidates if name in c.places]
+        if len(here) == 1:
+            return here[0]
+        if name in self.excluded:
+            raise LookupFailed(f"{name!r} is not in the dictionary: {self.excluded[name]}.")
+        raise LookupFailed(f"{name!r} is not in the dictionary. {nearest(name, self.labels)}")
+
+    def signature(self, candidate: Candidate | str, count: int, onset: int = 0, u: ArrayLike | None = None,
+                  present: Array | None = None) -> Array:
+        """Return what one unit of each magnitude leaves in the whitened innovations, (N, l, d).
+
+        The magnitudes are the size of a bias, the slope of a drift, the jump of the state, the share lost, or the share
+        lost and the constants added (stuck).
+
+        Args:
+            candidate: the candidate or its label.
+            count: number of samples N.
+            onset: first sample that it can change.
+            u: (N, m) inputs, for a loss and a stuck actuator.
+            present: (N, l) whether a reading is there.
+
+        Raises:
+            StructureError: a frozen sensor or a noise, which have no course of their own; a loss without u.
+        """
+        c = self[candidate] if isinstance(candidate, str) else candidate
+        since = np.arange(count) - onset
+        if c.additive:
+            course = {"bias": since >= 0, "jump": since == 0, "drift": np.maximum(since + 1, 0)}[c.kind].astype(float)
+            into_state, into_output = course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
+        elif c.columns:
+            into_state, into_output = self._multiplicative(c, since, u)
+        else:
+            raise StructureError(
+                f"{c.label}: its course may be anything, so that there is no signature: test it as an arbitrary "
+                "waveform or by its covariance."
+            )
+        return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
+
+    def _multiplicative(self, c: Candidate, since: np.ndarray, u: ArrayLike | None) -> tuple[Array, Array]:
+        if u is None:
+            raise StructureError(f"{c.label}: its signature depends on the input: pass u (N, m).")
+        inputs = np.asarray(u, dtype=float).reshape(since.size, -1)
+        if inputs.shape[1] != self.model.m:
+            raise DataError(f"u has {inputs.shape[1]} channels; the model has {self.model.m}.")
+        f = self.model.expanded(inputs)[:, list(c.columns)]
+        on = (since >= 0).astype(float)[:, None]
+        before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # what drives x(k) is the input before
+        begun = on.copy()
+        begun[:1] = 0.0
+        into_state, into_output = [-(on * before) @ c.into_state.T], [-(on * f) @ c.into_output.T]
+        if c.kind == "stuck":
+            for b, d in zip(c.into_state.T, c.into_output.T):
+                into_state.append(begun * b)
+                into_output.append(on * d)
+        return np.stack(into_state, axis=2), np.stack(into_output, axis=2)
+
+    def __str__(self) -> str:
+        """List the candidates, the groups and what is left out."""
+        lines = [f"{len(self.candidates)} faults can be told apart"]
+        for c in self.candidates:
+            marks = ["transient only"] * c.bounded_deflection + ["one name for all"] * (len(c.members) > 1)
+            lines.append(f"  {c.label}" + f"  ({', '.join(marks)})" * bool(marks))
+        lines += [f"  {a} and {b} are close: sine {sine:.3f}" for a, b, sine in self.near]
+        lines += [f"  left out: {label}, {why}" for label, why in self.excluded.items()]
+        return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
+
+
+def dictionary(
+    model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
+    kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
+    unknown: bool = True,
+) -> Dictionary:
+    """List the faults that are thought possible, merge those that look the same, leave out those nobody sees.
+
+    Args:
+        model: the healthy model, with noise covariances.
+        actuators: "all" or names of inputs.
+        sensors: "all" or names of outputs.
+        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise"; each where it can be.
+        process: directions (n,) of disturbances in the state equation, by name.
+        state_jump: whether the state may jump, in any direction.
+        unknown: whether "none of these" is an answer.
+
+    Raises:
+        LookupFailed: an unknown kind or channel.
+        StructureError: no noise covariances, no candidate left.
+
+    Warns:
+        DataWarning: faults that were merged or left out.
+    """
+    wanted = [kinds] if isinstance(kinds, str) else list(kinds)
+    for kind in wanted:
+        if kind not in KINDS:
+            raise LookupFailed(f"no fault of kind {kind!r}. {nearest(kind, KINDS)}")
+    steady = predictor(model)
+    names = [f"actuator:{c}" for c in _chosen(actuators, model.inputs)]
+    names += [f"sensor:{c}" for c in _chosen(sensors, model.outputs)]
+    names += [f"process:{c}" for c in process or {}]
+    raw = [_candidate(model, name, kind, process) for kind in wanted if kind != "jump" for name in names
+           if name.partition(":")[0] in KINDS[kind]]
+    if state_jump or "jump" in wanted:
+        raw.append(_candidate(model, "state", "jump", None))
+    found, excluded = [], {}
+    for candidate in raw:
+        kept = _seen(model, steady, candidate, excluded)
+        if kept is not None:
+            found.append(kept)
+    if not found:
+        raise StructureError("No output sees any of the faults: there is nothing to look for.")
+    merged, sines = _merged(steady, found)
+    return Dictionary(model, steady, merged, excluded, sines, unknown)
+
+
+def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
+    if isinstance(wanted, str):
+        wanted = names if wanted == "all" else [wanted]
+    chosen = [name.partition(":")[2] or name for name in wanted]
+    for name in chosen:
+        channel_of(names, f":{name}")
+    return chosen
+
+
+def _candidate(model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None) -> Candidate:
+    into_state, into_output = place_of(model, name, None, process)
+    columns: tuple[int, ...] = ()
+    if kind in ("loss", "stuck"):
+        c = channel_of(model.inputs, name)
+        columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
+    new = Candidate(name, kind, into_state, into_output, columns)
+    return replace(new, members=(new.own_label,), places=(name,))
+
+
+def _horizon(steady: Predictor) -> int:
+    return min(max(2 * steady.settling, 50), LONGEST)
+
+
+def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
+    """Return the signature (N, l, d) from the onset on; of a candidate that has none, that of a bias in its place."""
+    impulse = np.zeros((count, *candidate.into_state.shape))
+    impulse[0] = candidate.into_state
+    direct = np.zeros((count, *candidate.into_output.shape))
+    direct[0] = candidate.into_output
+    found = steady.whitened(steady.respond(impulse, direct))
+    for _ in range({"jump": 0, "drift": 2}.get(candidate.kind, 1)):
+        found = np.cumsum(found, axis=0)
+    return found
+
+
+def _seen(model: "HammersteinSS", steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> Any:
+    """Keep the directions that some output sees, and flag a trace that dies out."""
+    trace = response(steady, candidate, _horizon(steady))
+    flat = trace.reshape(-1, trace.shape[2])
+    possible = np.linalg.norm(steady.root) * (
+        np.linalg.norm(candidate.into_state, axis=0) * max(np.linalg.norm(steady.C), 1e-300)
+        + np.linalg.norm(candidate.into_output, axis=0)
+    )
+    _, sizes, axes = np.linalg.svd(flat, full_matrices=False)
+    there = sizes > UNSEEN * max(float(possible.max(initial=0.0)), 1e-300)
+    if not there.any():
+        excluded[candidate.own_label] = "no output ever sees it"
+        warnings.warn(
+            f"{candidate.own_label}: no output ever sees this fault; it is left out and cannot be an answer.",
+            DataWarning, stacklevel=4,
+        )
+        return None
+    if not there.all() and candidate.kind in ADDITIVE:
+        warnings.warn(
+            f"{candidate.own_label}: {int(np.sum(~there))} of {there.size} directions are seen by no output; they are "
+            "left out.", DataWarning, stacklevel=4,
+        )
+        seen = axes[there].T
+        candidate = replace(
+            candidate, into_state=candidate.into_state @ seen, into_output=candidate.into_output @ seen
+        )
+    course = np.linalg.norm(trace.reshape(len(trace), -1), axis=1)
+    fades = bool(candidate.additive and course[-1] < FORGOTTEN * course.max())
+    return replace(candidate, bounded_deflection=fades)
+
+
+def _merged(steady: Predictor, found: list[Candidate]) -> tuple[tuple[Candidate, ...], Array]:
+    """Put candidates whose signatures span the same space into one group."""
+    count = _horizon(steady)
+    axes = [_axes(response(steady, c, count)) if c.additive else None for c in found]
+    kept: list[int] = []
+    groups: dict[int, list[Candidate]] = {}
+    for i, candidate in enumerate(found):
+        for j in kept:
+            first, second = axes[j], axes[i]
+            if first is None or second is None or first.shape != second.shape:
+                continue
+            sine = float(np.linalg.norm(second - first @ (first.T @ second), 2))
+            if sine < SAME:
+                groups[j].append(candidate)
+                warnings.warn(
+                    f"{found[j].own_label} and {candidate.own_label} leave the same trace (sine of the angle "
+                    f"{sine:.1e}): no record can tell them apart, and an answer names both.",
+                    DataWarning, stacklevel=4,
+                )
+                break
+        else:
+            kept.append(i)
+            groups[i] = [candidate]
+    sines = np.full((len(kept), len(kept)), np.nan)
+    for a, i in enumerate(kept):
+        for b, j in enumerate(kept):
+            first, second = axes[i], axes[j]
+            if first is not None and second is not None:
+                wide, narrow = (first, second) if first.shape[1] >= second.shape[1] else (second, first)
+                sines[a, b] = np.linalg.svd(narrow - wide @ (wide.T @ narrow), compute_uv=False)[-1]
+    merged = []
+    for i in kept:
+        members, places = ([getattr(c, word) for c in groups[i]] for word in ("own_label", "name"))
+        merged.append(replace(found[i], members=tuple(members), places=tuple(dict.fromkeys(places))))
+    return tuple(merged), sines
+
+
+def _axes(trace: Array) -> Array:
+    """Orthonormal axes (N l, d) of a signature."""
+    flat = trace.reshape(-1, trace.shape[2])
+    return np.asarray(np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0])
