@@ -59,9 +59,10 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nk: int | S
     return _posed("armax.exact", data, Linear(), False, "none", na, nb, nc, nk, constraints, offset, starts, seed)
 
 
-def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, basis: Basis | str | Sequence[Basis | str],
-          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True,
-          starts: int = 3, seed: int = 0) -> Procedure:
+def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int,
+          basis: Basis | str | Sequence[Basis | str] = "polynomial:3", nk: int | Sequence[int] = 0,
+          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 3, seed: int = 0
+          ) -> Procedure:
     """Minimise the innovations of a Hammerstein ARMAX model.
 
     Args:
@@ -69,7 +70,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, basis: Basis
         na: order of A.
         nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
-        basis: basis of the nonlinearity, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).

@@ -27,10 +27,10 @@ import numpy as np
 
 from formulations.equation_error import model_meta
 from formulations.hammerstein_arx import GAUGES
-from formulations.hammerstein_oe import OutputError, check_excited, check_rows, checked_record, plant_layout
+from formulations.hammerstein_oe import OutputError
 from formulations.noise_models import one_output
+from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import blank, equation_error, iterated, stable_poles, with_poles
-from optid.bases import fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import StructureError
@@ -51,16 +51,16 @@ LIMIT = 20_000
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 
-def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str] = "polynomial:3",
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True
           ) -> Program:
     """Pose the least squares of the simulation errors with the simulated outputs as variables.
 
     Args:
-        data: the record: every input sample present, outputs may be missing; one output.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth
             constraint in the named variables.
@@ -69,18 +69,18 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
 
     Raises:
         StructureError: impossible orders, unknown gauge, several outputs, or a record that is too long.
-        DataError: a missing input sample.
+        DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     if gauge not in GAUGES:
         raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
-    record = checked_record(one_output(data))
+    record, layout = plant_record(one_output(data), na, nb, nk, basis)
     if record.n_samples > LIMIT:
         raise StructureError(
             f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "
             f"{LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
-    layout = plant_layout(record, na, nb, nk, fitted_bases(record, basis))
     check_excited(record, layout)
+    check_inputs_differ(record, layout)
     unknowns = Unknowns(layout, record.n_experiments, (True,) * layout.m, bool(offset))
     check_rows(record, unknowns)
     return _Shooting(OutputError(record, unknowns, gauge)).program(constraints)

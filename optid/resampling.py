@@ -104,7 +104,9 @@ def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, s
 
     if isinstance(fit.data, Stream):
         raise StructureError("a stream cannot be simulated again; read the record, or use fit.uncertainty")
-    if fit.model is not None and fit.model.kind != "HammersteinARX":
+    if fit.model is None:
+        raise StructureError(f"this fit has no model to resample: {fit.solution.reason or fit.solution.status}")
+    if fit.model.kind != "HammersteinARX":
         raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
     if runs < 40 or not 0 < level < 1:
         raise StructureError(f"runs={runs}, level={level}: at least 40 runs and a level between 0 and 1 are needed")
