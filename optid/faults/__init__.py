@@ -9,6 +9,8 @@ from typing import Any
 _HOME = {
     "Fault": "faults",
     "inject": "injection",
+    "hard_over_test": "hard_over",
+    "HardOver": "hard_over",
     "trajectory": "injection",
     "whiten": "whitening",
     "health": "whitening",

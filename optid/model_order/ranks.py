@@ -159,7 +159,7 @@ def rank_test(
         raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
     r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
     left, values, right = np.linalg.svd(r22)
-    gram_of = _shifted(statistics, width, rows)
+    gram_of = shifted_moments(statistics, width, rows)
     unbiased = j / (j - z.size)  # residuals of a regression on the instruments
     lags = range(reach + 1)
     covariance_e = [unbiased * left.T @ (noise.T @ gram_of(lag) @ noise) @ left for lag in lags]
@@ -167,7 +167,7 @@ def rank_test(
     tails = np.cumsum((values**2)[::-1])[::-1]
     expected, thresholds, p_values = np.zeros((3, values.size))
     for n0 in range(values.size):
-        mean, variance = _moments([e[n0:, n0:] for e in covariance_e], [s[n0:, n0:] for s in covariance_z])
+        mean, variance = moments_of_sum([e[n0:, n0:] for e in covariance_e], [s[n0:, n0:] for s in covariance_z])
         expected[n0] = mean / j
         if mean <= 0 or variance <= 0:
             p_values[n0] = 1.0 if values[n0] <= floor else 0.0
@@ -229,7 +229,7 @@ def _projections(
     return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
 
 
-def _shifted(statistics: HankelStatistics, width: int, rows: int):
+def shifted_moments(statistics: HankelStatistics, width: int, rows: int):
     """Return the function lag -> mean of s_t s_{t + lag}^T over windows s_t = [1; rows block rows]."""
 
     def gram_of(lag: int) -> Array:
@@ -239,7 +239,7 @@ def _shifted(statistics: HankelStatistics, width: int, rows: int):
     return gram_of
 
 
-def _moments(covariance_e: Sequence[Array], covariance_z: Sequence[Array]) -> tuple[float, float]:
+def moments_of_sum(covariance_e: Sequence[Array], covariance_z: Sequence[Array]) -> tuple[float, float]:
     """Mean and variance of |(1/sqrt j) sum_t e_t z_t^T|^2, which is Gaussian with Omega = sum_tau R_z(tau) x R_e(tau).
 
     All lags have weight one, which is exact for noise that windows share; where the estimate is not a covariance,

@@ -5,6 +5,7 @@ Each takes an input, a seed and the sizes of its noises, and returns a record (`
 
 from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem
 from optid.plants.physical import ReactionWheelPendulum, pendulum, pendulum_input, van_der_pol
+from optid.plants.two_modes import two_mode_plant
 
 __all__ = [
     "EXAMPLE1",
@@ -14,5 +15,6 @@ __all__ = [
     "ReactionWheelPendulum",
     "pendulum",
     "pendulum_input",
+    "two_mode_plant",
     "van_der_pol",
 ]

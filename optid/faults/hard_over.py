@@ -1,0 +1,356 @@
+"""Complete loss of a sensor or an actuator by rank deficiency (dissertation, chapter 7): sliding windows, three tests.
+
+Order: the number of states that the instruments show changes. It drops only where the lost channel was the only access
+to some mode, and an actuator's loss is hidden by past outputs among the instruments as soon as there is process noise:
+process noise then reaches the same modes. Hence past and future inputs alone are the instruments by default.
+Rows: the outputs of a dead sensor depend on no input. Columns: no output depends on the input of a dead actuator, given
+past outputs and the other inputs. Both work on every plant.
+A window that straddles the failure sees an average of both plants and keeps the nominal rank, and its rows and columns
+are not zero: the alarm comes about one window after the failure. Meant as confirmation beside faster detectors.
+
+Nothing is said where the inputs do not move: behind every verdict stands what a healthy channel would have shown on the
+same window. Open loop is assumed: under feedback inputs depend on sensor noise, and rows of dead sensors are not zero.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import DataError, RankError, StructureError
+from optid.faults.zero_tests import ZeroTest, smallest_excitation, zero_test
+from optid.model_order.ranks import rank_test
+from optid.subspace.hankel import HankelStatistics, hankel_statistics
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_ss import HammersteinSS
+
+INSTRUMENTS = ("inputs", "inputs+past")
+BLOCK_ROWS = 6
+LONG = 20
+"""Windows have at least this many samples per future row of outputs."""
+
+LEVEL = 1e-3
+"""Probability that the row or column of a dead channel is not recognised on one window."""
+
+STILL = 0.1
+"""Smallest excitation, relative to the healthy record, below which no order is estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class WindowVerdict:
+    """What one window says.
+
+    Attributes:
+        experiment: index of the experiment.
+        start: first sample of the window.
+        stop: sample after the last.
+        order: estimated order, None where it cannot be.
+        order_note: why, or why not.
+        excitation: smallest eigenvalue of the input Gram matrix, relative to the healthy record.
+        rows: one test per sensor.
+        columns: one test per actuator.
+        moving: sensors whose output has a memory that white sensor noise has not; a dead sensor has none.
+    """
+
+    experiment: int
+    start: int
+    stop: int
+    order: int | None
+    order_note: str
+    excitation: float
+    rows: tuple[ZeroTest, ...]
+    columns: tuple[ZeroTest, ...]
+    moving: frozenset[str] = frozenset()
+
+    @property
+    def dead(self) -> tuple[str, ...]:
+        """Channels that may be dead; a sensor that still moves by itself, or an actuator behind a flat sensor, is not."""
+        sensors = [test for test in self.rows if test.zero and test.name not in self.moving]
+        flat = any(test.flat for test in sensors)
+        alive = [test for test in self.columns if test.zero and not flat]
+        return tuple(test.name for test in sorted([*sensors, *alive], key=lambda test: test.ratio))
+
+    @property
+    def untestable(self) -> tuple[str, ...]:
+        """Channels of which this window can say nothing."""
+        return tuple(test.name for test in (*self.rows, *self.columns) if not test.testable)
+
+
+@dataclass(frozen=True, eq=False)
+class HardOver:
+    """The test of a record.
+
+    Attributes:
+        windows: verdicts in time.
+        nominal_order: order of the healthy record.
+        window: samples of a window.
+        hop: samples between windows.
+        block_rows: future block rows.
+        instruments: "inputs" or "inputs+past".
+        name: of the record.
+    """
+
+    windows: tuple[WindowVerdict, ...]
+    nominal_order: int
+    window: int
+    hop: int
+    block_rows: int
+    instruments: str
+    name: str = ""
+
+    @property
+    def alarm(self) -> WindowVerdict | None:
+        """The first window with a dead row or column, or the second in a row with another order."""
+        before = None
+        for verdict in self.windows:
+            changed = verdict.order is not None and verdict.order != self.nominal_order
+            if verdict.dead or changed and before == verdict.experiment:
+                return verdict
+            before = verdict.experiment if changed else None
+        return None
+
+    @property
+    def detected(self) -> bool:
+        """Whether there is an alarm."""
+        return self.alarm is not None
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The channels that may be dead at the alarm, the likeliest first; () where only the order changed."""
+        return self.alarm.dead if self.alarm is not None else ()
+
+    @property
+    def untestable(self) -> tuple[str, ...]:
+        """Channels of which no window can say anything."""
+        found = [set(verdict.untestable) for verdict in self.windows]
+        return tuple(sorted(set.intersection(*found))) if found else ()
+
+    def explain(self) -> str:
+        """Say in words what was found."""
+        if self.alarm is None:
+            words = f"No alarm in {len(self.windows)} windows of {self.window} samples; nominal order "
+            words += f"{self.nominal_order}."
+        else:
+            at = self.alarm
+            order = "not estimated" if at.order is None else str(at.order)
+            words = (f"Alarm with the window of samples {at.start} to {at.stop - 1}: order {order}, nominal "
+                     f"{self.nominal_order}. ")
+            if not at.dead:
+                words += "No row and no column is zero: the dynamics changed, no channel is lost entirely."
+            elif len(at.dead) == 1:
+                words += f"{at.dead[0]} is dead: all others exceed their thresholds."
+            else:
+                words += f"One of {', '.join(at.dead)} is dead; rank alone does not say which."
+            words += " The failure lies within or before this window."
+        if self.untestable:
+            words += f" Untestable for lack of excitation: {', '.join(self.untestable)}."
+        if self.instruments == "inputs+past":
+            words += " With past outputs as instruments process noise hides the loss of an actuator from the order."
+        return words
+
+    def __str__(self) -> str:
+        names = [test.name for test in (*self.windows[0].rows, *self.windows[0].columns)]
+        lines = ["statistic / threshold of each channel; up to 1 is dead, - is untestable"]
+        shown = [name if len(name) <= 13 else name[:12] + "." for name in names][:4]
+        lines.append(f"{'samples':<15}{'order':>6}" + "".join(f"{name:>14}" for name in shown))
+        for verdict in self.windows:
+            tests = [*verdict.rows, *verdict.columns][:4]
+            cells = "".join(f"{f'{t.ratio:.3g}' if t.testable else '-':>14}" for t in tests)
+            order = "-" if verdict.order is None else verdict.order
+            lines.append(f"{f'{verdict.start}-{verdict.stop - 1}':<15}{order:>6}{cells}")
+        from textwrap import wrap
+
+        return "\n".join([*lines, *wrap(self.explain(), 80)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Positions of the signals [f(u) | y] in windows of 3 alpha samples."""
+
+    inputs: tuple[tuple[int, ...], ...]
+    p: int
+    l: int  # noqa: E741 - the field's letter
+    alpha: int
+
+    @property
+    def all(self) -> range:
+        return range(self.p)
+
+    @property
+    def y(self) -> range:
+        return range(self.p, self.p + self.l)
+
+
+@dataclass(frozen=True, eq=False)
+class _Healthy:
+    """What a healthy record shows: sizes, excitation and coefficients."""
+
+    order: int
+    sizes: Array
+    excitation: float
+    rows: tuple[Array, ...]
+    columns: tuple[Array, ...]
+
+
+def hard_over_test(
+    data: Data,
+    healthy: Data,
+    *,
+    model: "HammersteinSS | None" = None,
+    order: int | None = None,
+    window: int | None = None,
+    hop: int | None = None,
+    block_rows: int = BLOCK_ROWS,
+    instruments: str = "inputs",
+    level: float = LEVEL,
+) -> HardOver:
+    """Test a record for dead sensors and actuators, window by window.
+
+    Args:
+        data: the record to be judged; NaN = missing. Windows never cross from one experiment to the next.
+        healthy: a record without failure: nominal order, sizes and what healthy channels show.
+        model: its input nonlinearities turn u into f(u); None takes the inputs as they are. No output feedback.
+        order: nominal order; that of the healthy record when not given.
+        window: samples of a window; at least, and by default, 20 per block row and output.
+        hop: samples between windows; a quarter of a window when not given.
+        block_rows: future block rows alpha, larger than order / outputs; the past has as many.
+        instruments: "inputs", or "inputs+past" to see what process noise hides.
+        level: probability that a dead channel is not recognised on one window.
+
+    Raises:
+        StructureError: arguments out of range, or a model with feedback.
+        DataError: records with other channels.
+        RankError: a record shorter than a window, or a healthy record that does not excite the inputs.
+    """
+    if instruments not in INSTRUMENTS:
+        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
+    if isinstance(block_rows, bool) or not isinstance(block_rows, int | np.integer) or block_rows < 2:
+        raise StructureError(f"block_rows={block_rows!r}: a whole number from 2 is needed.")
+    if not 0 < level < 1:
+        raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
+    data, healthy = data.raw(), healthy.raw()
+    if (data.inputs, data.outputs) != (healthy.inputs, healthy.outputs):
+        raise DataError(f"the healthy record has channels {', '.join((*healthy.inputs, *healthy.outputs))}, the other "
+                        f"{', '.join((*data.inputs, *data.outputs))}: they must be the same, in the same order.")
+    least = LONG * block_rows * data.l
+    window = least if window is None else window
+    hop = max(window // 4, 1) if hop is None else hop
+    if window < least or hop < 1:
+        raise StructureError(f"window={window}, hop={hop}: a window of at least {least} samples (20 per block row and "
+                             "output) and a hop of at least 1 are needed.")
+    layout = _layout(data, model, int(block_rows))
+    nominal = _reference(_signals(healthy, model), layout, healthy, order, instruments)
+    found = []
+    for e, record in enumerate(_signals(data, model)):
+        for start in range(0, len(record) - window + 1, hop):
+            found.append(_judged(record[start : start + window], layout, nominal, data, instruments, level,
+                                 (e, start, start + window)))
+    if not found:
+        raise RankError(f"No experiment has the {window} samples of a window: shorten it or take fewer block rows.")
+    return HardOver(tuple(found), nominal.order, window, hop, layout.alpha, instruments, data.name)
+
+
+def _layout(data: Data, model: "HammersteinSS | None", alpha: int) -> _Layout:
+    if model is None:
+        return _Layout(tuple((i,) for i in range(data.m)), data.m, data.l, alpha)
+    if model.feedback:
+        raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
+    if (model.inputs, model.outputs) != (data.inputs, data.outputs):
+        raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
+    groups = tuple(tuple(c for c, i in enumerate(model.input_of) if i == j) for j in range(data.m))
+    return _Layout(groups, len(model.input_of), data.l, alpha)
+
+
+def _signals(data: Data, model: "HammersteinSS | None") -> Iterator[Array]:
+    for e in data.experiments:
+        yield np.hstack([e.u if model is None else model.expanded(e.u), e.y])
+
+
+def _reference(
+    records: Iterator[Array], layout: _Layout, data: Data, order: int | None, instruments: str
+) -> _Healthy:
+    alpha = layout.alpha
+    statistics = hankel_statistics(list(records), 3 * alpha, centre="mean")
+    statistics.check()
+    mean = statistics.gram[0] / statistics.windows
+    sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
+    for c, size in enumerate(sizes[1 : 1 + statistics.d]):
+        if not size > 0:
+            channel = (*(data.inputs[i] for i, g in enumerate(layout.inputs) for _ in g), *data.outputs)[c]
+            raise RankError(f"{channel} does not move in the healthy record: take one in which every channel does.")
+    every = statistics.at(layout.all, range(2 * alpha))
+    excitation = smallest_excitation(statistics, every, sizes[every])
+    if excitation < 1e-10:
+        raise RankError(f"the inputs of the healthy record do not excite {2 * alpha} block rows (smallest eigenvalue "
+                        f"{excitation:.1e}): use richer inputs or fewer block rows.")
+    if order is None:
+        order, _ = _order(statistics, layout, sizes, instruments)
+    rows, columns, _ = _tests(statistics, layout, data, sizes, None, LEVEL)
+    return _Healthy(order, sizes, excitation, tuple(t for _, t in rows), tuple(t for _, t in columns))
+
+
+def _judged(
+    record: Array, layout: _Layout, nominal: _Healthy, data: Data, instruments: str, level: float,
+    place: tuple[int, int, int],
+) -> WindowVerdict:
+    alpha = layout.alpha
+    names = [f"sensor:{c}" for c in data.outputs], [f"actuator:{c}" for c in data.inputs]
+    nothing = [tuple(ZeroTest(name, float("nan"), float("nan"), float("nan"), 0.0) for name in kind) for kind in names]
+    try:
+        statistics = hankel_statistics([record], 3 * alpha, centre="mean", method="gram")
+        statistics.check()
+    except RankError as error:
+        return WindowVerdict(*place, None, str(error), float("nan"), nothing[0], nothing[1])
+    every = statistics.at(layout.all, range(2 * alpha))
+    excitation = smallest_excitation(statistics, every, nominal.sizes[every]) / nominal.excitation
+    rows, columns, moving = _tests(statistics, layout, data, nominal.sizes, nominal, level)
+    order, note = None, f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
+    if excitation >= STILL:
+        try:
+            order, note = _order(statistics, layout, nominal.sizes, instruments)
+        except RankError as error:
+            note = f"untestable: {error}"
+    return WindowVerdict(*place, order, note, excitation, tuple(t for t, _ in rows), tuple(t for t, _ in columns),
+                         moving)
+
+
+def _order(statistics: HankelStatistics, layout: _Layout, sizes: Array, instruments: str) -> tuple[int, str]:
+    alpha, at = layout.alpha, statistics.at
+    z = [np.zeros(1, dtype=np.intp), at(layout.all, range(2 * alpha))]
+    if instruments == "inputs+past":
+        z.append(at(layout.y, range(alpha)))
+    phi = np.concatenate([[0], at(layout.all, range(alpha, 2 * alpha))])
+    y = at(layout.y, range(alpha, 2 * alpha))
+    test = rank_test(statistics, np.concatenate(z), phi, y, rows=2 * alpha, largest=(alpha - 1) * layout.l,
+                     scale=sizes[y])
+    return test.order, test.reason
+
+
+def _tests(
+    statistics: HankelStatistics, layout: _Layout, data: Data, sizes: Array, nominal: _Healthy | None, level: float
+) -> tuple[list[tuple[ZeroTest, Array]], list[tuple[ZeroTest, Array]], frozenset[str]]:
+    """Row tests, column tests, and the sensors that move by themselves."""
+    alpha, at = layout.alpha, statistics.at
+    past, future, now = range(alpha), range(alpha, 2 * alpha), range(alpha, alpha + 1)
+    every = at(layout.all, range(2 * alpha))
+    rows, columns, moving = [], [], set()
+    for i, (s, channel) in enumerate(zip(layout.y, data.outputs)):
+        name, y = f"sensor:{channel}", at([s], future)
+        rows.append(zero_test(statistics, every, [0], y, rows=2 * alpha, level=level, name=name, scale=sizes[y],
+                              coefficients=None if nominal is None else nominal.rows[i]))
+        own = zero_test(statistics, at([s], past), np.concatenate([[0], every]), at([s], now), rows=2 * alpha,
+                        level=level, scale=sizes[at([s], now)])[0]
+        if own.statistic > own.threshold:
+            moving.add(name)
+    y = at(layout.y, now)
+    for j, (group, channel) in enumerate(zip(layout.inputs, data.inputs)):
+        others = [c for c in layout.all if c not in group]
+        rest = np.concatenate([[0], at(others, range(alpha + 1)), at(layout.y, past)])
+        columns.append(zero_test(statistics, at(group, range(alpha + 1)), rest, y, rows=2 * alpha, level=level,
+                                 name=f"actuator:{channel}", scale=sizes[y],
+                                 coefficients=None if nominal is None else nominal.columns[j]))
+    return rows, columns, frozenset(moving)

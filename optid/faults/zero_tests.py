@@ -1,0 +1,154 @@
+"""Is a group of coefficients zero? Wald tests on windows of a record, with the serial correlation of the windows.
+
+With [o; t; y] the rows of a Hankel matrix, regress y on o and t. Let z_t be the part of the tested rows t that the
+others o do not explain, normalised, and e_t the residuals of y, normalised. If the coefficients of t are zero,
+
+    T = |(1/j) sum_t e_t z_t^T|_F^2
+
+is nearly g chi2_h / j, with g and h from the covariances of e and z at every lag at which windows overlap
+(`optid.model_order.ranks`). If they are Theta instead, T grows by |C_z^(1/2) Theta C_e^(-1/2)|^2: with Theta of a
+healthy record this says whether a test on another record can tell anything at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.bases.basis import Array
+from optid.model_order.ranks import moments_of_sum, shifted_moments
+from optid.subspace.hankel import HankelStatistics
+
+Positions = Sequence[int] | NDArray[np.intp]
+
+DROPPED = 1e-8
+"""Eigenvalue of the scaled tested rows below which a direction is not excited and not tested."""
+
+QUIET = 1e-7
+"""Residuals relative to the spread of the healthy output that count as rounding."""
+
+MARGIN = 3.0
+"""A test counts only where a healthy channel would exceed its threshold this many times."""
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroTest:
+    """One group of coefficients on one window.
+
+    Attributes:
+        name: the channel, for instance "sensor:y1".
+        statistic: T, without unit.
+        threshold: quantile of T if the coefficients are zero.
+        p_value: probability of a larger T if they are zero.
+        healthy: T to be expected of a healthy channel on this window; inf where no healthy record was given.
+        flat: whether the tested output does not move at all.
+    """
+
+    name: str
+    statistic: float
+    threshold: float
+    p_value: float
+    healthy: float = float("inf")
+    flat: bool = False
+
+    @property
+    def testable(self) -> bool:
+        """Whether a healthy channel would be told from a dead one."""
+        return self.healthy > MARGIN * self.threshold
+
+    @property
+    def zero(self) -> bool:
+        """Whether the coefficients are zero as far as this window tells, and it would tell."""
+        return self.testable and self.statistic <= self.threshold
+
+    @property
+    def ratio(self) -> float:
+        """T over its threshold."""
+        return self.statistic / self.threshold if self.threshold > 0 else 0.0 if self.statistic == 0 else float("inf")
+
+
+def zero_test(
+    statistics: HankelStatistics,
+    tested: Positions,
+    others: Positions,
+    outputs: Positions,
+    *,
+    rows: int,
+    level: float,
+    name: str = "",
+    scale: Array | None = None,
+    coefficients: Array | None = None,
+) -> tuple[ZeroTest, Array]:
+    """Test whether the coefficients of some rows are zero.
+
+    Args:
+        statistics: moments of windows of `rows` + reach samples; correlation counts up to the reach.
+        tested: positions of t within the first `rows` block rows.
+        others: positions of o, the constant (0) among them.
+        outputs: positions of y.
+        rows: block rows in use.
+        level: probability of calling a true zero not zero.
+        name: of the channel.
+        scale: (y,) sizes of the outputs when healthy; their own spread when not given.
+        coefficients: (t, y) of a healthy record, in units of the signals.
+
+    Returns:
+        The test, and the coefficients (t, y) on this record.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    t, o, y = (np.asarray(part, dtype=np.intp) for part in (tested, others, outputs))
+    j, width = statistics.windows, 1 + rows * statistics.d
+    gram = statistics.gram / j
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    past, on_t = _regressed(gram, o, np.concatenate([t, y]), size), np.arange(t.size)
+    weights = np.zeros((width, t.size + y.size))  # what is left of t and y after o
+    weights[t, on_t] = 1
+    weights[y, t.size + np.arange(y.size)] = 1
+    weights[o] -= past
+    left = weights.T @ gram[:width, :width] @ weights
+    spread = np.sqrt(np.maximum(np.diag(left)[t.size :], 0)) if scale is None else np.asarray(scale, dtype=float)
+    spread = np.maximum(spread, 1e-150)
+    unit = size[t]
+    values, vectors = np.linalg.eigh(left[: t.size, : t.size] / np.outer(unit, unit))
+    kept = values > DROPPED * t.size
+    normal = vectors[:, kept] / np.sqrt(values[kept]) / unit[:, None]  # z = normal^T t
+    gains = normal.T @ left[: t.size, t.size :]
+    theta = normal @ gains
+    covariance = (left[t.size :, t.size :] - gains.T @ gains) / np.outer(spread, spread) + QUIET**2 * np.eye(y.size)
+    whitener = np.linalg.inv(np.linalg.cholesky((covariance + covariance.T) / 2)).T / spread[:, None]
+    energy = float(np.max(np.diag(left)[t.size :] / spread**2))
+    shocks, noise = weights[:, on_t] @ normal, (weights[:, t.size :] - weights[:, on_t] @ theta) @ whitener
+    statistic = float(np.sum((gains @ whitener) ** 2))
+    gram_of, lags = shifted_moments(statistics, width, rows), range(statistics.rows - rows + 1)
+    unbiased = j / max(j - o.size - t.size, 1)
+    e = [unbiased * noise.T @ gram_of(lag) @ noise for lag in lags]
+    z = [shocks.T @ gram_of(lag) @ shocks for lag in lags]
+    flat = energy <= QUIET**2
+    if not kept.any() or flat:
+        healthy = 0.0 if not kept.any() else float("inf")
+        return ZeroTest(name, 0.0, 0.0, 1.0, healthy, flat), theta
+    mean, variance = moments_of_sum(e, z)
+    g, h = variance / (2 * mean), 2 * mean**2 / variance
+    healthy = float("inf")
+    if coefficients is not None:
+        root = np.sqrt(values[kept])[:, None] * (vectors[:, kept] * unit[:, None]).T
+        healthy = mean / j + float(np.sum((root @ coefficients @ whitener) ** 2))
+    threshold, p_value = float(g / j * chdtri(h, level)), float(chdtrc(h, statistic * j / g))
+    return ZeroTest(name, statistic, threshold, p_value, healthy), theta
+
+
+def smallest_excitation(statistics: HankelStatistics, positions: Positions, scale: Array) -> float:
+    """Return the smallest eigenvalue of the covariance of some rows, each divided by its healthy size."""
+    at = np.asarray(positions, dtype=np.intp)
+    mean = statistics.gram[0, at] / statistics.windows
+    covariance = statistics.gram[np.ix_(at, at)] / statistics.windows - np.outer(mean, mean)
+    return max(float(np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0]), 0.0)
+
+
+def _regressed(gram: Array, on: NDArray[np.intp], of: NDArray[np.intp], size: Array) -> Array:
+    """Least squares (on, of) from moments; directions that are not excited get no coefficient."""
+    scaled = gram[np.ix_(on, on)] / np.outer(size[on], size[on])
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    return inverse @ (gram[np.ix_(on, of)] / size[on][:, None]) / size[on][:, None]

@@ -1,0 +1,267 @@
+"""Hard-over losses: the decision table, the distribution of the tests by Monte Carlo, gates, and bad input."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+import optid
+from optid.data import Data
+from optid.errors import DataError, RankError, StructureError
+from optid.faults import Fault, hard_over_test, inject
+from optid.faults.zero_tests import zero_test
+from optid.plants import two_mode_plant
+from optid.subspace.hankel import hankel_statistics, windows_of
+
+N = 1500
+
+
+def run(coupled=False, process=0.1, fault=None, onset=0, n=N, seed=1, u=None):
+    model = two_mode_plant(coupled, process)
+    u = np.random.default_rng(seed).normal(size=(n, 2)) if u is None else u
+    faults = [] if fault is None else [Fault.loss(fault, onset, 1.0)]
+    return Data(u, inject(model, u, faults, seed=seed + 1000))
+
+
+HEALTHY = {(coupled, process): run(coupled, process, n=3000, seed=99)
+           for coupled in (False, True) for process in (0.0, 0.1)}
+
+
+def judged(coupled=False, process=0.1, fault=None, onset=0, n=N, seed=1, u=None, **settings):
+    data = run(coupled, process, fault, onset, n, seed, u)
+    return hard_over_test(data, HEALTHY[coupled, process], window=N, **settings)
+
+
+# -- the decision table ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("process", [0.0, 0.1])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_orders_without_and_with_a_loss(coupled, process):
+    orders = [judged(coupled, process, fault).windows[0].order for fault in (None, "sensor:y1", "actuator:u1")]
+    assert orders == ([4, 4, 4] if coupled else [4, 2, 2])
+
+
+@pytest.mark.parametrize("process, order", [(0.0, 2), (0.1, 4)])
+def test_past_outputs_hide_the_loss_of_an_actuator(process, order):
+    # without process noise they hide nothing
+    found = judged(False, process, "actuator:u1", instruments="inputs+past")
+    assert found.windows[0].order == order
+    assert "hides" in found.explain()
+    assert judged(False, process, "sensor:y1", instruments="inputs+past").windows[0].order == 2
+
+
+@pytest.mark.parametrize("fault", ["sensor:y1", "actuator:u2"])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_a_straddling_window_keeps_the_nominal_order(coupled, fault):
+    found = judged(coupled, 0.1, fault, onset=N, n=3 * N, hop=N // 2)
+    straddling = [w for w in found.windows if w.start < N - 5 < N < w.stop]
+    after = [w for w in found.windows if w.start >= N]
+    assert [w.order for w in straddling] == [4]
+    assert not any(w.dead for w in found.windows if w.start < N)
+    assert all(fault in w.dead for w in after)
+    assert found.alarm.start == N
+    assert str(found.alarm.start) in found.explain()
+
+
+@pytest.mark.parametrize("fault", ["sensor:y1", "sensor:y2", "actuator:u1", "actuator:u2"])
+def test_the_dead_channel_of_a_coupled_plant_is_named(fault):
+    for seed in range(5):
+        found = judged(True, 0.1, fault, seed=seed)
+        tests = {t.name: t for t in (*found.windows[0].rows, *found.windows[0].columns)}
+        assert found.candidates == (fault,)
+        assert tests.pop(fault).ratio < 1
+        assert min(t.ratio for t in tests.values()) > 100
+        assert f"{fault} is dead" in found.explain()
+
+
+def test_an_uncoupled_plant_names_both_unless_its_sensor_still_moves():
+    assert set(judged(False, 0.1, "sensor:y1").candidates) == {"sensor:y1", "actuator:u1"}
+    assert judged(False, 0.1, "actuator:u1").candidates == ("actuator:u1",)  # y1 shows process noise
+    assert set(judged(False, 0.0, "actuator:u1").candidates) == {"sensor:y1", "actuator:u1"}
+
+
+def test_a_healthy_record_gives_no_alarm():
+    for coupled in (False, True):
+        for seed in range(10):
+            found = judged(coupled, 0.1, n=3 * N, seed=seed)
+            assert not found.detected and found.candidates == ()
+            assert "No alarm" in found.explain()
+
+
+# -- stuck, frozen, nonlinear, missing -------------------------------------------------------------------------------
+
+
+def test_stuck_channels_count_as_dead():
+    model, u = two_mode_plant(True, 0.1), np.random.default_rng(3).normal(size=(N, 2))
+    for fault in (Fault.stuck("actuator:u1", 0, 2.0), Fault.stuck("sensor:y2", 0, 1.7), Fault.frozen("sensor:y2", 40)):
+        data = Data(u, inject(model, u, fault, seed=5))
+        data = data if fault.kind != "frozen" else Data(u[40:], data.y[40:])
+        found = hard_over_test(data, HEALTHY[True, 0.1], window=len(u) - 40 if fault.kind == "frozen" else N)
+        assert found.candidates == (fault.name,)
+        assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
+
+
+def test_input_nonlinearities_of_a_model():
+    path = Path(os.environ.get("OPTID_DATA", "missing")) / "fault_plant.json"
+    if not path.exists():
+        pytest.skip("OPTID_DATA has no fault_plant.json")
+    plant = {key: np.array(value) for key, value in json.loads(path.read_text()).items()
+             if key in ("A", "B", "C", "D", "Q", "R")}
+    functions = optid.UserFunctions([lambda u: u + 0.25 * u**3], names=["f1"]), optid.UserFunctions(
+        [lambda u: np.tanh(1.5 * u) + 0.15 * u], names=["f2"])
+    shapes = tuple(optid.Nonlinearity(basis.fitted(-1.2, 1.2), np.ones(1)) for basis in functions)
+    noise = optid.NoiseCovariances(plant["Q"], plant["R"], np.zeros((4, 2)), np.eye(2))
+    model = optid.HammersteinSS(*(plant[k] for k in "ABCD"), nonlinearities=shapes, noise=noise)
+    u = np.repeat(np.random.default_rng(0).uniform(-1.2, 1.2, size=(1200, 2)), 5, axis=0)
+    healthy = Data(u, inject(model, u, seed=1))
+    for name in ("actuator:u1", "actuator:u2", "sensor:y1", "sensor:y2"):
+        data = Data(u[:2000], inject(model, u[:2000], Fault.loss(name, 0, 1.0), seed=2))
+        assert hard_over_test(data, healthy, model=model, window=2000).candidates == (name,)
+    other = Data(u[:2000], inject(model, u[:2000], seed=2))
+    assert not hard_over_test(other, healthy, model=model, window=2000).detected
+
+
+def test_missing_samples_and_experiments():
+    data = run(True, 0.1, "actuator:u1", n=2 * N)
+    y = data.y.copy()
+    y[::97, 0] = np.nan
+    second = run(True, 0.1, n=N, seed=8)
+    both = Data([data.u, second.u], [y, second.y])
+    found = hard_over_test(both, HEALTHY[True, 0.1], window=N, hop=N)
+    assert [w.dead for w in found.windows] == [("actuator:u1",)] * 2 + [()]
+    assert [(w.experiment, w.start) for w in found.windows] == [(0, 0), (0, N), (1, 0)]
+    y[:, 0] = np.where(np.arange(2 * N) % 10, y[:, 0], np.nan)
+    empty = hard_over_test(Data(data.u, y), HEALTHY[True, 0.1], window=N).windows[0]
+    assert empty.order is None and "complete" in empty.order_note and len(empty.untestable) == 4
+
+
+def test_the_calling_arrays_are_not_changed():
+    u = np.random.default_rng(0).normal(size=(N, 2))
+    y = inject(two_mode_plant(True, 0.1), u)
+    before = u.copy(), y.copy()
+    hard_over_test(Data(u, y), HEALTHY[True, 0.1], window=N)
+    assert np.array_equal(u, before[0]) and np.array_equal(y, before[1])
+
+
+# -- the excitation gate ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [None, "actuator:u1"])
+def test_inputs_that_stand_still_give_no_verdict(fault):
+    found = judged(True, 0.1, fault, u=np.tile([0.7, -0.2], (N, 1)))
+    assert not found.detected
+    assert found.windows[0].order is None and "smallest eigenvalue" in found.windows[0].order_note
+    assert set(found.untestable) == {"sensor:y1", "sensor:y2", "actuator:u1", "actuator:u2"}
+    assert "Untestable for lack of excitation" in found.explain()
+
+
+def test_one_input_that_stands_still_leaves_the_others_testable():
+    u = np.random.default_rng(4).normal(size=(N, 2))
+    u[:, 0] = 0.3
+    found = judged(True, 0.1, "sensor:y2", u=u)
+    assert found.untestable == ("actuator:u1",)
+    assert found.candidates == ("sensor:y2",)
+    assert not judged(True, 0.1, u=u).detected
+
+
+def test_weak_inputs_give_no_false_alarm():
+    for size in (1e-3, 1e-2, 0.05, 0.2):
+        for seed in range(5):
+            u = size * np.random.default_rng(seed).normal(size=(N, 2))
+            assert not judged(True, 0.1, u=u, seed=seed).detected, size
+
+
+def test_a_sinusoid_gives_rows_but_no_order():
+    k = np.arange(N)
+    u = np.column_stack([np.sin(0.4 * k), np.cos(1.1 * k)])
+    found = judged(True, 0.1, "sensor:y1", u=u)
+    assert found.windows[0].order is None
+    assert found.candidates == ("sensor:y1",)
+    assert not judged(True, 0.1, u=u).detected
+
+
+# -- the distribution ------------------------------------------------------------------------------------------------
+
+
+def test_statistic_against_a_dense_regression():
+    data, alpha = run(True, n=400), 3
+    statistics = hankel_statistics([np.hstack([data.u, data.y])], 3 * alpha, centre="mean")
+    at = statistics.at
+    others = np.r_[0, at([1], range(alpha + 1)), at([2, 3], range(alpha))]
+    tests = at([0], range(alpha + 1)), others, at([2, 3], [alpha])
+    found, theta = zero_test(statistics, *tests, rows=2 * alpha, level=0.01)
+    windows = windows_of(np.hstack([data.u, data.y]), 3 * alpha).reshape(len(data.u) - 3 * alpha + 1, -1)
+    dense = np.hstack([np.ones((len(windows), 1)), windows])
+    t, o, y = (dense[:, part] for part in tests)
+    coefficients = np.linalg.lstsq(np.hstack([o, t]), y, rcond=None)[0]
+    assert theta == pytest.approx(coefficients[o.shape[1] :], rel=1e-6, abs=1e-9)
+    e = y - np.hstack([o, t]) @ coefficients
+    left = t - o @ np.linalg.lstsq(o, t, rcond=None)[0]
+    j = len(e)
+    wald = np.trace(np.linalg.solve(e.T @ e / j, coefficients[o.shape[1] :].T @ (left.T @ left / j)
+                                    @ coefficients[o.shape[1] :]))
+    assert found.statistic == pytest.approx(wald, rel=1e-6)
+    assert found.threshold == pytest.approx(chi2.isf(0.01, 2 * t.shape[1]) / j, rel=0.3)  # nearly white residuals
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+def test_dead_channels_are_missed_as_often_as_the_level_says(colour):
+    runs, level, wrong = 100, 0.1, {"sensor:y1": 0, "actuator:u1": 0}
+    model = two_mode_plant(True, 0.1)
+    for name in wrong:
+        for seed in range(runs):
+            u = lfilter([1], [1, -colour], np.random.default_rng(seed).normal(size=(N // 3, 2)), axis=0)
+            data = Data(u, inject(model, u, Fault.loss(name, 0, 1.0), seed=seed))
+            found = hard_over_test(data, HEALTHY[True, 0.1], window=N // 3, level=level).windows[0]
+            test = next(t for t in (*found.rows, *found.columns) if t.name == name)
+            assert test.testable
+            wrong[name] += test.statistic > test.threshold
+    assert all(0.03 < count / runs < 0.2 for count in wrong.values()), wrong
+
+
+def test_the_forecast_of_a_healthy_channel_is_about_what_it_shows():
+    found = judged(True, 0.1).windows[0]
+    for test in (*found.rows, *found.columns):
+        assert test.statistic == pytest.approx(test.healthy, rel=0.3)
+
+
+# -- words and bad input ---------------------------------------------------------------------------------------------
+
+
+def test_prints_within_eighty_columns():
+    text = str(judged(False, 0.1, "sensor:y1", onset=N, n=3 * N))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "rank alone does not say which" in " ".join(text.split())
+
+
+def test_a_change_of_dynamics_is_an_alarm_without_a_dead_channel():
+    model, u = two_mode_plant(False, 0.1), np.random.default_rng(0).normal(size=(2 * N, 2))
+    a = np.array(model.A)
+    a[2:, 2:] = 0  # y2 is now the last input: one state, where there were two
+    data = Data(u, inject(model, u, Fault.schedule(A=a, onset=0), seed=1))
+    found = hard_over_test(data, HEALTHY[False, 0.1], window=N)
+    assert {w.order for w in found.windows} == {3}
+    assert found.alarm is found.windows[1] and found.candidates == ()  # twice in a row
+    assert "the dynamics changed" in found.explain()
+
+
+def test_bad_input_is_refused_by_name():
+    data, healthy = run(True), HEALTHY[True, 0.1]
+    for settings in (dict(instruments="past"), dict(block_rows=1), dict(level=0.0), dict(window=100), dict(hop=0)):
+        with pytest.raises(StructureError, match=next(iter(settings)).replace("_", ".")):
+            hard_over_test(data, healthy, **settings)
+    with pytest.raises(RankError, match="No experiment has the 5000 samples"):
+        hard_over_test(data, healthy, window=5000)
+    with pytest.raises(DataError, match="must be the same"):
+        hard_over_test(Data(data.u, data.y, outputs=("a", "b")), healthy)
+    still = healthy.u.copy()
+    still[:, 1] = 2.0
+    with pytest.raises(RankError, match="u2 does not move"):
+        hard_over_test(data, Data(still, healthy.y))
+    with pytest.raises(RankError, match="do not excite"):
+        hard_over_test(data, Data(np.sin(np.outer(np.arange(3000), [0.1, 0.2])), healthy.y))
