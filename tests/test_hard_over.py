@@ -106,6 +106,18 @@ def test_stuck_channels_count_as_dead():
         assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
 
 
+def test_a_flat_sensor_hides_only_the_actuators_that_it_alone_shows():
+    u = np.random.default_rng(3).normal(size=(N, 2))
+    for coupled, dead in ((True, {"sensor:y1", "actuator:u1"}), (False, {"sensor:y1"})):
+        model = two_mode_plant(coupled, 0.1)
+        y = inject(model, u, [Fault.stuck("sensor:y1", 0, 1.7), Fault.loss("actuator:u1", 0, 1.0)], seed=5)
+        found = hard_over_test(Data(u, y), HEALTHY[coupled, 0.1], window=N)
+        assert set(found.candidates) == dead
+        assert ("actuator:u1" in found.untestable) is not coupled
+    y = np.ones((N, 2))
+    assert set(hard_over_test(Data(u, y), HEALTHY[True, 0.1], window=N).candidates) == {"sensor:y1", "sensor:y2"}
+
+
 def test_input_nonlinearities_of_a_model():
     path = Path(os.environ.get("OPTID_DATA", "missing")) / "fault_plant.json"
     if not path.exists():

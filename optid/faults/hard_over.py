@@ -68,11 +68,9 @@ class WindowVerdict:
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Channels that may be dead; a sensor that still moves by itself, or an actuator behind a flat sensor, is not."""
-        sensors = [test for test in self.rows if test.zero and test.name not in self.moving]
-        flat = any(test.flat for test in sensors)
-        alive = [test for test in self.columns if test.zero and not flat]
-        return tuple(test.name for test in sorted([*sensors, *alive], key=lambda test: test.ratio))
+        """Channels that may be dead, the likeliest first; a sensor that still moves by itself is not."""
+        found = [test for test in (*self.rows, *self.columns) if test.zero and test.name not in self.moving]
+        return tuple(test.name for test in sorted(found, key=lambda test: test.ratio))
 
     @property
     def untestable(self) -> tuple[str, ...]:
@@ -346,11 +344,15 @@ def _tests(
                         level=level, scale=sizes[at([s], now)])[0]
         if own.statistic > own.threshold:
             moving.add(name)
-    y = at(layout.y, now)
+    seen = [i for i, (test, _) in enumerate(rows) if not test.flat]  # flat sensors tell nothing of actuators
+    y = at([layout.y[i] for i in seen], now)
     for j, (group, channel) in enumerate(zip(layout.inputs, data.inputs)):
+        if not seen:
+            columns.append((ZeroTest(f"actuator:{channel}", *3 * (float("nan"),), healthy=0.0), np.zeros((0, 0))))
+            continue
         others = [c for c in layout.all if c not in group]
         rest = np.concatenate([[0], at(others, range(alpha + 1)), at(layout.y, past)])
         columns.append(zero_test(statistics, at(group, range(alpha + 1)), rest, y, rows=2 * alpha, level=level,
                                  name=f"actuator:{channel}", scale=sizes[y],
-                                 coefficients=None if nominal is None else nominal.columns[j]))
+                                 coefficients=None if nominal is None else nominal.columns[j][:, seen]))
     return rows, columns, frozenset(moving)
