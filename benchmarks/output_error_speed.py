@@ -106,10 +106,18 @@ def theirs(data: optid.Data, peer: str, epochs: int, budget: int) -> dict | str:
         done = subprocess.run([peer, "-c", PEER, str(path), str(CELLS), "500", str(epochs), str(budget)],
                               capture_output=True, text=True)
     if done.returncode == -signal.SIGXCPU and done.stdout:
-        return {"seconds": budget, **json.loads(done.stdout)}
+        return {"seconds": budget, **figures_in(done.stdout)}
     if done.returncode:
         return f"jax-sysid failed: {done.stderr.strip().splitlines()[-1]}"
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    return figures_in(done.stdout)
+
+
+def figures_in(text: str) -> dict:
+    """The figures of the lines that hold some; jax-sysid prints of its own."""
+    found: dict = {}
+    for line in text.splitlines():
+        found |= json.loads(line) if line.startswith("{") else {}
+    return found
 
 
 def main(argv=None) -> dict:

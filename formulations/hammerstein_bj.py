@@ -10,7 +10,7 @@ input, as in ``mu[valve]``.
 
 Every experiment has its own initial state of the plant; the noise starts from rest. Where the output is missing the
 innovation counts as zero and the prediction takes its place, with the consequences told in
-`formulations.hammerstein_armax`; every input is needed.
+`formulations.hammerstein_armax`; where an input is missing the record is cut.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from formulations.equation_error import compress
 from formulations.hammerstein_arx import GAUGES
-from formulations.hammerstein_oe import OutputError, check_excited, check_rows, checked_record, plant_layout, search
+from formulations.hammerstein_oe import OutputError, search
 from formulations.noise_models import (
     PredictionErrors,
     arma,
@@ -31,8 +30,9 @@ from formulations.noise_models import (
     procedure,
     whole_number,
 )
+from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import stable_poles, with_poles
-from optid.bases import Linear, fitted_bases
+from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import OptidError, StructureError
@@ -43,15 +43,13 @@ from optid.solving import Procedure
 
 Array = np.ndarray
 
-ROWS_PER_COLUMN = 1.1
-
 
 def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk: int | Sequence[int] = 0,
            constraints: Sequence[Any] = (), offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear Box-Jenkins model.
 
     Args:
-        data: the record: every input sample present, outputs may be missing; one output.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles of the plant.
         nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
@@ -64,26 +62,26 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk
 
     Raises:
         StructureError: impossible orders, several outputs.
-        DataError: a missing input sample.
+        DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns.
     """
-    record = checked_record(one_output(data))
-    layout = plant_layout(record, na, nb, nk, fitted_bases(record, Linear()))
+    record, layout = plant_record(one_output(data), na, nb, nk, Linear())
     return _posed("bj.exact", record, layout, False, "none", nc, nd, constraints, offset, starts, seed)
 
 
 def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
-          basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (),
-          gauge: str = "norm", offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
+          basis: Basis | str | Sequence[Basis | str] = "polynomial:3", nk: int | Sequence[int] = 0,
+          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 4, seed: int = 0
+          ) -> Procedure:
     """Minimise the innovations of a Hammerstein Box-Jenkins model.
 
     Args:
-        data: the record: every input sample present, outputs may be missing; one output.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles of the plant.
         nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
         nd: order of D.
-        basis: basis of the nonlinearity, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
@@ -93,13 +91,12 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
 
     Raises:
         StructureError: impossible orders, unknown gauge, several outputs.
-        DataError: a missing input sample.
+        DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     if gauge not in GAUGES:
         raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
-    record = checked_record(one_output(data))
-    layout = plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+    record, layout = plant_record(one_output(data), na, nb, nk, basis)
     check_excited(record, layout)
     return _posed("hammerstein_bj.exact", record, layout, True, gauge, nc, nd, constraints, offset, starts, seed)
 
@@ -114,19 +111,6 @@ def _posed(name: str, data: Data, layout: Layout, free: bool, gauge: str, nc: in
     check_inputs_differ(data, layout)
     criterion = PredictionErrors(data, unknowns, "norm" if free else "none")
     return procedure(name, criterion, _starts(criterion, starts, seed), constraints, gauge)
-
-
-def check_inputs_differ(data: Data, layout: Layout) -> None:
-    """Refuse inputs that the record does not tell apart.
-
-    Raises:
-        RankError: naming two columns of the expanded inputs of which one depends on the other.
-    """
-    columns = 1 + sum(nb * basis.size for nb, basis in zip(layout.nb, layout.bases))
-    if layout.m > 1 and sum(e.n_samples - layout.first_row for e in data.experiments) >= ROWS_PER_COLUMN * columns:
-        complete = Data([e.u for e in data.experiments], [e.u[:, :1] for e in data.experiments], data.dt,
-                        list(data.inputs), list(data.outputs))
-        compress(complete, na=0, nb=layout.nb, nk=layout.nk, basis=layout.bases)
 
 
 def _starts(criterion: PredictionErrors, count: int, seed: int) -> dict[str, Array]:

@@ -16,8 +16,9 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import flat, model_meta, per_channel
+from formulations.equation_error import flat, model_meta
 from formulations.hammerstein_arx import GAUGES
+from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import (
     blank,
     equation_error,
@@ -28,10 +29,10 @@ from formulations.output_error_starts import (
     with_poles,
 )
 from formulations.prediction_error import Descent, Posed, agreement, best_of, descend, refine
-from optid.bases import Linear, fitted_bases
+from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import DataError, RankError, StructureError
+from optid.errors import RankError, StructureError
 from optid.judging import measure_violation
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import gauge_factor, leading_sign
@@ -56,7 +57,6 @@ ENTRIES = 3
 """Different optima from which the constrained iteration may start."""
 
 STABLE = 1 - 1e-9
-ROWS_PER_UNKNOWN = 1.1
 
 
 def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
@@ -64,7 +64,7 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
     """Minimise the simulation error of a linear model.
 
     Args:
-        data: the record: every input sample present, outputs may be missing; one output.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
@@ -76,24 +76,24 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
 
     Raises:
         StructureError: impossible orders, several outputs.
-        DataError: a missing input sample.
-        RankError: too few samples for the unknowns.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, or inputs that the record does not tell apart.
     """
-    record = checked_record(data)
-    layout = plant_layout(record, na, nb, nk, fitted_bases(record, Linear()))
+    record, layout = plant_record(data, na, nb, nk, Linear())
+    check_inputs_differ(record, layout)
     return _procedure("oe.exact", record, layout, False, offset, constraints, "none", starts, seed)
 
 
-def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str] = "polynomial:3",
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True,
           starts: int = 6, seed: int = 0) -> Procedure:
     """Minimise the simulation error of a Hammerstein model.
 
     Args:
-        data: the record: every input sample present, outputs may be missing; one output.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
@@ -104,85 +104,16 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
 
     Raises:
         StructureError: impossible orders, unknown gauge, several outputs.
-        DataError: a missing input sample.
-        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
+            does not tell apart.
     """
     if gauge not in GAUGES:
         raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
-    record = checked_record(data)
-    layout = plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+    record, layout = plant_record(data, na, nb, nk, basis)
     check_excited(record, layout)
+    check_inputs_differ(record, layout)
     return _procedure("hammerstein_oe.exact", record, layout, True, offset, constraints, gauge, starts, seed)
-
-
-# -- the record ------------------------------------------------------------------------------------------------------
-
-
-def checked_record(data: Any) -> Data:
-    """Refuse what a simulation error cannot be computed from.
-
-    Raises:
-        StructureError: a stream, or several outputs.
-        DataError: a missing input sample; named by channel, experiment and sample.
-    """
-    if not isinstance(data, Data):
-        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
-                             "with optid.read instead of a stream")
-    if data.l > 1:
-        raise StructureError(
-            f"an output-error model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by itself "
-            "(data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
-    for number, e in enumerate(data.experiments, start=1):
-        lost = ~np.isfinite(e.u)
-        if lost.any():
-            k, c = np.argwhere(lost)[0]
-            where = f" of experiment {number}" if data.n_experiments > 1 else ""
-            raise DataError(
-                f"input {data.inputs[c]!r} is missing at sample {k}{where} ({int(lost[:, c].sum())} in all): a "
-                "simulation needs every input. Interpolate it, split the record there, or use 'hammerstein_arx.exact'")
-    return data
-
-
-def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]) -> Layout:
-    """Return the checked orders of the plant.
-
-    Raises:
-        StructureError: impossible orders.
-        RankError: an experiment that its initial state would explain.
-    """
-    if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
-        raise StructureError(f"na is the number of poles, a whole number from 0; got {na!r}")
-    layout = Layout(int(na), per_channel("nb", nb, data.inputs, low=1), per_channel("nk", nk, data.inputs, low=0),
-                    bases, data.outputs, data.inputs)
-    for number, e in enumerate(data.experiments, start=1):
-        label = f"experiment {number}: " if data.n_experiments > 1 else ""
-        if e.n_samples <= layout.first_row:
-            raise RankError(f"{label}{e.n_samples} samples, but the lags reach back {layout.first_row}: its initial "
-                            "state would explain them all. Leave it out, or use fewer lags")
-    return layout
-
-
-def check_rows(data: Data, unknowns: Unknowns) -> None:
-    """Refuse a record with fewer than 1.1 outputs per unknown (`RankError`)."""
-    rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
-    if rows < ROWS_PER_UNKNOWN * unknowns.size:
-        raise RankError(f"{rows} output samples for {unknowns.size} unknowns (initial states included): at least "
-                        f"{int(np.ceil(ROWS_PER_UNKNOWN * unknowns.size))} are needed. Use a longer record, fewer "
-                        "lags or fewer basis functions")
-
-
-def check_excited(data: Data, layout: Layout) -> None:
-    """Refuse a basis function without energy, by name."""
-    for c, (channel, basis) in enumerate(zip(layout.inputs, layout.bases)):
-        energy = np.zeros(basis.size)
-        for e in data.experiments:
-            for k in range(0, e.n_samples, SEARCH):
-                energy += np.sum(basis.values(e.u[k : k + SEARCH, c]) ** 2, axis=0)
-        silent = np.flatnonzero(energy <= 1e-14 * energy.mean())
-        if silent.size:
-            raise RankError(f"function {silent[0] + 1} of the basis of input {channel!r} is never excited: no sample "
-                            "lies in its part of the interval. Use fewer functions, or an interval that the input "
-                            "visits")
 
 
 # -- the errors ------------------------------------------------------------------------------------------------------

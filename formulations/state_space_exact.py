@@ -35,7 +35,7 @@ from optid.bases import fitted_bases
 from optid.bases.basis import Basis
 from optid.channels import Transform
 from optid.data import Data
-from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.errors import DataWarning, RankError, StructureError
 from optid.judging import measure_violation
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.noise import with_noise
@@ -44,6 +44,7 @@ from optid.regressors.sensitivities import Linearised
 from optid.regressors.state_sensitivities import StateUnknowns
 from optid.solution import Status
 from optid.solving import Evidence, Procedure
+from optid.stretches import with_whole_inputs
 from optid.subspace.expansion import expand
 
 Array = np.ndarray
@@ -71,7 +72,7 @@ def linear(
     """Minimise the simulation or prediction error of a linear state-space model.
 
     Args:
-        data: the record: every input sample present, outputs may be missing.
+        data: the record. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
         criterion: "simulation" (output error, K = 0) or "prediction" (innovation form, K estimated).
         block_rows: of the subspace fits to start from, one or several; None chooses three.
@@ -88,7 +89,7 @@ def linear(
 
     Raises:
         StructureError: words, orders or starts that do not fit.
-        DataError: a missing input sample.
+        DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns.
     """
     return _procedure("ss.exact", data, nx, "linear", None, criterion, block_rows, weighting, offset, feedthrough,
@@ -139,7 +140,9 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 1:
         raise StructureError(f"iterations={iterations!r}: a whole number from 1 is needed.")
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-    _check_inputs(data)
+    if not isinstance(data, Data):
+        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
+                             "with optid.read instead of a stream")
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
     data = data.mapped(lambda u: u, lambda y: y, transform=Transform.identity(data.m, data.l))
     plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
@@ -151,20 +154,6 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     poles, others = _sorted(constraints)
     return _run(plan, given, criterion, weighting, STABLE if stability == "stable" else np.inf, models,
                 int(iterations), poles, others)
-
-
-def _check_inputs(data: Any) -> None:
-    if not isinstance(data, Data):
-        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
-                             "with optid.read instead of a stream")
-    for number, e in enumerate(data.experiments, start=1):
-        lost = ~np.isfinite(e.u)
-        if lost.any():
-            k, c = np.argwhere(lost)[0]
-            where = f" of experiment {number}" if data.n_experiments > 1 else ""
-            raise DataError(
-                f"input {data.inputs[c]!r} is missing at sample {k}{where} ({int(lost[:, c].sum())} in all): the state "
-                "needs every input. Interpolate it, or split the record there")
 
 
 def _sorted(constraints: Sequence[Any]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -196,6 +185,8 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
     expansion = expand(plan.records, fitted_bases(data, plan.basis), feedback_bases(data, plan.feedback_basis),
                        data.inputs, data.outputs)
+    data = with_whole_inputs(data, 2 * nx + 1)
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
     unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), criterion == "prediction", plan.offset)
     _check_rows(data, unknowns)
     y = np.vstack([e.y for e in data.experiments])
@@ -209,7 +200,7 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     posing = Posing(plan.name, error, constraints)
     x = posing.signed(best.x)
     evidence = yield from refine(posing.posed(), replace(best, x=x), {"order": nx, **figures}, x)
-    return _with_bound(_with_noise(evidence, error), error, plan.records)
+    return _with_bound(_with_noise(evidence, error), error, records)
 
 
 def _with_bound(evidence: Evidence | None, error: StateError, records: list[Array]) -> Evidence | None:

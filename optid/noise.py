@@ -24,9 +24,10 @@ from optid.data import Data
 from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
+from optid.stretches import between_gaps
 from optid.subspace.innovations import innovation_form
 from optid.validation.correlations import Correlation, autocorrelation
-from optid.validation.predictions import between_gaps, one_step
+from optid.validation.predictions import one_step
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS

@@ -167,8 +167,29 @@ def test_missing_input_is_named():
     u[7, 1] = np.nan
     with pytest.raises(DataError, match="'u2' is missing at sample 7"):
         model.simulate(u)
-    with pytest.raises(DataError, match="'u2' is missing at sample 7"):
+    data = Data(u, data.y, dt=0.5)
+    with pytest.raises(StructureError, match="no state is known"):
+        model.predict(data, x0=np.zeros(model.nx))
+    u[::4] = np.nan
+    with pytest.raises(DataError, match="no stretch"):
         model.predict(Data(u, data.y, dt=0.5))
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_predictions_between_missing_inputs_are_those_of_the_stretches(horizon):
+    model = linear()
+    data = record(model, experiments=2)
+    us = [u.copy() for u in data.u]
+    us[0][[40, 43], 1] = np.nan
+    lost = Data(us, list(data.y), dt=model.dt).detrend()
+    found = model.predict(lost, horizon)
+    parts = (slice(0, 40), slice(44, None))
+    hand = model.predict(Data([data.u[0][p] for p in parts], [data.y[0][p] for p in parts], dt=model.dt), horizon)
+    for part, expected in zip(parts, hand):
+        assert found[0][part] == pytest.approx(expected, abs=1e-9, nan_ok=True)
+    assert np.isnan(found[0][40:44]).all()
+    whole = Data(data.u[1], data.y[1], dt=model.dt)
+    assert found[1] == pytest.approx(model.predict(whole, horizon), abs=1e-9, nan_ok=True)
 
 
 def test_diverging_free_run_is_reported_with_its_sample():

@@ -155,10 +155,6 @@ def test_refusals():
         quiet(data, shooting.exact, **(ORDERS | {"na": -1}))
     with pytest.raises(RankError, match="samples for"):
         quiet(Data(data.u[:10], data.y[:10]), shooting.exact, **ORDERS)
-    u = data.u.copy()
-    u[17] = np.nan
-    with pytest.raises(DataError, match="'u' is missing at sample 17"):
-        quiet(Data(u, data.y), shooting.exact, **ORDERS)
     with pytest.raises(DataError, match="'y'"):
         quiet(Data(data.u, np.full((200, 1), np.nan)), shooting.exact, **ORDERS)
     with pytest.raises(OptidError):

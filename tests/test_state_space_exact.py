@@ -225,10 +225,6 @@ def test_shape_constraints_hold_for_every_input():
 
 def test_refusals():
     _, data = system()
-    u = data.u.copy()
-    u[5, 1] = np.nan
-    with pytest.raises(DataError, match="'u2' is missing at sample 5"):
-        optid.fit(Data(u, data.y), linear, nx=2)
     with pytest.raises(StructureError, match="criterion='best'"):
         optid.fit(data, linear, nx=2, criterion="best")
     with pytest.raises(StructureError, match="weighting"):

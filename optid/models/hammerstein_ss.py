@@ -21,6 +21,7 @@ from optid.models.experiments import one_or_all, records_of
 from optid.models.feedback_tables import tabulated
 from optid.models.noise_covariances import NoiseCovariances
 from optid.models.nonlinearity import Nonlinearity
+from optid.stretches import between_gaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +235,9 @@ class HammersteinSS:
     def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
         """Predict with the innovation form (P1): every output up to `horizon` samples before is known.
 
-        A missing output corrects nothing, and its feedback sees the prediction instead.
+        A missing output corrects nothing, and its feedback sees the prediction instead. After a missing input the
+        state is not known: the stretches in between are predicted each from an initial state of its own, and short
+        ones not at all.
 
         Args:
             data: the record; detrended or scaled data are taken back to raw units first.
@@ -242,15 +245,30 @@ class HammersteinSS:
             x0: "fit" (least squares of the one-step errors), "zero", or the state (n,), one for each experiment.
 
         Returns:
-            (N, l) in raw units, NaN in the first horizon - 1 samples; a tuple of such arrays for several experiments.
+            (N, l) in raw units, NaN in the first horizon - 1 samples and where inputs leave no prediction; a tuple of
+            such arrays for several experiments.
 
         Raises:
-            DataError: a missing input, other channels or sampling time, predictions that leave the range of numbers.
+            DataError: no stretch with every input, other channels or sampling time, predictions that leave the range
+                of numbers.
             StructureError: a horizon that is not a whole number from 1, or an x0 that cannot be read.
         """
         horizon = checked_horizon(horizon)
+        if isinstance(data, Data) and any(np.isnan(e.u).any() for e in data.experiments):
+            return self._predicted_between_gaps(data, horizon, x0)
         jobs, states, _ = self._jobs("predict", data, x0)
         return one_or_all([simulation.ahead(job, x, horizon) for job, x in zip(jobs, states)])
+
+    def _predicted_between_gaps(self, data: Data, horizon: int, x0: Any) -> Any:
+        if not isinstance(x0, str):
+            raise StructureError("inputs are missing, and no state is known after such a gap: use x0='fit' or 'zero'")
+        raw = data.raw()
+        cut, places = between_gaps(raw, 2 * self.nx + 1)
+        stretches = self.predict(cut, horizon, x0)
+        found = [np.full(e.y.shape, np.nan) for e in raw.experiments]
+        for (experiment, part), predicted in zip(places, stretches if isinstance(stretches, tuple) else (stretches,)):
+            found[experiment][part] = predicted
+        return one_or_all(found)
 
     def simulate_measured_feedback(self, data: Data, x0: Any = "zero") -> Any:
         """Simulate with the measured outputs in the feedback (P2), without correcting the state.

@@ -1,0 +1,95 @@
+"""What a simulation error needs of a record: whole inputs, enough outputs, excited functions, inputs that differ."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from formulations.equation_error import compress, per_channel
+from optid.bases import Linear, fitted_bases
+from optid.bases.basis import Basis
+from optid.data import Data
+from optid.errors import RankError, StructureError
+from optid.regressors import Layout
+from optid.regressors.sensitivities import CHUNK, Unknowns
+from optid.stretches import with_whole_inputs
+
+ROWS_PER_UNKNOWN = 1.1
+
+
+def plant_record(data: Any, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str]
+                 ) -> tuple[Data, Layout]:
+    """Return the record with whole inputs and the checked orders of the plant.
+
+    Where inputs are missing the record is cut into stretches, each an experiment with an initial state of its own.
+
+    Raises:
+        StructureError: a stream, several outputs, or impossible orders.
+        DataError: no stretch with every input is long enough.
+        RankError: an experiment that its initial state would explain.
+    """
+    if not isinstance(data, Data):
+        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
+                             "with optid.read instead of a stream")
+    if data.l > 1:
+        raise StructureError(
+            f"an output-error model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by itself "
+            "(data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
+    reach = plant_layout(data, na, nb, nk, fitted_bases(data, Linear())).first_row
+    record = with_whole_inputs(data, 2 * reach + 1)
+    return record, plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+
+
+def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]) -> Layout:
+    """Return the checked orders of the plant.
+
+    Raises:
+        StructureError: impossible orders.
+        RankError: an experiment that its initial state would explain.
+    """
+    if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
+        raise StructureError(f"na is the number of poles, a whole number from 0; got {na!r}")
+    layout = Layout(int(na), per_channel("nb", nb, data.inputs, low=1), per_channel("nk", nk, data.inputs, low=0),
+                    bases, data.outputs, data.inputs)
+    for number, e in enumerate(data.experiments, start=1):
+        label = f"experiment {number}: " if data.n_experiments > 1 else ""
+        if e.n_samples <= layout.first_row:
+            raise RankError(f"{label}{e.n_samples} samples, but the lags reach back {layout.first_row}: its initial "
+                            "state would explain them all. Leave it out, or use fewer lags")
+    return layout
+
+
+def check_rows(data: Data, unknowns: Unknowns) -> None:
+    """Refuse a record with fewer than 1.1 outputs per unknown (`RankError`)."""
+    rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
+    if rows < ROWS_PER_UNKNOWN * unknowns.size:
+        raise RankError(f"{rows} output samples for {unknowns.size} unknowns (initial states included): at least "
+                        f"{int(np.ceil(ROWS_PER_UNKNOWN * unknowns.size))} are needed. Use a longer record, fewer "
+                        "lags or fewer basis functions")
+
+
+def check_excited(data: Data, layout: Layout) -> None:
+    """Refuse a basis function without energy, by name."""
+    for c, (channel, basis) in enumerate(zip(layout.inputs, layout.bases)):
+        energy = np.zeros(basis.size)
+        for e in data.experiments:
+            for k in range(0, e.n_samples, CHUNK):
+                energy += np.sum(basis.values(e.u[k : k + CHUNK, c]) ** 2, axis=0)
+        silent = np.flatnonzero(energy <= 1e-14 * energy.mean())
+        if silent.size:
+            raise RankError(f"function {silent[0] + 1} of the basis of input {channel!r} is never excited: no sample "
+                            "lies in its part of the interval. Use fewer functions, or an interval that the input "
+                            "visits")
+
+
+def check_inputs_differ(data: Data, layout: Layout) -> None:
+    """Refuse inputs that the record does not tell apart.
+
+    Raises:
+        RankError: naming two columns of the expanded inputs of which one depends on the other.
+    """
+    columns = 1 + sum(nb * basis.size for nb, basis in zip(layout.nb, layout.bases))
+    if layout.m > 1 and sum(e.n_samples - layout.first_row for e in data.experiments) >= ROWS_PER_UNKNOWN * columns:
+        complete = Data([e.u for e in data.experiments], [e.u[:, :1] for e in data.experiments], data.dt,
+                        list(data.inputs), list(data.outputs))
+        compress(complete, na=0, nb=layout.nb, nk=layout.nk, basis=layout.bases)
