@@ -94,6 +94,26 @@ EXPECTED: dict[str, dict[str, Range]] = {
         "4 chirp, scaled and shaped ASIVID angle": (0, 1.5),
         "1 sinusoid condition": (1e12, np.inf), "3 levels condition": (1e2, 1e4),
     },
+    # reference: 4 / 2 / 2 and 4 / 4 / 4; with process noise past outputs hide the actuator; dead rows and columns stay
+    # below the threshold, live ones exceed it more than 200 times; a window at the failure keeps order 4
+    "thesis/ch7_hard_over": {
+        **{f"{plant}, {noise}, {fault}": (order, order) for plant, orders in (("decoupled", (4, 2, 2)),
+           ("coupled", (4, 4, 4))) for noise in (0.0, 0.1)
+           for fault, order in zip((None, "sensor:y1", "actuator:u1"), orders)},
+        **{f"{plant}, 0.1, {fault}, {word}": limits for plant in ("decoupled", "coupled")
+           for fault in ("sensor:y1", "actuator:u1") for word, limits in (("dead", (0, 1)), ("others", (200, 1e5)))},
+        "decoupled, 0.0, actuator:u1, past": (2, 2), "decoupled, 0.1, actuator:u1, past": (4, 4),
+        "straddling, sensor:y1": (4, 4), "straddling, actuator:u1": (4, 4),
+        "delay, sensor:y1": (1400, 1750), "delay, actuator:u1": (1400, 1750),
+    },
+    # reference: J and its smallest curvature at six invariant subspaces; PAST about 0.11 from the best, creep 0.002
+    "thesis/ch8_tracking": {
+        **{f"J {i}": about(value, 1e-9) for i, value in enumerate((1.9, 3.9, 4.4, 5.9, 6.4, 8.4))},
+        **{f"curvature {i}": about(value, 1e-9) for i, value in enumerate((0, -4, -5, -8, -9, -9))},
+        "gradient at W = 0": (0, 1e-12), "past error": (0.03, 0.2), "past creep": (1e-4, 0.01), "past gap": (0, 0.01),
+        "opast error": (0.03, 0.2), "opast creep": (0, 1e-12), "past error after": (0, 0.15),
+        "opast error after": (0, 0.15),
+    },
     # the source reports cosines that vanish; a record of 1000 samples has them below 0.011 or so
     "thesis/ch3_table31": {
         "largest cosine, N = 1000": (0, 0.012), "largest cosine, N = 10000": (0, 0.006),
