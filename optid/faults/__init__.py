@@ -19,6 +19,7 @@ _HOME = {
     "dictionary": "signatures",
     "Dictionary": "signatures",
     "Candidate": "signatures",
+    "Isolability": "isolability",
 }
 
 

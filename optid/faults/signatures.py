@@ -14,6 +14,7 @@ from optid.faults.faults import channel_of, place_of
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
+    from optid.faults.isolability import Isolability
     from optid.models import HammersteinSS
 
 ADDITIVE = ("bias", "drift", "jump")
@@ -192,6 +193,12 @@ class Dictionary:
                 into_state.append(begun * b)
                 into_output.append(on * d)
         return np.stack(into_state, axis=2), np.stack(into_output, axis=2)
+
+    def isolability(self, window: int = 100, **how: Any) -> "Isolability":
+        """Return how large every fault must be to be noticed and to be named; see `optid.faults.isolability.study`."""
+        from optid.faults.isolability import study
+
+        return study(self, window, **how)
 
     def __str__(self) -> str:
         """List the candidates, the groups and what is left out."""

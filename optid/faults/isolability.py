@@ -1,0 +1,314 @@
+"""Before any data: how large must a fault be to be noticed, and how large to be named?
+
+Simulated in signature space: the whitened innovations of a window are white noise plus the signature of the fault, and
+the search over all candidates and onsets is run on many of them. The formula for two rivals at a known onset is
+optimistic, because the onset is searched, too.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import LookupFailed, StructureError, nearest
+from optid.faults.signature_space import Ruler, SignatureSpace, signature_space
+from optid.faults.signatures import Dictionary
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
+"""Deflections at which the probabilities are computed."""
+
+MIDDLE = 0.3, 0.7
+"""Where in the window an unknown onset is drawn from."""
+
+
+class Forecast(NamedTuple):
+    """What is to be expected of a fault of a given size.
+
+    Attributes:
+        detected: probability of an alarm.
+        isolated: probability of an alarm that names the right candidate.
+    """
+
+    detected: float
+    isolated: float
+
+
+@dataclass(frozen=True, eq=False)
+class Isolability:
+    """How large every fault must be; `print` it, or `plot` it.
+
+    Attributes:
+        labels: the C candidates.
+        window: samples of a window.
+        onset: "unknown", or the onset that is known.
+        prob: probability asked for.
+        false_alarm: probability that a healthy window alarms.
+        detectable: (C,) smallest size noticed with that probability; inf where none is. Of a fault with several
+            magnitudes the median norm over its directions.
+        isolable: (C,) smallest size noticed and named rightly.
+        matrix: (C, C) smallest size at which fault i is noticed and preferred to j; on the diagonal: noticed.
+        sines: (C, C) sine of the smallest angle between the signature of i in mid-window and that of j at any onset.
+        unit: (C,) deflection of a size of one in mid-window.
+        rivals: the candidate that takes most of the wrong answers at the isolable size, "" where there are none.
+        bounded: (C,) whether the trace dies out: a longer window does not help.
+        excluded: {label: why} of what no output sees.
+        skipped: labels of the candidates whose signature needs data.
+        thresholds: (C,) of the statistics.
+        detected: (C, G) probability of an alarm at the deflections of `GRID`.
+        isolated: (C, G) probability of the right name.
+        draws: simulated windows per fault.
+    """
+
+    labels: tuple[str, ...]
+    window: int
+    onset: int | str
+    prob: float
+    false_alarm: float
+    detectable: Array
+    isolable: Array
+    matrix: Array
+    sines: Array
+    unit: Array
+    rivals: tuple[str, ...]
+    bounded: np.ndarray
+    excluded: dict[str, str]
+    skipped: tuple[str, ...]
+    thresholds: Array
+    detected: Array = field(repr=False)
+    isolated: Array = field(repr=False)
+    draws: int = 0
+
+    def deflection(self, label: str, size: float) -> float:
+        """Return the deflection of a fault of this size in mid-window: sigma per sample times root of samples."""
+        return float(abs(size) * self.unit[self._index(label)])
+
+    def forecast(self, label: str, size: float) -> Forecast:
+        """Return what to expect of a fault of a given size.
+
+        Raises:
+            LookupFailed: no such candidate.
+        """
+        c, d = self._index(label), self.deflection(label, size)
+        return Forecast(*(_between(d, curves[c], self.draws) for curves in (self.detected, self.isolated)))
+
+    def _index(self, label: str) -> int:
+        if label not in self.labels:
+            raise LookupFailed(f"{label!r} is not among the candidates. {nearest(label, self.labels)}")
+        return self.labels.index(label)
+
+    @property
+    def ambiguity_groups(self) -> list[tuple[str, ...]]:
+        """Faults that no record can tell apart."""
+        return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
+
+    def table(self) -> str:
+        """Print sizes, rivals and angles, and the quantitative isolability matrix."""
+        return str(self)
+
+    def __str__(self) -> str:
+        """Print the table, the matrix and what to know about them, in 80 columns."""
+        where = "unknown" if self.onset == "unknown" else f"known, {self.onset}"
+        lines = [
+            f"window {self.window} samples, onset {where}, false alarm {self.false_alarm:g},",
+            f"probability {self.prob:g} ({self.draws} simulated windows per fault)",
+            "",
+            f"     {'fault':<24}{'noticed':>9}{'named':>9}  {'worst rival':<23}{'sine':>6}",
+        ]
+        for i, label in enumerate(self.labels):
+            rival = self.rivals[i]
+            sine = f"{self.sines[i, self.labels.index(rival)]:6.3f}" if rival else ""
+            lines.append(
+                f"{i + 1:>3}  {_cut(label, 23):<24}{_size(self.detectable[i]):>9}{_size(self.isolable[i]):>9}"
+                f"  {_cut(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
+            )
+        lines += ["", "smallest size of the fault of a row that is told from the one of a column"]
+        wide = 7
+        fits = (80 - 5) // wide
+        for first in range(0, len(self.labels), fits):
+            columns = range(first, min(first + fits, len(self.labels)))
+            lines.append("     " + "".join(f"{j + 1:>{wide}}" for j in columns))
+            lines += [
+                f"{i + 1:>3}  " + "".join(f"{_size(self.matrix[i, j]):>{wide}}" for j in columns)
+                for i in range(len(self.labels))
+            ]
+        notes = ["on the diagonal: noticed at all"]
+        if self.bounded.any():
+            notes.append("* transient only: the trace dies out, waiting does not help")
+        notes += [f"no record tells apart: {', '.join(group)}" for group in self.ambiguity_groups]
+        notes += [f"left out: {label}, {why}" for label, why in self.excluded.items()]
+        notes += [f"needs data, not judged here: {label}" for label in self.skipped]
+        return "\n".join(lines + notes).replace(" \n", "\n")
+
+    def plot(self) -> "Figure":
+        """Draw the quantitative isolability matrix, the chances by size and the deflections needed."""
+        from optid.faults.isolability_picture import draw
+
+        return draw(self)
+
+
+def study(
+    found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
+    false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
+) -> Isolability:
+    """Simulate the search for every fault at all sizes.
+
+    Args:
+        found: the dictionary.
+        window: samples of a window.
+        onset: "unknown" (drawn from the middle of the window and searched everywhere), or the sample where it is known.
+        prob: probability with which a fault is to be noticed, and named.
+        false_alarm: probability that a healthy window alarms, over all candidates and onsets.
+        draws: simulated windows per fault.
+        calibration: simulated healthy windows behind the thresholds.
+        seed: of the simulation.
+
+    Raises:
+        DataError: too few calibration windows for the false-alarm rate.
+        StructureError: a window that is too short, impossible probabilities, no candidate with a signature.
+    """
+    if not 0.5 <= prob < 1:
+        raise StructureError(f"prob={prob!r}; a probability from 0.5 to below 1 is needed.")
+    if isinstance(onset, str) and onset != "unknown":
+        raise StructureError(f"onset={onset!r}: use 'unknown' or the number of a sample.")
+    known = None if isinstance(onset, str) else int(onset)
+    space = signature_space(found, window, known)
+    first, second = np.random.SeedSequence(seed).generate_state(2)
+    thresholds = space.thresholds(false_alarm, calibration, int(first))
+    rng = np.random.default_rng(int(second))
+    noise = [np.concatenate(parts) for parts in zip(
+        *([ruler.scores(part) for ruler in space.rulers] for part in space.healthy(draws, int(second) + 1)))]
+    count = len(space.rulers)
+    curves = [_curves(space, c, noise, thresholds, known, rng) for c in range(count)]
+    detected, isolated = np.array([c.detected for c in curves]), np.array([c.isolated for c in curves])
+    unit = np.array([c.unit for c in curves])
+    matrix = np.array([[_crossing(p, prob, draws) for p in c.preferred] for c in curves]) / unit[:, None]
+    isolable = np.array([_crossing(p, prob, draws) for p in isolated])
+    return Isolability(
+        space.labels, window, onset, prob, false_alarm, np.array([_crossing(p, prob, draws) for p in detected]) / unit,
+        isolable / unit, matrix, np.array([_sines(space, ruler, known) for ruler in space.rulers]), unit,
+        tuple(_rival(space, c, at) for c, at in zip(curves, isolable)),
+        np.array([ruler.candidate.bounded_deflection for ruler in space.rulers]), dict(found.excluded), space.skipped,
+        thresholds, detected, isolated, draws,
+    )
+
+
+class _Curves(NamedTuple):
+    """Probabilities of one fault over the grid of deflections.
+
+    Attributes:
+        detected: (G,).
+        isolated: (G,).
+        preferred: (C, G) noticed and preferred to each other candidate; noticed by itself in its own row.
+        accused: (C, G) share of the answers.
+        unit: deflection of a size of one.
+    """
+
+    detected: Array
+    isolated: Array
+    preferred: Array
+    accused: Array
+    unit: float
+
+
+def _curves(
+    space: SignatureSpace, c: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
+) -> _Curves:
+    ruler, draws = space.rulers[c], len(noise[0])
+    low, high = (int(share * space.window) for share in MIDDLE)
+    onsets = np.full(draws, known) if known is not None else rng.integers(low, max(high, low + 1), draws)
+    sizes, unit = _directions(space, ruler, known, draws, rng)
+    # statistic at deflection d: |z + d s|^2 = |z|^2 + 2 d z's + d^2 |s|^2
+    parts: list[list[Array]] = [[], [], []]
+    faults = np.zeros((draws, space.window, space.outputs))
+    for onset in np.unique(onsets):
+        rows = onsets == onset
+        faults[rows, onset:] = np.einsum("kop,mp->mko", ruler.trace[: space.window - onset], sizes[rows])
+    for other, z in zip(space.rulers, noise):
+        s = other.scores(faults)
+        for store, value in zip(parts, (np.sum(z**2, axis=2), np.sum(z * s, axis=2), np.sum(s**2, axis=2))):
+            store.append(value)
+    count = len(space.rulers)
+    detected, isolated = np.zeros(GRID.size), np.zeros(GRID.size)
+    preferred, accused = np.zeros((count, GRID.size)), np.zeros((count, GRID.size))
+    for g, d in enumerate(GRID):
+        excess = np.stack([(a + 2 * d * b + d**2 * e).max(axis=1) for a, b, e in zip(*parts)], axis=1) - thresholds
+        alarm, answer = excess.max(axis=1) > 0, excess.argmax(axis=1)
+        detected[g], isolated[g] = np.mean(alarm), np.mean(alarm & (answer == c))
+        preferred[:, g] = np.mean((excess[:, [c]] > 0) & (excess[:, [c]] >= excess), axis=0)
+        preferred[c, g] = detected[g]
+        accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
+    return _Curves(detected, isolated, preferred, accused, unit)
+
+
+def _directions(
+    space: SignatureSpace, ruler: Ruler, known: int | None, draws: int, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Return sizes (M, d) of deflection one in mid-window, in random directions, and the deflection of a unit size."""
+    onset = space.window // 2 if known is None else known
+    trace = ruler.trace[: space.window - onset]
+    values, axes = np.linalg.eigh(np.einsum("kop,koq->pq", trace, trace))
+    d = values.size
+    if d == 1:
+        unit = float(np.sqrt(values[0]))
+        return np.full((draws, 1), 1 / unit), unit
+    drawn = rng.standard_normal((draws, d))
+    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    sizes = drawn / np.sqrt(np.maximum(values, 1e-9 * values[-1])) @ axes.T
+    return sizes, 1 / float(np.median(np.linalg.norm(sizes, axis=1)))
+
+
+def _probits(probabilities: Array, draws: int) -> Array:
+    """Quantiles of the normal law, in which these curves are nearly straight lines."""
+    from scipy.special import ndtri
+
+    return np.asarray(ndtri(np.clip(probabilities, 0.5 / draws, 1 - 0.5 / draws)))
+
+
+def _between(d: float, probabilities: Array, draws: int) -> float:
+    """Interpolate a curve over the grid."""
+    from scipy.special import ndtr
+
+    return float(ndtr(np.interp(d, GRID, _probits(probabilities, draws))))
+
+
+def _crossing(probabilities: Array, prob: float, draws: int) -> float:
+    """The deflection from which on the probability stays at or above prob; inf where it never does."""
+    from scipy.special import ndtri
+
+    below = np.flatnonzero(probabilities < prob)
+    last = int(below[-1]) if below.size else 0
+    if not below.size or last + 1 >= GRID.size:
+        return float("inf") if below.size else 0.0
+    first, second = _probits(probabilities[last : last + 2], draws)
+    rise = (float(ndtri(prob)) - first) / (second - first)
+    return float(GRID[last] + min(max(rise, 0.0), 1.0) * (GRID[last + 1] - GRID[last]))
+
+
+def _rival(space: SignatureSpace, curves: _Curves, at: float) -> str:
+    """The candidate most often accused instead, at the isolable deflection or the one before it."""
+    g = GRID.size - 1 if not np.isfinite(at) else max(int(np.searchsorted(GRID, at)) - 1, 0)
+    wrong = curves.accused[:, g].copy()
+    wrong[int(np.argmax(curves.accused[:, -1]))] = 0.0
+    return space.labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
+
+
+def _sines(space: SignatureSpace, ruler: Ruler, known: int | None) -> Array:
+    """Smallest sine (C,) between the signature in mid-window and the others at any onset."""
+    onset = space.window // 2 if known is None else known
+    own = np.zeros((ruler.trace.shape[2], space.window, space.outputs))
+    axes = np.linalg.svd(ruler.trace[: space.window - onset].reshape(-1, ruler.trace.shape[2]), full_matrices=False)[0]
+    own[:, onset:] = axes.T.reshape(-1, space.window - onset, space.outputs)
+    cosines = [np.linalg.svd(other.scores(own).swapaxes(0, 1), compute_uv=False)[:, 0].max() for other in space.rulers]
+    return np.sqrt(np.maximum(0.0, 1 - np.minimum(cosines, 1.0) ** 2))
+
+
+def _size(value: float) -> str:
+    return "never" if not np.isfinite(value) else f"{value:.3g}"
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"

@@ -1,0 +1,207 @@
+"""Isolability: the fast search equals dense least squares, thresholds keep their rate, forecasts meet a simulation."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fault_plants import levels, noisy, standard
+from scipy.stats import chi2, ncx2
+from test_fault_injection import small
+from typer.testing import CliRunner
+
+from optid import Data
+from optid.cli.app import app
+from optid.errors import DataError, LookupFailed, StructureError
+from optid.faults import Fault, dictionary, inject, whiten
+from optid.faults.isolability import GRID, MIDDLE
+from optid.faults.signature_space import family_thresholds, signature_space
+
+LOAD = np.array([0.3, -0.2, 0.5])
+
+
+@pytest.fixture(scope="module")
+def found():
+    return dictionary(small(), process={"load": LOAD}, kinds=["bias", "drift"])
+
+
+@pytest.fixture(scope="module")
+def standard_study(real_data):
+    model, load = standard(real_data)
+    faults = dictionary(model, process={"load": load})
+    return model, load, faults, faults.isolability(100)
+
+
+def dense(found, window, r):
+    """Largest explained energy of every candidate by least squares on whole windows."""
+    best = []
+    for c in found.candidates:
+        energies = [0.0]
+        for onset in range(window - (-(-c.dimension // 2)) + 1):
+            G = found.signature(c, window, onset).reshape(window * 2, -1)
+            fitted = G @ np.linalg.lstsq(G, r.ravel(), rcond=1e-9)[0]
+            energies.append(fitted @ fitted)
+        best.append(max(energies))
+    return np.array(best)
+
+
+def test_the_search_by_convolution_equals_dense_least_squares(found):
+    windows = np.random.default_rng(0).normal(size=(5, 40, 2))
+    fast = signature_space(found, 40).statistics(windows)
+    np.testing.assert_allclose(fast, [dense(found, 40, r) for r in windows], rtol=1e-9)
+
+
+def test_one_candidate_with_a_known_onset_has_the_law_of_chi_square():
+    alone = dictionary(small(), actuators=[], sensors=["y1"], state_jump=False)
+    study = alone.isolability(60, onset=30, draws=20_000, calibration=100_000, false_alarm=0.01)
+    limit = chi2.isf(0.01, 1)
+    assert abs(study.thresholds[0] / limit - 1) < 0.03
+    d = np.array([1.0, 2.0, 3.0, 5.0])
+    np.testing.assert_allclose(np.interp(d, GRID, study.detected[0]), ncx2.sf(limit, 1, d**2), atol=0.02)
+    np.testing.assert_array_equal(study.detected, study.isolated)
+    needed = np.interp(0.95, ncx2.sf(limit, 1, np.linspace(0, 6, 601) ** 2), np.linspace(0, 6, 601))
+    assert abs(study.deflection("sensor:y1", study.detectable[0]) - needed) < 0.05
+    signature = alone.signature("sensor:y1", 60, 30)
+    assert abs(study.unit[0] - np.linalg.norm(signature)) < 1e-9 and study.rivals == ("",)
+
+
+def test_two_rivals_at_a_known_onset_follow_the_formula():
+    """Far above the threshold the right one of two wins when noise does not bridge half the distance between them."""
+    near = small().B[:, 0] + [0.1, 0.25, -0.1]
+    both = dictionary(small(), actuators=["u1"], sensors=[], process={"near": near}, state_jump=False)
+    study = both.isolability(60, onset=20, draws=20_000, calibration=20_000)
+    from scipy.stats import norm
+
+    sine = study.sines[0, 1]
+    first, second = (both.signature(label, 60, 20).ravel() for label in study.labels)
+    cosine = first @ second / np.linalg.norm(first) / np.linalg.norm(second)
+    assert abs(sine - np.sqrt(1 - cosine**2)) < 1e-9
+    assert 0.1 < sine < 0.4
+    d = 2.5 / sine
+    # |r'a| > |r'b| with unit a, b at cosine c: both r'(a - b) and r'(a + b) are positive, or both negative
+    up = norm.cdf(d * np.sqrt((1 - cosine) / 2)), norm.cdf(d * np.sqrt((1 + cosine) / 2))
+    expected = up[0] * up[1] + (1 - up[0]) * (1 - up[1])
+    assert abs(study.forecast("actuator:u1", d / study.unit[0]).isolated - expected) < 0.015
+
+
+def test_thresholds_keep_the_rate_of_the_family(found):
+    space = signature_space(found, 50)
+    thresholds = space.thresholds(0.02, 20_000, 1)
+    fresh = np.vstack([space.statistics(part) for part in space.healthy(20_000, 2)])
+    assert abs(np.mean(np.any(fresh > thresholds, axis=1)) - 0.02) < 0.005
+    shares = np.mean(fresh > thresholds, axis=0)
+    assert shares.max() / shares.min() < 1.7  # every candidate alarms equally often
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.1])
+def test_family_thresholds_of_independent_and_of_equal_statistics(rate):
+    drawn = np.random.default_rng(0).chisquare(2, (100_000, 3))
+    free = family_thresholds(drawn, rate)
+    np.testing.assert_allclose(free, chi2.isf(1 - (1 - rate) ** (1 / 3), 2), rtol=0.03)
+    same = family_thresholds(np.repeat(drawn[:, :1], 3, axis=1), rate)
+    np.testing.assert_allclose(same, chi2.isf(rate, 2), rtol=0.03)
+
+
+def test_the_standard_plant_needs_the_deflections_measured_before(standard_study):
+    _, _, _, study = standard_study
+    detectable = (study.detectable * study.unit)[:5]
+    assert np.all((5.2 < detectable) & (detectable < 6.1))
+    at = study.labels.index
+    pair = at("actuator:u2"), at("sensor:y2")
+    assert study.rivals[pair[0]] == "sensor:y2" and study.rivals[pair[1]] == "actuator:u2"
+    assert np.all(study.isolable >= study.detectable) and np.all(study.isolable[list(pair)] > 2 *
+                                                                 study.detectable[list(pair)])
+    np.testing.assert_array_equal(np.diag(study.matrix), study.detectable)
+    assert np.all(study.matrix.max(axis=1) <= study.isolable * 1.02)
+    assert study.bounded.tolist() == [False] * 5 + [True]
+
+
+def test_the_forecast_meets_records_of_the_plant(standard_study):
+    """Small version of the benchmark: faults injected into the noisy plant, the Kalman filter, the search."""
+    model, load, faults, study = standard_study
+    space, rng = signature_space(faults, 100), np.random.default_rng(3)
+    for label in ("actuator:u1", "sensor:y2", "process:load"):
+        c = study.labels.index(label)
+        size, windows = 0.8 * study.isolable[c], []
+        for run in range(400):
+            u, onset = levels(200, run), 100 + int(rng.integers(100 * MIDDLE[0], 100 * MIDDLE[1]))
+            y = inject(model, u, Fault.step(label, onset, size), seed=run, process={"load": load})
+            windows.append(whiten(model, Data(u, y), x0="zero").r[100:])
+        excess = space.statistics(np.array(windows)) - study.thresholds
+        right = np.mean((excess.max(axis=1) > 0) & (excess.argmax(axis=1) == c))
+        assert abs(right - study.forecast(label, size).isolated) < 0.075  # 3 standard errors
+        assert abs(np.mean(excess.max(axis=1) > 0) - study.forecast(label, size).detected) < 0.06
+
+
+def test_a_longer_window_helps_a_lasting_fault_and_not_a_transient_one(found):
+    short, long = found.isolability(40, calibration=5000), found.isolability(120, calibration=5000)
+    assert long.detectable[0] < 0.8 * short.detectable[0]
+    assert abs(long.detectable[-1] / short.detectable[-1] - 1) < 0.15 and long.bounded[-1]
+
+
+def test_faults_that_no_record_tells_apart_are_one_row():
+    model = small(D=[[0.0, 0.0], [0.0, 0.3]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        merged = dictionary(model, process={"same": model.B[:, 0]})
+    study = merged.isolability(40, calibration=5000, draws=300)
+    assert study.ambiguity_groups == [("actuator:u1", "process:same")]
+    assert np.isfinite(study.isolable).all() and "no record tells apart: actuator:u1, process:same" in study.table()
+
+
+def test_one_output_cannot_tell_all_apart_at_any_size():
+    """With one output and no noise in the state, a step behind one filter is told from others by its course alone."""
+    model = noisy([[0.5]], [[1.0]], [[1.0]], [[0.04]], [[0.01]])
+    study = dictionary(model).isolability(40, calibration=5000, draws=500)
+    assert study.labels == ("actuator:u", "sensor:y", "state")
+    assert np.all(study.isolable > study.detectable)
+
+
+def test_it_prints_within_80_columns_and_draws(standard_study, found, tmp_path):
+    _, _, _, study = standard_study
+    wide = found.isolability(40, calibration=5000, draws=200)
+    for one in (study, wide):
+        assert max(map(len, str(one).splitlines())) <= 80
+        figure = one.plot()
+        figure.savefig(tmp_path / "picture.png")
+        texts = {t.get_text() for t in figure.axes[0].texts}
+        assert f"{one.matrix[0, 0]:.2g}" in texts and len(figure.axes[0].texts) == len(one.labels) ** 2
+    assert "transient only" in str(study)
+
+
+def test_bad_input(found):
+    with pytest.raises(StructureError, match="at least 8 samples"):
+        found.isolability(7)
+    with pytest.raises(StructureError, match="prob="):
+        found.isolability(40, prob=1.0)
+    with pytest.raises(StructureError, match="false_alarm="):
+        found.isolability(40, false_alarm=0.0)
+    with pytest.raises(DataError, match="at least 50000000 draws"):
+        found.isolability(40, false_alarm=1e-6)
+    for onset in ("middle", 40, -1):
+        with pytest.raises(StructureError, match="onset="):
+            found.isolability(40, onset=onset)
+    with pytest.raises(StructureError, match="known without data"):
+        dictionary(small(), kinds="loss", state_jump=False).isolability(40)
+    with pytest.raises(LookupFailed, match="sensor:y2"):
+        found.isolability(20, calibration=5000, draws=50).forecast("sensor:y", 1.0)
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["isolability", *map(str, words)])
+
+
+def test_command(tmp_path):
+    model = small()
+    model.save(tmp_path / "model.json")
+    done = run(tmp_path / "model.json", "--window", 40, "--load", "pump=0.3,-0.2,0.5", "--draws", 200, "--picture",
+               tmp_path / "p.png", "--kinds", "bias", "drift")
+    assert done.exit_code == 0, done.output
+    assert "process:pump drift" in done.output and "window 40 samples" in done.output
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+    replace(model, noise=None).save(tmp_path / "silent.json")
+    for words, message in ((["silent.json"], "noise covariances"), (["model.json", "--load", "pump"], "NAME="),
+                           (["model.json", "--onset", "soon"], "--onset"), (["none.json"], "none.json")):
+        done = run(Path(tmp_path) / words[0], *words[1:])
+        assert done.exit_code != 0 and message in str(done.output) + str(done.exception)
