@@ -13,7 +13,8 @@ import optid
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
-from optid.faults.zero_tests import zero_test
+from optid.faults.hard_over import HardOver, WindowVerdict
+from optid.faults.zero_tests import ZeroTest, zero_test
 from optid.plants import two_mode_plant
 from optid.subspace.hankel import hankel_statistics, windows_of
 
@@ -260,6 +261,17 @@ def test_a_change_of_dynamics_is_an_alarm_without_a_dead_channel():
     assert {w.order for w in found.windows} == {3}
     assert found.alarm is found.windows[1] and found.candidates == ()  # twice in a row
     assert "the dynamics changed" in found.explain()
+
+
+def test_alarm_by_order_comes_before_the_name():
+    live, dead = ZeroTest("sensor:y1", 9.0, 1.0, 0.0), ZeroTest("sensor:y1", 0.5, 1.0, 0.4)
+    story = [(2, live), (3, live), (2, live), (3, live), (3, live), (2, dead)]
+    windows = tuple(WindowVerdict(0, 10 * i, 10 * i + 10, order, "", 1.0, (test,), ())
+                    for i, (order, test) in enumerate(story))
+    found = HardOver(windows, 2, 10, 10, 6, "inputs")
+    assert (found.alarm.start, found.isolation.start, found.candidates) == (40, 50, ("sensor:y1",))
+    assert "showed with the window of samples 50 to 59" in found.explain()
+    assert not HardOver(windows[:4], 2, 10, 10, 6, "inputs").detected  # never twice in a row
 
 
 def test_bad_input_is_refused_by_name():

@@ -45,6 +45,7 @@ def main(folder: Path) -> dict[str, float]:
         stops, tests = [w.stop for w in sliding.windows], [(*w.rows, *w.columns) for w in sliding.windows]
         for style, i in zip(("-", "--", "-", "--"), range(4)):
             axis.semilogy(stops, [t[i].ratio for t in tests], style, color=f"C{i // 2}", label=tests[0][i].name)
+        axis.axhline(1, color="k", linewidth=0.8)
         axis.set(title=f"loss of {fault} at {2 * N}", xlabel="end of the window", ylabel="statistic / threshold")
         found[f"delay, {fault}"] = (sliding.alarm.stop if sliding.alarm else 10 * N) - 2 * N
         found[f"straddling, {fault}"] = next(w.order or 0 for w in sliding.windows if w.start == 2 * N - N // 2)

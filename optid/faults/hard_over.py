@@ -117,9 +117,14 @@ class HardOver:
         return self.alarm is not None
 
     @property
+    def isolation(self) -> WindowVerdict | None:
+        """The first window with a dead row or column; the order may have changed before it."""
+        return next((verdict for verdict in self.windows if verdict.dead), None)
+
+    @property
     def candidates(self) -> tuple[str, ...]:
-        """The channels that may be dead at the alarm, the likeliest first; () where only the order changed."""
-        return self.alarm.dead if self.alarm is not None else ()
+        """The channels that may be dead, the likeliest first; () where only the order changed."""
+        return self.isolation.dead if self.isolation is not None else ()
 
     @property
     def untestable(self) -> tuple[str, ...]:
@@ -133,17 +138,18 @@ class HardOver:
             words = f"No alarm in {len(self.windows)} windows of {self.window} samples; nominal order "
             words += f"{self.nominal_order}."
         else:
-            at = self.alarm
+            at, isolated, dead = self.alarm, self.isolation, self.candidates
             order = "not estimated" if at.order is None else str(at.order)
             words = (f"Alarm with the window of samples {at.start} to {at.stop - 1}: order {order}, nominal "
-                     f"{self.nominal_order}. ")
-            if not at.dead:
+                     f"{self.nominal_order}; the failure lies within or before it. ")
+            if isolated is None:
                 words += "No row and no column is zero: the dynamics changed, no channel is lost entirely."
-            elif len(at.dead) == 1:
-                words += f"{at.dead[0]} is dead: all others exceed their thresholds."
+            elif len(dead) == 1:
+                words += f"{dead[0]} is dead: the other channels that can be tested exceed their thresholds."
             else:
-                words += f"One of {', '.join(at.dead)} is dead; rank alone does not say which."
-            words += " The failure lies within or before this window."
+                words += f"One of {', '.join(dead)} is dead; rank alone does not say which."
+            if isolated is not None and isolated is not at:
+                words += f" That showed with the window of samples {isolated.start} to {isolated.stop - 1}."
         if self.untestable:
             words += f" Untestable for lack of excitation: {', '.join(self.untestable)}."
         if self.instruments == "inputs+past":
