@@ -16,6 +16,8 @@ _HOME = {
     "health": "whitening",
     "predictor": "whitening",
     "model_uncertainty": "nuisance",
+    "flat_lines": "screening",
+    "check_channels": "screening",
     "dictionary": "signatures",
     "Dictionary": "signatures",
     "Candidate": "signatures",

@@ -1,0 +1,147 @@
+"""What is wrong with a record before any statistics: flat lines, swapped channels, jumps of the unit."""
+
+from dataclasses import dataclass
+from itertools import permutations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import DataError
+from optid.faults.whitening import Whitened, predictor, whiten
+from optid.models.experiments import in_units_of
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+FLAT = 3
+"""Readings identical to the bit that are no coincidence when the noise is continuous."""
+
+UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
+"""Factors by which units of the same quantity differ."""
+
+BETTER = 0.1
+"""A share of the energy of the innovations below which another reading of the record is the right one."""
+
+
+@dataclass(frozen=True)
+class FlatLine:
+    """A sensor that repeats one reading to the bit.
+
+    Attributes:
+        name: "sensor:y1".
+        experiment: which experiment, from 0.
+        first: first sample of the run of equal readings.
+        count: their number.
+        value: the reading.
+    """
+
+    name: str
+    experiment: int
+    first: int
+    count: int
+    value: float
+
+    def __str__(self) -> str:
+        """Say where."""
+        return f"{self.name}: {self.count} readings of exactly {self.value:.6g} from sample {self.first} on"
+
+
+def flat_lines(data: Data, at_least: int = FLAT) -> tuple[FlatLine, ...]:
+    """Find runs of readings that are identical to the bit; a missing reading ends a run.
+
+    A sensor with a resolution coarser than its noise repeats readings by itself: an output with fewer than ten
+    different readings per hundred outside its longest run is left out.
+
+    Args:
+        data: the record.
+        at_least: length of the shortest run reported.
+    """
+    found = []
+    for number, part in enumerate(data.experiments):
+        for name, y in zip(data.outputs, part.y.T):
+            starts, counts = _runs(y)
+            if not counts.size:
+                continue
+            longest = int(counts.argmax())
+            rest = np.delete(y, slice(starts[longest], starts[longest] + counts[longest]))
+            rest = rest[~np.isnan(rest)]
+            if rest.size and np.unique(rest).size < 0.1 * rest.size:
+                continue
+            found += [
+                FlatLine(f"sensor:{name}", number, int(k), int(c), float(y[k]))
+                for k, c in zip(starts, counts) if c >= at_least
+            ]
+    return tuple(found)
+
+
+def check_channels(model: "HammersteinSS", data: Data) -> None:
+    """Refuse a healthy record whose outputs are swapped or whose unit jumps.
+
+    Both are told by the innovations: another order of the outputs, or another factor from some sample on, makes them
+    ten times smaller in energy, and the size that the model says.
+
+    Args:
+        model: with noise covariances.
+        data: the record.
+
+    Raises:
+        DataError: outputs that look swapped, named; a change of the unit of an output, with the sample and the factor.
+    """
+    raw = in_units_of(model, data)
+    energy = _energy(model, raw)
+    readings = sum(int(np.sum(~np.isnan(part.y))) for part in raw.experiments)
+    if energy < 2 * readings:
+        return
+    if 1 < data.l <= 5:
+        orders = [order for order in permutations(range(data.l)) if order != tuple(range(data.l))]
+        trials = [_energy(model, raw.mapped(lambda u: u, lambda y, o=order: y[:, list(o)])) for order in orders]
+        best = int(np.argmin(trials))
+        if trials[best] < BETTER * energy:
+            moved = [data.outputs[i] for i, j in enumerate(orders[best]) if i != j]
+            order = ", ".join(data.outputs[j] for j in orders[best])
+            raise DataError(
+                f"The outputs {', '.join(moved)} look swapped: in the order {order} the model predicts them "
+                f"{energy / trials[best]:.0f} times better. Check the names of the columns."
+            )
+    for number in range(raw.n_experiments):
+        for o, name in enumerate(data.outputs):
+            found = _unit_jump(model, raw, number, o)
+            if found is not None:
+                where = f"experiment {number + 1}: " * (raw.n_experiments > 1)
+                raise DataError(
+                    f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the "
+                    f"readings fit the model when divided by {found[1]:g}. Convert them."
+                )
+
+
+def _unit_jump(model: "HammersteinSS", raw: Data, number: int, o: int) -> tuple[int, float] | None:
+    """Return the first sample and the factor of the change of a unit, if that explains the record."""
+    part = raw.experiments[number]
+    alone = Data(part.u, part.y, raw.dt, raw.inputs, raw.outputs)
+    energy, count = _energy(model, alone), len(part.y)
+    steady, found = predictor(model), whiten(model, alone)
+    large = np.abs(found.innovations[:, o]) / np.sqrt(steady.covariance[o, o])
+    for onset in np.flatnonzero(large > 6)[:3]:
+        for factor in [*UNITS, *(1 / unit for unit in UNITS)]:
+            divided = np.array(part.y)
+            divided[onset:, o] /= factor
+            trial = _energy(model, Data(part.u, divided, raw.dt, raw.inputs, raw.outputs))
+            if trial < BETTER * energy and trial < 2 * count * raw.l:
+                return int(onset), float(factor)
+    return None
+
+
+def _energy(model: "HammersteinSS", data: Data) -> float:
+    found = whiten(model, data)
+    parts = [found] if isinstance(found, Whitened) else list(found)
+    return float(sum(np.sum(part.r**2) for part in parts))
+
+
+def _runs(y: Array) -> tuple[np.ndarray, np.ndarray]:
+    """First samples and lengths of the runs of equal readings; missing ones belong to none."""
+    edges = np.flatnonzero(np.concatenate([[True], y[1:] != y[:-1]]))
+    counts = np.diff(np.append(edges, y.size))
+    there = ~np.isnan(y[edges])
+    return edges[there], counts[there]
