@@ -133,6 +133,11 @@ class OutputError:
     unknowns: Unknowns
     gauge: str
 
+    @property
+    def errors(self) -> str:
+        """What they are called."""
+        return "simulation errors"
+
     @cached_property
     def functions(self) -> tuple[Array, ...] | None:
         """Values of the basis functions, where they are few enough to be kept."""

@@ -46,6 +46,11 @@ class PredictionErrors(OutputError):
 
     unknowns: NoiseUnknowns  # type: ignore[assignment]
 
+    @property
+    def errors(self) -> str:
+        """What they are called."""
+        return "prediction errors"
+
     def linearise(self, x: Array) -> Linearised:
         """Return the errors near x."""
         return linearise(self.data, self.unknowns, self.unknowns.unpack(x), gauge=self.gauge_rows(x))

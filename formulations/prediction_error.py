@@ -41,6 +41,9 @@ INSIDE = 1e-6
 NOWHERE = 1e-9
 """Relative violation that is rounding; a step to more than that pays for it."""
 
+PATIENCE = 5
+"""Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
+
 STEPS = 100
 
 COMPARED = 1e-6
@@ -56,11 +59,16 @@ where noise is larger than that, starts of different methods have been seen to a
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as stable:0.999")
 
-NO_BOUND = "the errors are not convex in poles and zeros: no lower bound is known, several starts are compared"
+NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 
 class Criterion(Protocol):
     """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states."""
+
+    @property
+    def errors(self) -> str:
+        """Their name: "simulation errors" or "prediction errors"."""
+        ...
 
     @property
     def energy(self) -> float:
@@ -284,7 +292,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
     floor = criterion_floor(posed.criterion)
     previous: _Iterate | None = None
-    damping, growth, weight, last = 0.0, 4.0, 0.0, np.inf
+    damping, growth, weight, last, idle = 0.0, 4.0, 0.0, np.inf, 0
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, STEPS + 1):
         solution = yield here.program if not damping else posed.pose(here.x, here.at, damping)
@@ -299,7 +307,8 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         gain = here.at.value - _quadratic(here.at, reached - here.x)
         weight = max(weight, 2.0 * _largest_dual(here.program, solution))
         new = _reached(posed, reached)
-        share = CONFIRMED if abs(gain) < 0.5 * last else STALLED
+        idle += not damping and abs(gain) <= STALLED * here.at.value
+        share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
         last = abs(gain) if not damping else last
         if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:
             status, reason = _judged(solution, gain, here.at.value, floor, share)
@@ -315,11 +324,25 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
                 reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
-                return _evidence(posed, here, Status.LIMIT, reason, {**figures, "programmes": count})
+                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}))
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
-    reason = f"{STEPS} programmes did not suffice"
-    return _evidence(posed, here, Status.LIMIT, reason, {**figures, "programmes": STEPS})
+    reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
+              "value")
+    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}))
+
+
+def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any]
+           ) -> Generator[Program, Solution, Evidence]:
+    """Judge where the steps ended by one more undamped programme; it may promise what a curved boundary does."""
+    solution = yield here.program
+    floor = criterion_floor(posed.criterion)
+    if not solution.has_point or here.outside > INSIDE:
+        return _evidence(posed, here, Status.LIMIT, reason, figures)
+    gain = here.at.value - _quadratic(here.at, posed.pack(solution.values) - here.x)
+    if abs(gain) > STALLED * here.at.value + floor:
+        return _evidence(posed, here, Status.LIMIT, reason, figures)
+    return _evidence(posed, here, *_judged(solution, gain, here.at.value, floor, STALLED), figures)
 
 
 def criterion_floor(criterion: Criterion) -> float:
@@ -335,11 +358,13 @@ def _judged(solution: Solution, gain: float, value: float, floor: float, share: 
     if abs(gain) > share * value + floor:
         return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
                                    f"{abs(gain) / max(value, 1e-300):.0e} of its value")
-    return Status.LOCAL, NO_BOUND
+    return Status.LOCAL, ""
 
 
 def _evidence(posed: Posed, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
-    bound = Bound(-np.inf, False, "none", NO_BOUND)
+    unknown = NO_BOUND.format(posed.criterion.errors)
+    bound = Bound(-np.inf, False, "none", unknown)
+    reason = unknown if status is Status.LOCAL else reason
     return Evidence(posed.model(here.x), here.at.value, bound, status, reason, figures)
 
 

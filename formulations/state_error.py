@@ -47,6 +47,11 @@ class StateError:
     checks: tuple[Callable[[Any], str], ...] = ()
 
     @property
+    def errors(self) -> str:
+        """What they are called."""
+        return "prediction errors" if self.unknowns.innovations else "simulation errors"
+
+    @property
     def energy(self) -> float:
         """Weighted sum of squares of the outputs about their means."""
         return self._energy
