@@ -139,6 +139,27 @@ def test_input_nonlinearities_of_a_model():
     assert not hard_over_test(other, healthy, model=model, window=2000).detected
 
 
+@pytest.mark.parametrize("fault", [None, "sensor:y2", "actuator:u1"])
+def test_records_without_noise_and_in_any_units(fault):
+    model, u = two_mode_plant(True, 0.1), np.random.default_rng(2).normal(size=(3 * N, 2))
+    faults = [] if fault is None else [Fault.loss(fault, 2 * N, 1.0)]
+    expected = () if fault is None else (fault,)
+    for noise, scale, offset in (("none", 1, 0), ("model", 1e-6, 0), ("model", 1e8, 0), ("model", 1, 1e5)):
+        y = scale * inject(model, u, faults, noise=noise) + offset
+        v = u / scale - offset
+        found = hard_over_test(Data(v[2 * N :], y[2 * N :]), Data(v[: 2 * N], y[: 2 * N]), window=N)
+        assert found.candidates == expected and found.windows[0].order == 4
+
+
+def test_missing_inputs_before_a_nonlinearity():
+    model, u = two_mode_plant(True, 0.1), np.random.default_rng(2).normal(size=(3 * N, 2))
+    y = inject(model, u, Fault.loss("actuator:u1", 2 * N, 1.0))
+    v = u.copy()
+    v[2 * N + 50 :: 200, 1] = np.nan
+    healthy, data = Data(u[: 2 * N], y[: 2 * N]), Data(v[2 * N :], y[2 * N :])
+    assert hard_over_test(data, healthy, model=model, window=N).candidates == ("actuator:u1",)
+
+
 def test_missing_samples_and_experiments():
     data = run(True, 0.1, "actuator:u1", n=2 * N)
     y = data.y.copy()

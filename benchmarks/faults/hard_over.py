@@ -90,8 +90,8 @@ def decisions(runs: int) -> None:
               f"{np.mean(np.array(middle) == 4):>8.2f}{dead:>12}{raw:>12}{live:>7.0f}{named:>7.2f}{alone:>7.2f}",
               flush=True)
     print("goal: share 1; past 4 at noise 0.1 behind a lost actuator, else as order; middle 1; dead up to 1;\n"
-          "live above 200; named 1 (0 without failure); alone 1 where coupled. Apart, y1 and u1 share all their\nrank; what y1 "
-          "still shows of process noise tells a lost actuator.\n")
+          "live above 200; named 1 (0 without failure); alone 1 where coupled. Apart, y1 and u1 share all their\n"
+          "rank; what y1 still shows of process noise tells a lost actuator.\n")
 
 
 def streams(model: optid.HammersteinSS, what: str, runs: int, hold: int, expand: bool) -> None:

@@ -130,11 +130,13 @@ def zero_test(
         healthy = 0.0 if not kept.any() else float("inf")
         return ZeroTest(name, 0.0, 0.0, 1.0, healthy, flat), theta
     mean, variance = moments_of_sum(e, z)
-    g, h = variance / (2 * mean), 2 * mean**2 / variance
     healthy = float("inf")
     if coefficients is not None:
         root = np.sqrt(values[kept])[:, None] * (vectors[:, kept] * unit[:, None]).T
         healthy = mean / j + float(np.sum((root @ coefficients @ whitener) ** 2))
+    if mean <= 0 or variance <= 0:  # residuals are rounding: any coefficient counts
+        return ZeroTest(name, statistic, 0.0, float(statistic == 0), healthy), theta
+    g, h = variance / (2 * mean), 2 * mean**2 / variance
     threshold, p_value = float(g / j * chdtri(h, level)), float(chdtrc(h, statistic * j / g))
     return ZeroTest(name, statistic, threshold, p_value, healthy), theta
 

@@ -84,4 +84,5 @@ def fantope_certificate(
     elif not np.isfinite(t):
         raise StructureError(f"t={t!r}: a finite number is needed.")
     energy = float(np.trace(w.T @ c @ w))
-    return FantopeCertificate(energy, fantope_bound(np.asarray(values, dtype=float), r, t), float(t), float(np.trace(c)), gone)
+    bound = fantope_bound(np.asarray(values, dtype=float), r, t)
+    return FantopeCertificate(energy, bound, float(t), float(np.trace(c)), gone)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
-from optid.channels import listed
 from optid.errors import DataError, StructureError
 from optid.tracking.geometry import as_basis, check_dimension, orthonormal, principal_angles
 
@@ -168,7 +167,7 @@ class SubspaceTracker:
 
     def __str__(self) -> str:
         seen, used, passed = (int(c) for c in self.counts)
-        head = (f"{self.method.upper()}, {self.r} of {self.n} dimensions ({listed(self.names)}), forgetting "
+        head = (f"{self.method.upper()}, {self.r} of {self.n} dimensions ({', '.join(self.names)}), forgetting "
                 f"{self.forgetting:g}")
         if len(head) > 80:
             head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
