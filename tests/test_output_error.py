@@ -1,5 +1,7 @@
 """Output-error fits: recovery, optima equal to those of other routes, constraints, missing samples, bad input."""
 
+import os
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -384,7 +386,8 @@ def test_a_short_experiment_is_named():
         optid.fit(optid.Data([data.u, data.u[:3]], [data.y, data.y[:3]]), "oe.exact", na=3, nb=3)
 
 
-@pytest.mark.parametrize("u, words", [(np.ones(200), "constant"), (np.where(np.sin(np.arange(200.0) ** 2) > 0, 1.0, -1.0), "binary")])
+@pytest.mark.parametrize("u, words", [(np.ones(200), "constant"),
+                                      (np.where(np.sin(np.arange(200.0) ** 2) > 0, 1.0, -1.0), "binary")])
 def test_inputs_that_say_nothing_about_a_nonlinearity(u, words):
     y = np.random.default_rng(0).normal(size=200)
     with pytest.raises(DataError, match=words):
@@ -405,3 +408,27 @@ def test_published_output_error_fits(real_data, name, count, lag, low, high):
     score = 100 * (1 - np.linalg.norm(error) / np.linalg.norm(raw.y - raw.y.mean()))
     assert low <= score <= high
     assert fit.model.is_stable and fit.solution.status is Status.LOCAL
+
+
+@pytest.mark.skipif("OPTID_DATA" not in os.environ, reason="OPTID_DATA names no folder with the record")
+def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
+    record = optid.read(f"{os.environ['OPTID_DATA']}/lab_hydraulic_actuator.csv", inputs="u_valve",
+                        outputs="y_pressure", dt=1.0).split(512)[0]
+    fit = optid.fit(record, "hammerstein_oe.exact", na=3, nb=2, basis="triangular:6", constraints=["stable:0.95"])
+    assert fit.solution.status is Status.LOCAL and np.max(np.abs(fit.model.poles)) <= 0.95
+    # no model with its poles inside the same circle, nearby, has smaller errors by more than the boundary's curvature
+    plant = fit.model.plant
+    unknowns = Unknowns(plant_layout(record, 3, 2, 0, (plant.f.basis,)), 1, (True,))
+    criterion = hammerstein_oe.OutputError(record, unknowns, "norm")
+    at_rest = np.zeros((1, unknowns.memory))
+    x = unknowns.pack(PlantPoint(plant.a, (plant.f.mu,), plant.b, float(plant.offset[0]), at_rest))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        roots = fit.model.poles[np.argsort(np.imag(fit.model.poles))]
+        upper, real = roots[-1], float(np.real(roots[1]))
+        moved = min(0.9499, abs(upper) + 0.01 * rng.normal()) * np.exp(1j * (np.angle(upper) + 0.01 * rng.normal()))
+        a = np.real(np.poly([moved, np.conj(moved), min(0.9499, real + 0.05 * rng.normal())]))[1:]
+        near = x.copy()
+        near[unknowns.slices["a"]] = a
+        held = np.arange(unknowns.shared) < 3
+        assert descend(criterion, near, held=held).value >= fit.solution.objective * (1 - 1e-4)
