@@ -86,6 +86,18 @@ def test_an_uncoupled_plant_names_both_unless_its_sensor_still_moves():
     assert set(judged(False, 0.0, "actuator:u1").candidates) == {"sensor:y1", "actuator:u1"}
 
 
+def test_sensors_with_coloured_noise():
+    for coupled, dead in ((True, {"sensor:y1"}), (False, {"sensor:y1", "actuator:u1"})):
+        data = run(coupled, 0.1, "sensor:y1")
+        y = data.y.copy()
+        y[:, 0] += lfilter([0.3], [1, -0.9], np.random.default_rng(5).normal(size=N))
+        coloured = Data(data.u, y)
+        found = hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N, white_sensors=False)
+        assert set(found.candidates) == dead
+        if coupled:  # no actuator explains it, so that the memory of the noise does not matter
+            assert set(hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N).candidates) == dead
+
+
 def test_a_healthy_record_gives_no_alarm():
     for coupled in (False, True):
         for seed in range(10):

@@ -13,7 +13,7 @@ same window. Open loop is assumed: under feedback inputs depend on sensor noise,
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,7 +34,7 @@ LONG = 20
 """Windows have at least this many samples per future row of outputs."""
 
 LEVEL = 1e-3
-"""Probability that the row or column of a dead channel is not recognised on one window."""
+"""Probability that the row or column of a dead channel is not recognised, or a true order rejected, on one window."""
 
 STILL = 0.1
 """Smallest excitation, relative to the healthy record, below which no order is estimated."""
@@ -68,8 +68,13 @@ class WindowVerdict:
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Channels that may be dead, the likeliest first; a sensor that still moves by itself is not."""
-        found = [test for test in (*self.rows, *self.columns) if test.zero and test.name not in self.moving]
+        """Channels that may be dead, the likeliest first.
+
+        Where a dead actuator would explain it too, a sensor that still moves by itself is not among them.
+        """
+        actuators = [test for test in self.columns if test.zero]
+        sensors = [test for test in self.rows if test.zero and not (actuators and test.name in self.moving)]
+        found = [*sensors, *actuators]
         return tuple(test.name for test in sorted(found, key=lambda test: test.ratio))
 
     @property
@@ -211,6 +216,7 @@ def hard_over_test(
     block_rows: int = BLOCK_ROWS,
     instruments: str = "inputs",
     level: float = LEVEL,
+    white_sensors: bool = True,
 ) -> HardOver:
     """Test a record for dead sensors and actuators, window by window.
 
@@ -223,7 +229,9 @@ def hard_over_test(
         hop: samples between windows; a quarter of a window when not given.
         block_rows: future block rows alpha, larger than order / outputs; the past has as many.
         instruments: "inputs", or "inputs+past" to see what process noise hides.
-        level: probability that a dead channel is not recognised on one window.
+        level: probability that a dead channel is not recognised, or the true order rejected, on one window.
+        white_sensors: whether the noise of the sensors is white: an output with a memory then still sees the plant, and
+            where its sensor or the only actuator that it shows may be dead, it is the actuator. False keeps both.
 
     Raises:
         StructureError: arguments out of range, or a model with feedback.
@@ -251,8 +259,9 @@ def hard_over_test(
     found = []
     for e, record in enumerate(_signals(data, model)):
         for start in range(0, len(record) - window + 1, hop):
-            found.append(_judged(record[start : start + window], layout, nominal, data, instruments, level,
-                                 (e, start, start + window)))
+            verdict = _judged(record[start : start + window], layout, nominal, data, instruments, level,
+                              (e, start, start + window))
+            found.append(verdict if white_sensors else replace(verdict, moving=frozenset()))
     if not found:
         raise RankError(f"No experiment has the {window} samples of a window: shorten it or take fewer block rows.")
     return HardOver(tuple(found), nominal.order, window, hop, layout.alpha, instruments, data.name)
@@ -292,7 +301,7 @@ def _reference(
         raise RankError(f"the inputs of the healthy record do not excite {2 * alpha} block rows (smallest eigenvalue "
                         f"{excitation:.1e}): use richer inputs or fewer block rows.")
     if order is None:
-        order, _ = _order(statistics, layout, sizes, instruments)
+        order, _ = _order(statistics, layout, sizes, instruments, LEVEL)
     rows, columns, _ = _tests(statistics, layout, data, sizes, None, LEVEL)
     return _Healthy(order, sizes, excitation, tuple(t for _, t in rows), tuple(t for _, t in columns))
 
@@ -315,22 +324,24 @@ def _judged(
     order, note = None, f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
     if excitation >= STILL:
         try:
-            order, note = _order(statistics, layout, nominal.sizes, instruments)
+            order, note = _order(statistics, layout, nominal.sizes, instruments, level)
         except RankError as error:
             note = f"untestable: {error}"
     return WindowVerdict(*place, order, note, excitation, tuple(t for t, _ in rows), tuple(t for t, _ in columns),
                          moving)
 
 
-def _order(statistics: HankelStatistics, layout: _Layout, sizes: Array, instruments: str) -> tuple[int, str]:
+def _order(
+    statistics: HankelStatistics, layout: _Layout, sizes: Array, instruments: str, level: float
+) -> tuple[int, str]:
     alpha, at = layout.alpha, statistics.at
     z = [np.zeros(1, dtype=np.intp), at(layout.all, range(2 * alpha))]
     if instruments == "inputs+past":
         z.append(at(layout.y, range(alpha)))
     phi = np.concatenate([[0], at(layout.all, range(alpha, 2 * alpha))])
     y = at(layout.y, range(alpha, 2 * alpha))
-    test = rank_test(statistics, np.concatenate(z), phi, y, rows=2 * alpha, largest=(alpha - 1) * layout.l,
-                     scale=sizes[y])
+    test = rank_test(statistics, np.concatenate(z), phi, y, rows=2 * alpha, level=level,
+                     largest=(alpha - 1) * layout.l, scale=sizes[y])
     return test.order, test.reason
 
 
