@@ -188,6 +188,54 @@ def test_bad_input(found):
         found.isolability(20, calibration=5000, draws=50).forecast("sensor:y", 1.0)
 
 
+# -- faults whose signature depends on the input -----------------------------------------------------------------------
+
+
+def test_losses_and_stuck_actuators_are_searched_along_the_input_of_the_window():
+    u = levels(40, 3)
+    lossy = dictionary(small(), kinds=["bias", "loss", "stuck"])
+    space = signature_space(lossy, 40, u=u)
+    assert space.skipped == () and "actuator:u1 loss" in space.labels
+    windows = np.random.default_rng(0).normal(size=(3, 40, 2))
+    fast = space.statistics(windows)
+    for c, label in enumerate(space.labels):
+        for m, r in enumerate(windows):
+            energies = [0.0]
+            for onset in range(40 - (-(-lossy[label].dimension // 2)) + 1):
+                G = lossy.signature(label, 40, onset, u=u).reshape(80, -1)
+                fitted = G @ np.linalg.lstsq(G, r.ravel(), rcond=1e-9)[0]
+                energies.append(fitted @ fitted)
+            assert abs(fast[m, c] / max(energies) - 1) < 1e-7
+    assert signature_space(lossy, 40).skipped == tuple(x for x in lossy.labels if "loss" in x or "stuck" in x)
+
+
+def test_the_forecast_of_a_loss_meets_records_with_that_input():
+    model, u, rng = small(), levels(160, 5), np.random.default_rng(0)
+    lossy = dictionary(model, kinds=["bias", "loss"])
+    study = lossy.isolability(60, u=u[100:], draws=2000)
+    c, windows = study.labels.index("actuator:u1 loss"), []
+    share = 0.8 * study.isolable[c]
+    assert 0 < share < 1
+    for run in range(400):
+        onset = 100 + int(rng.integers(60 * MIDDLE[0], 60 * MIDDLE[1]))
+        y = inject(model, u, Fault.loss("actuator:u1", onset, share), seed=run)
+        windows.append(whiten(model, Data(u, y), x0="zero").r[100:])
+    excess = signature_space(lossy, 60, u=u[100:]).statistics(np.array(windows)) - study.thresholds
+    right = np.mean((excess.max(axis=1) > 0) & (excess.argmax(axis=1) == c))
+    assert abs(right - study.forecast("actuator:u1 loss", share).isolated) < 0.075
+
+
+def test_an_actuator_that_does_not_move_is_untestable_and_more_than_all_cannot_be_lost():
+    lossy, u = dictionary(small(), kinds="loss", actuators=["u1"]), levels(40, 3)
+    with pytest.raises(DataError, match="actuator:u1 loss: untestable"):
+        lossy.isolability(40, u=u * [0.0, 1.0], calibration=5000)
+    weak = lossy.isolability(40, u=0.01 * u, calibration=5000, draws=200)
+    assert np.isinf(weak.detectable[0]) and "never" in str(weak)
+    weak.plot()
+    with pytest.raises(DataError, match="u has 30 samples: 40"):
+        lossy.isolability(40, u=u[:30])
+
+
 def run(*words):
     return CliRunner().invoke(app, ["isolability", *map(str, words)])
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
-from optid.errors import LookupFailed, StructureError, nearest
-from optid.faults.signature_space import Ruler, SignatureSpace, signature_space
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.faults.signature_space import InputRuler, Ruler, SignatureSpace, signature_space
 from optid.faults.signatures import Dictionary
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ class Isolability:
 def study(
     found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
     false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
+    u: ArrayLike | None = None,
 ) -> Isolability:
     """Simulate the search for every fault at all sizes.
 
@@ -165,9 +167,11 @@ def study(
         draws: simulated windows per fault.
         calibration: simulated healthy windows behind the thresholds.
         seed: of the simulation.
+        u: (N, m) a typical input over the window, for losses and stuck actuators.
 
     Raises:
-        DataError: too few calibration windows for the false-alarm rate.
+        DataError: too few calibration windows for the false-alarm rate, an input of another length or one that does
+            not move a suspected actuator.
         StructureError: a window that is too short, impossible probabilities, no candidate with a signature.
     """
     if not 0.5 <= prob < 1:
@@ -175,7 +179,7 @@ def study(
     if isinstance(onset, str) and onset != "unknown":
         raise StructureError(f"onset={onset!r}: use 'unknown' or the number of a sample.")
     known = None if isinstance(onset, str) else int(onset)
-    space = signature_space(found, window, known)
+    space = signature_space(found, window, known, u)
     first, second = np.random.SeedSequence(seed).generate_state(2)
     thresholds = space.thresholds(false_alarm, calibration, int(first))
     rng = np.random.default_rng(int(second))
@@ -187,12 +191,17 @@ def study(
     unit = np.array([c.unit for c in curves])
     matrix = np.array([[_crossing(p, prob, draws) for p in c.preferred] for c in curves]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
+    whole = np.array([1.0 if ruler.candidate.kind == "loss" else np.inf for ruler in space.rulers])
+    detectable = np.array([_crossing(p, prob, draws) for p in detected])
+    sizes = [_possible(d / unit, whole) for d in (detectable, isolable)]
     return Isolability(
-        space.labels, window, onset, prob, false_alarm, np.array([_crossing(p, prob, draws) for p in detected]) / unit,
-        isolable / unit, matrix, np.array([_sines(space, ruler, known) for ruler in space.rulers]), unit,
-        tuple(_rival(space, c, at) for c, at in zip(curves, isolable)),
-        np.array([ruler.candidate.bounded_deflection for ruler in space.rulers]), dict(found.excluded), space.skipped,
-        thresholds, detected, isolated, draws,
+        labels=space.labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
+        isolable=sizes[1], matrix=_possible(matrix.T, whole).T,
+        sines=np.array([_sines(space, ruler, known) for ruler in space.rulers]), unit=unit,
+        rivals=tuple(_rival(space, c, at) for c, at in zip(curves, isolable)),
+        bounded=np.array([ruler.candidate.bounded_deflection for ruler in space.rulers]),
+        excluded=dict(found.excluded), skipped=space.skipped, thresholds=thresholds, detected=detected,
+        isolated=isolated, draws=draws,
     )
 
 
@@ -226,7 +235,7 @@ def _curves(
     faults = np.zeros((draws, space.window, space.outputs))
     for onset in np.unique(onsets):
         rows = onsets == onset
-        faults[rows, onset:] = np.einsum("kop,mp->mko", ruler.trace[: space.window - onset], sizes[rows])
+        faults[rows] = np.einsum("kop,mp->mko", ruler.signature(int(onset)), sizes[rows])
     for other, z in zip(space.rulers, noise):
         s = other.scores(faults)
         for store, value in zip(parts, (np.sum(z**2, axis=2), np.sum(z * s, axis=2), np.sum(s**2, axis=2))):
@@ -245,12 +254,17 @@ def _curves(
 
 
 def _directions(
-    space: SignatureSpace, ruler: Ruler, known: int | None, draws: int, rng: np.random.Generator
+    space: SignatureSpace, ruler: Ruler | InputRuler, known: int | None, draws: int, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """Return sizes (M, d) of deflection one in mid-window, in random directions, and the deflection of a unit size."""
     onset = space.window // 2 if known is None else known
-    trace = ruler.trace[: space.window - onset]
+    trace = ruler.signature(onset)
     values, axes = np.linalg.eigh(np.einsum("kop,koq->pq", trace, trace))
+    if not values[-1] > 0:
+        raise DataError(
+            f"{ruler.candidate.label}: untestable, the input does not excite it after sample {onset}. Use a window in "
+            "which it moves."
+        )
     d = values.size
     if d == 1:
         unit = float(np.sqrt(values[0]))
@@ -296,14 +310,19 @@ def _rival(space: SignatureSpace, curves: _Curves, at: float) -> str:
     return space.labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
 
 
-def _sines(space: SignatureSpace, ruler: Ruler, known: int | None) -> Array:
+def _sines(space: SignatureSpace, ruler: Ruler | InputRuler, known: int | None) -> Array:
     """Smallest sine (C,) between the signature in mid-window and the others at any onset."""
     onset = space.window // 2 if known is None else known
-    own = np.zeros((ruler.trace.shape[2], space.window, space.outputs))
-    axes = np.linalg.svd(ruler.trace[: space.window - onset].reshape(-1, ruler.trace.shape[2]), full_matrices=False)[0]
-    own[:, onset:] = axes.T.reshape(-1, space.window - onset, space.outputs)
+    trace = ruler.signature(onset)
+    axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)[0]
+    own = axes.T.reshape(-1, space.window, space.outputs)
     cosines = [np.linalg.svd(other.scores(own).swapaxes(0, 1), compute_uv=False)[:, 0].max() for other in space.rulers]
     return np.sqrt(np.maximum(0.0, 1 - np.minimum(cosines, 1.0) ** 2))
+
+
+def _possible(sizes: Array, largest: Array) -> Array:
+    """More than the whole cannot be lost."""
+    return np.where(sizes > largest, np.inf, sizes)
 
 
 def _size(value: float) -> str:

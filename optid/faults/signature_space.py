@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
 from optid.errors import DataError, StructureError
 from optid.faults.signatures import Candidate, Dictionary, response
+from optid.models.experiments import samples_of
 
 SHARE = 1e-9
 """Directions of a Gram matrix below this share of its largest eigenvalue explain nothing."""
@@ -48,6 +50,38 @@ class Ruler(NamedTuple):
         correlation = np.fft.irfft(np.einsum("mfo,fop->mfp", transform, self.spectrum), 2 * count, axis=1)
         return np.einsum("tqp,mtp->mtq", self.roots, correlation[:, self.onsets])
 
+    def signature(self, onset: int) -> Array:
+        """Return the signature (N, l, d) of an onset."""
+        shifted = np.zeros_like(self.trace)
+        shifted[onset:] = self.trace[: len(self.trace) - onset]
+        return shifted
+
+
+class InputRuler(NamedTuple):
+    """One candidate whose signature depends on the input, over all onsets of a window.
+
+    Attributes:
+        candidate: the candidate.
+        onsets: (T,) onsets that are searched.
+        bank: (N, N, l, d) its signatures by onset.
+        roots: (T, d, d) inverse roots of the Gram matrices.
+    """
+
+    candidate: Candidate
+    onsets: np.ndarray
+    bank: Array
+    roots: Array
+
+    def scores(self, windows: Array) -> Array:
+        """Return (M, T, d) of windows (M, N, l); the squared norm over the last axis is the statistic."""
+        bank = self.bank[self.onsets]
+        correlation = np.tensordot(windows, bank, ([1, 2], [1, 2]))
+        return np.einsum("tqp,mtp->mtq", self.roots, correlation)
+
+    def signature(self, onset: int) -> Array:
+        """Return the signature (N, l, d) of an onset."""
+        return self.bank[onset]
+
 
 @dataclass(frozen=True, eq=False)
 class SignatureSpace:
@@ -60,7 +94,7 @@ class SignatureSpace:
         skipped: labels of the candidates without a signature of their own.
     """
 
-    rulers: tuple[Ruler, ...]
+    rulers: tuple[Ruler | InputRuler, ...]
     window: int
     outputs: int
     skipped: tuple[str, ...]
@@ -116,15 +150,19 @@ def family_thresholds(statistics: Array, false_alarm: float) -> Array:
     return np.quantile(statistics, 1 - level, axis=0)
 
 
-def signature_space(found: Dictionary, window: int, onset: int | None = None) -> SignatureSpace:
+def signature_space(
+    found: Dictionary, window: int, onset: int | None = None, u: ArrayLike | None = None
+) -> SignatureSpace:
     """Return the signatures of a dictionary over a window.
 
     Args:
         found: the dictionary.
         window: samples N.
         onset: the only onset that is searched; None for all.
+        u: (N, m) inputs over the window, for losses and stuck actuators; without it these are skipped.
 
     Raises:
+        DataError: an input of another length.
         StructureError: a window that is too short, an onset outside it, no candidate with a signature.
     """
     least = 2 * found.model.nx + 2
@@ -132,24 +170,47 @@ def signature_space(found: Dictionary, window: int, onset: int | None = None) ->
         raise StructureError(f"window={window}: at least {least} samples are needed for {found.model.nx} states.")
     if onset is not None and not 0 <= onset < window:
         raise StructureError(f"onset={onset} lies outside the window of {window} samples.")
-    additive = [c for c in found.candidates if c.additive]
-    if not additive:
+    inputs = None if u is None else samples_of(u, "u", found.model.m)
+    if inputs is not None and (len(inputs) != window or not np.isfinite(inputs).all()):
+        raise DataError(f"u has {len(inputs)} samples: {window}, none missing, are needed, those of the window.")
+    able = [c for c in found.candidates if c.additive or (c.columns and inputs is not None)]
+    if not able:
         raise StructureError(
-            "No candidate has a signature that is known without data: add the kind 'bias', 'drift' or a state jump."
+            "No candidate has a signature that is known without data: add the kind 'bias', 'drift' or a state jump, or "
+            "pass the input u of a window for losses and stuck actuators."
         )
-    rulers = [_ruler(found, c, window, onset) for c in additive]
-    return SignatureSpace(
-        tuple(rulers), window, found.model.l, tuple(c.label for c in found.candidates if not c.additive)
-    )
+    rulers = [
+        _ruler(found, c, window, onset) if c.additive else _input_ruler(found, c, window, onset, inputs) for c in able
+    ]
+    skipped = [c.label for c in found.candidates if c not in able]
+    return SignatureSpace(tuple(rulers), window, found.model.l, tuple(skipped))
 
 
 def _ruler(found: Dictionary, candidate: Candidate, window: int, onset: int | None) -> Ruler:
     trace = response(found.predictor, candidate, window)
-    needed = -(-trace.shape[2] // found.model.l)
-    onsets = np.arange(window - needed + 1) if onset is None else np.array([onset])
+    onsets = _onsets(found, trace.shape[2], window, onset)
     grams = np.cumsum(np.einsum("kop,koq->kpq", trace, trace), axis=0)[window - onsets - 1]
+    spectrum = np.conj(np.fft.rfft(trace, 2 * window, axis=0))
+    return Ruler(candidate, trace, onsets, _inverse_roots(grams), spectrum)
+
+
+def _input_ruler(
+    found: Dictionary, candidate: Candidate, window: int, onset: int | None, u: Array | None
+) -> InputRuler:
+    bank = np.stack([found.signature(candidate, window, k, u=u) for k in range(window)])
+    onsets = _onsets(found, bank.shape[3], window, onset)
+    grams = np.einsum("tkop,tkoq->tpq", bank[onsets], bank[onsets])
+    return InputRuler(candidate, onsets, bank, _inverse_roots(grams))
+
+
+def _onsets(found: Dictionary, dimension: int, window: int, onset: int | None) -> np.ndarray:
+    """Onsets that leave enough readings for the magnitudes."""
+    needed = -(-dimension // found.model.l)
+    return np.arange(window - needed + 1) if onset is None else np.array([onset])
+
+
+def _inverse_roots(grams: Array) -> Array:
     values, axes = np.linalg.eigh(grams)
     there = values > SHARE * np.maximum(values[:, -1:], 1e-300)
     inverse = np.where(there, 1 / np.sqrt(np.where(there, values, 1.0)), 0.0)
-    spectrum = np.conj(np.fft.rfft(trace, 2 * window, axis=0))
-    return Ruler(candidate, trace, onsets, inverse[:, :, None] * np.swapaxes(axes, 1, 2), spectrum)
+    return np.asarray(inverse[:, :, None] * np.swapaxes(axes, 1, 2))
