@@ -91,7 +91,8 @@ def decisions(runs: int) -> None:
               flush=True)
     print("goal: share 1; past 4 at noise 0.1 behind a lost actuator, else as order; middle 1; dead up to 1;\n"
           "live above 200; named 1 (0 without failure); alone 1 where coupled. Apart, y1 and u1 share all their\n"
-          "rank; what y1 still shows of process noise tells a lost actuator.\n")
+          "rank; what y1 still shows of process noise tells a lost actuator. Without process noise past outputs see\n"
+          "the state that dies away after the failure: up to 4, falling to 2 with the length of the window.\n")
 
 
 def streams(model: optid.HammersteinSS, what: str, runs: int, hold: int, expand: bool) -> None:
