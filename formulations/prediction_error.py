@@ -190,7 +190,8 @@ def best_of(criterion: Criterion, starts: Mapping[str, Array] | Iterable[tuple[s
             record unexplained, no more are asked for.
     """
     found: list[Descent] = []
-    for name, x in starts.items() if isinstance(starts, Mapping) else starts:
+    pairs: Iterable[tuple[str, Array]] = starts.items() if isinstance(starts, Mapping) else starts
+    for name, x in pairs:
         if criterion.admissible(x):
             found.append(descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name))
             found.sort(key=lambda one: (one.border, one.value))

@@ -65,5 +65,5 @@ def with_whole_inputs(data: Data, shortest: int) -> Data:
 
 def _stretches(gap: np.ndarray) -> int:
     """Count the runs of samples in which no input is missing."""
-    whole = ~gap.any(axis=1)
+    whole = np.logical_not(np.any(gap, axis=1, keepdims=True))[:, 0]
     return int(whole[0]) + int(np.count_nonzero(whole[1:] & ~whole[:-1]))

@@ -216,7 +216,7 @@ def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None
         method: how the parts were compressed.
     """
     states, rest = zip(*(_eliminated(part.factor, n) for part in parts))
-    rows_of_gauge = _weighted(gauge, sum(np.sum(part[:, :p] ** 2, axis=0) for part in rest))
+    rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
     together = len(rest) > 1 or len(rows_of_gauge)
     triangle = np.linalg.qr(np.vstack([*rest, *rows_of_gauge]), mode="r") if together else rest[0]
     full = np.zeros((p + 1, p + 1))
