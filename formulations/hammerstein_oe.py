@@ -143,9 +143,13 @@ class OutputError:
         """Values of the basis functions, where they are few enough to be kept."""
         return expanded(self.data, self.unknowns.layout)
 
-    @cached_property
+    @property
     def energy(self) -> float:
         """Sum of squares of the output about its mean."""
+        return self._energy
+
+    @cached_property
+    def _energy(self) -> float:
         y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
         return float(np.nansum((y - np.nanmean(y)) ** 2))
 

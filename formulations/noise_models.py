@@ -119,7 +119,7 @@ def procedure(name: str, criterion: PredictionErrors, starts: Mapping[str, Array
     Raises:
         RankError: too few innovations for the unknowns.
     """
-    found = best_of(criterion, starts)
+    found = best_of(criterion, starts.items())
     if not found:
         raise RankError("no start has a stable predictor; use other orders")
     rows, size = found[0].at.rows, criterion.unknowns.size

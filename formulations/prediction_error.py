@@ -176,22 +176,21 @@ def _gain(root: Array, at: Linearised) -> float:
     return float(np.sum((basis.T @ at.pull) ** 2)) + at.reach - float(at.pull @ at.pull)
 
 
-def best_of(criterion: Criterion, starts: Mapping[str, Array] | Iterable[tuple[str, Array]], iterations: int = STEPS,
-            *, enough: int | None = None) -> list[Descent]:
+def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iterations: int = STEPS, *,
+            enough: int | None = None) -> list[Descent]:
     """Descend from every start; the best comes first, those that end at the border of stability last.
 
     There they are no local optima: an unstable model would be better still.
 
     Args:
         criterion: the errors.
-        starts: points by name, or pairs that are estimated as they are asked for.
+        starts: (name, point) pairs; they may be estimated as they are asked for.
         iterations: at most, for each.
         enough: number of starts after which, when all of them ended at the same optimum and it leaves little of the
             record unexplained, no more are asked for.
     """
     found: list[Descent] = []
-    pairs: Iterable[tuple[str, Array]] = starts.items() if isinstance(starts, Mapping) else starts
-    for name, x in pairs:
+    for name, x in starts:
         if criterion.admissible(x):
             found.append(descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name))
             found.sort(key=lambda one: (one.border, one.value))

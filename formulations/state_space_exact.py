@@ -277,7 +277,7 @@ def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, we
         weighting = "scale"  # one output has nothing to be weighed against
     elif weighting == "auto":
         weighting = "determinant" if criterion == "prediction" else "variance"
-    found = best_of(error, starts, iterations)
+    found = best_of(error, starts.items(), iterations)
     levels = [error.level(one.x) if weighting != "scale" else one.value for one in found]
     order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
     ends = []

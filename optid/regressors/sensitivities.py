@@ -218,7 +218,8 @@ def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None
     states, rest = zip(*(_eliminated(part.factor, n) for part in parts))
     rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
     together = len(rest) > 1 or len(rows_of_gauge)
-    triangle = np.linalg.qr(np.vstack([*rest, *rows_of_gauge]), mode="r") if together else rest[0]
+    stacked = np.vstack([*rest, *rows_of_gauge])
+    triangle = np.linalg.qr(stacked, mode="r") if together else stacked
     full = np.zeros((p + 1, p + 1))
     full[: len(triangle)] = triangle
     condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
