@@ -61,7 +61,8 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
         # a gap of 1e-8 leaves multipliers that are good to 1e-5 only
         "cvxopt": {"abstol": 0.01 * eps, "reltol": 0.01 * eps, "feastol": eps, "max_iters": 200},
         "ecos": {"abstol": eps, "reltol": eps, "feastol": eps, "max_iters": 500},
-        "sdpa": {"epsilonStar": eps, "epsilonDash": eps},
+        # in several threads its answers, and now and then its verdict, change from run to run
+        "sdpa": {"epsilonStar": eps, "epsilonDash": eps, "numThreads": 1},
         # feastol above 1e-9 makes badly scaled programmes run for minutes
         "scip": {"scip_params": {"numerics/feastol": 1e-9,
                                  **({"limits/time": float(limit)} if limit is not None else {})}},
