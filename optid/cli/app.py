@@ -16,20 +16,15 @@ from optid.cli.options import (
     RECORD,
     RESULT,
     SOLVER,
-    Columns,
-    Decimal,
-    Delimiter,
-    Dt,
+    Example,
     Files,
-    Inputs,
-    Outputs,
     Report,
-    Runs,
-    Time,
+    Seed,
+    reads_a_record,
 )
 from optid.cli.ordering import order
-from optid.cli.terminal import FILES, Command, Group, Waiting, coloured, hearing, note, say
-from optid.errors import DataError
+from optid.cli.results import conclude
+from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
 
 app = typer.Typer(
     cls=Group,
@@ -60,22 +55,12 @@ def main(
 
 
 @app.command(cls=FittingCommand)
+@reads_a_record
 def fit(
     data: Files = None,
-    example: Annotated[
-        str | None,
-        typer.Option(
-            "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
-        ),
-    ] = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    dt: Dt = None,
-    time: Time = None,
-    experiment: Runs = None,
-    columns: Columns = None,
-    delimiter: Delimiter = ",",
-    decimal: Decimal = ".",
+    example: Example = None,
+    *,
+    how: dict[str, Any],
     stream: Annotated[
         bool,
         typer.Option("--stream", rich_help_panel=RECORD, help="Read chunk by chunk: for a file larger than memory."),
@@ -174,7 +159,7 @@ def fit(
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE...", rich_help_panel=SOLVER, help="Native options of the solver."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=RECORD, help="Seed of the noise of an example.")] = 0,
+    seed: Seed = 0,
     report: Report = None,
     model: Annotated[
         Path | None,
@@ -191,26 +176,12 @@ def fit(
     from optid.selection import fit_by_holdout
     from optid.showing.printing import describe, describe_validation
 
-    how = {
-        "inputs": inputs,
-        "outputs": outputs,
-        "dt": dt,
-        "time": time,
-        "experiment": experiment,
-        "columns": columns,
-        "delimiter": delimiter,
-        "decimal": decimal,
-    }
     words.check_folders(model, report)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
-        arguments: dict[str, Any] = {}
-        if example is None:
-            record: Any = words.read_record(data, how, stream=stream)
-        elif data:
-            raise DataError("give data files or --example, not both")
-        else:
-            record, arguments = words.example_record(example, seed, formulation)
+        record: Any
+        record, suggestion = words.record(data, how, example, seed, stream=stream)
+        arguments = words.suited(suggestion, formulation) if suggestion else {}
         given = {
             "na": na,
             "nb": words.whole_numbers(nb, "--nb"),
@@ -252,17 +223,11 @@ def fit(
 
             waiting.step("writing the report")
             write(found, report, held_out, command=shlex.join(["optid", *sys.argv[1:]]))
-    say(coloured(text))
-    said = " ".join(text.split())
-    for sentence in heard:
-        if " ".join(sentence.split()) not in said:
-            note(sentence)
-    for path, what in ((model, "model"), (report, "report")):
-        if path is not None:
-            say(f"{what} written to {path}")
+    conclude(text, heard, model=model, report=report)
 
 
 @app.command(cls=Command)
+@reads_a_record
 def validate(
     files: Annotated[
         list[Path],
@@ -270,14 +235,8 @@ def validate(
             metavar="MODEL... DATA...", help="Model files (.json) written by fit --model, then files of the record."
         ),
     ],
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    dt: Dt = None,
-    time: Time = None,
-    experiment: Runs = None,
-    columns: Columns = None,
-    delimiter: Delimiter = ",",
-    decimal: Decimal = ".",
+    *,
+    how: dict[str, Any],
     horizon: Annotated[
         int, typer.Option("--horizon", metavar="N", rich_help_panel=RESULT, help="Predict so many samples ahead, too.")
     ] = 1,
@@ -299,15 +258,11 @@ def validate(
         first = next(iter(models.values()))
         record: Any = words.read_record(
             data,
-            {
-                "inputs": inputs or list(first.inputs),
-                "outputs": outputs or list(first.outputs),
-                "dt": first.dt if dt is None else dt,
-                "time": time,
-                "experiment": experiment,
-                "columns": columns,
-                "delimiter": delimiter,
-                "decimal": decimal,
+            how
+            | {
+                "inputs": how["inputs"] or list(first.inputs),
+                "outputs": how["outputs"] or list(first.outputs),
+                "dt": first.dt if how["dt"] is None else how["dt"],
             },
         )
         waiting.step("validating")
@@ -322,13 +277,7 @@ def validate(
 
             waiting.step("writing the report")
             write_comparison(found, report, command=shlex.join(["optid", *sys.argv[1:]]))
-    say(text)
-    said = " ".join(text.split())
-    for sentence in heard:
-        if " ".join(sentence.split()) not in said:
-            note(sentence)
-    if report is not None:
-        say(f"report written to {report}")
+    conclude(text, heard, report=report)
 
 
 @app.command(cls=Command)

@@ -11,7 +11,7 @@ from optid.errors import DataError, StructureError
 from optid.streams import Stream
 
 
-def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, stream: bool = False) -> Data | Stream:
+def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False) -> Data | Stream:
     """Read the files of a record, one experiment each.
 
     Args:
@@ -20,12 +20,10 @@ def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, s
         stream: read chunk by chunk.
 
     Raises:
-        DataError: no file given, or what `optid.read` refuses.
+        DataError: what `optid.read` refuses.
     """
     from optid.readers import open_stream, read
 
-    if not files:
-        raise DataError("give a data file, or --example NAME (optid examples lists them)")
     time = how["time"]
     options: dict[str, Any] = {
         **how,
@@ -42,21 +40,66 @@ def read_record(files: Sequence[Path | str] | None, how: Mapping[str, Any], *, s
     return open_stream(Path(files[0]), **options)
 
 
-def example_record(name: str, seed: int, formulation: str) -> tuple[Data, dict[str, Any]]:
-    """Return a built-in record and those of its suggested arguments that the formulation takes.
+def record(
+    files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int,
+    *, asked: str = "a data file", stream: bool = False,
+) -> tuple[Data | Stream, dict[str, Any]]:
+    """Return the record of files, or a built-in one with the arguments of a fit that it suggests.
+
+    Args:
+        files: paths, one experiment each.
+        how: as in `read_record`.
+        example: name of a built-in record in their place.
+        seed: of the noise of the example.
+        asked: what the command takes in the way of files, for the messages.
+        stream: read chunk by chunk.
 
     Raises:
-        LookupFailed: no such example or formulation.
+        DataError: neither is given, or both are, or what `optid.read` refuses.
+        LookupFailed: no such example.
     """
-    from optid.examples import example
+    if example is None:
+        if not files:
+            raise DataError(f"give {asked}, or --example NAME (optid examples lists them)")
+        return read_record(files, how, stream=stream), {}
+    if files:
+        raise DataError(f"give {asked} or --example, not both")
+    from optid.examples import example as built_in
+
+    chosen = built_in(example, seed=seed)
+    return chosen.data, dict(chosen.suggestion)
+
+
+def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
+    """Return those of the suggested arguments that the formulation takes.
+
+    Raises:
+        LookupFailed: no such formulation.
+    """
     from optid.registry import formulation as look_up
 
-    chosen = example(name, seed=seed)
     takes = inspect.signature(look_up(formulation)[1]).parameters
-    arguments = {key: value for key, value in chosen.suggestion.items() if key in takes}
+    arguments = {key: value for key, value in suggestion.items() if key in takes}
     if "basis" not in takes:  # the suggested constraints are about the nonlinearity
         arguments.pop("constraints", None)
-    return chosen.data, arguments
+    return arguments
+
+
+def state_space_model(path: Path) -> Any:
+    """Read the model that questions about faults are asked of.
+
+    Raises:
+        StructureError: a model of another kind.
+    """
+    from optid.io import load
+
+    model = load(path)
+    if model.kind != "HammersteinSS":
+        raise StructureError(
+            f"{path} is a {model.kind}: faults are judged with a state-space model that has noise covariances "
+            "(optid fit ... --formulation hammerstein_ss.asivid)."
+        )
+    return model
 
 
 def models_and_data(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -125,19 +168,42 @@ def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
     return one_or_all(numbers) if words is not None else None
 
 
+def value(word: str) -> Any:
+    """Return what a word that is JSON says (number, list, true); any other is text."""
+    try:
+        return json.loads(word)
+    except json.JSONDecodeError:
+        return word
+
+
 def pairs(words: Sequence[str] | None, option: str) -> dict[str, Any]:
-    """Read key=value words; a value that is JSON (number, list, true) counts as such, any other is text.
+    """Read key=value words, the values as in `value`.
 
     Raises:
         StructureError: a word without an equals sign.
     """
     found = {}
     for word in words or []:
-        key, equals, value = word.partition("=")
+        key, equals, text = word.partition("=")
         if not equals or not key:
             raise StructureError(f"{option} {word}: write key=value")
+        found[key] = value(text)
+    return found
+
+
+def directions(words: Sequence[str] | None, option: str) -> dict[str, list[float]]:
+    """Read NAME=E1,E2,... words: directions in the state equation by name.
+
+    Raises:
+        StructureError: a word that is something else.
+    """
+    found = {}
+    for word in words or []:
+        name, equals, numbers = word.partition("=")
         try:
-            found[key] = json.loads(value)
-        except json.JSONDecodeError:
-            found[key] = value
+            found[name] = [float(number) for number in numbers.split(",")]
+        except ValueError:
+            equals = ""
+        if not (name and equals):
+            raise StructureError(f"{option} {word}: write NAME=E1,E2,..., one number per state")
     return found

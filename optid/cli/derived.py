@@ -152,17 +152,10 @@ def _arguments(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
     return {key: p for key, p in parameters.items() if p.kind is inspect.Parameter.KEYWORD_ONLY}
 
 
-def _json(value: Any) -> str:
+def _json(words: Any) -> str:
     """Write the words of one option as the value of ``--set``: numbers and true as such, several as a list."""
-    if isinstance(value, bool):
-        return json.dumps(value)
-    parts = [part.strip() for word in value for part in word.split(",") if part.strip()]
-    read = [_value(part) for part in parts]
-    return json.dumps(read[0] if len(read) == 1 else read)
+    from optid.cli.arguments import listed, one_or_all, value
 
-
-def _value(word: str) -> Any:
-    try:
-        return json.loads(word)
-    except json.JSONDecodeError:
-        return word
+    if isinstance(words, bool):
+        return json.dumps(words)
+    return json.dumps(one_or_all([value(word) for word in listed(words) or []]))

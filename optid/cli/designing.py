@@ -5,31 +5,22 @@ from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RECORD, RESULT, Columns, Decimal, Delimiter, Dt, Inputs, Outputs, Runs, Time
-from optid.cli.terminal import FILES, Waiting, hearing, note, say
+from optid.cli.options import MODEL, RECORD, RESULT, Example, FeedbackBasis, reads_a_record
+from optid.cli.results import conclude
+from optid.cli.terminal import FILES, Waiting, hearing
 
 EXCITATION = "The excitation"
 
 
+@reads_a_record
 def design(
     like: Annotated[
         list[str] | None,
         typer.Option("--like", metavar=FILES, rich_help_panel=RECORD, help="Record of the plant, one file or several."),
     ] = None,
-    example: Annotated[
-        str | None,
-        typer.Option(
-            "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
-        ),
-    ] = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    dt: Dt = None,
-    time: Time = None,
-    experiment: Runs = None,
-    columns: Columns = None,
-    delimiter: Delimiter = ",",
-    decimal: Decimal = ".",
+    example: Example = None,
+    *,
+    how: dict[str, Any],
     kind: Annotated[
         str,
         typer.Option(
@@ -86,15 +77,7 @@ def design(
             help="Basis of the nonlinearity to be identified, one or one per input. [dim]polynomial:4[/]",
         ),
     ] = None,
-    feedback_basis: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--feedback-basis",
-            metavar="NAME:SIZE...",
-            rich_help_panel=MODEL,
-            help="Basis of the functions of the outputs, one or one per output.",
-        ),
-    ] = None,
+    feedback_basis: FeedbackBasis = None,
     rows: Annotated[
         int, typer.Option("--rows", rich_help_panel=MODEL, help="Lags of every function: block rows, or nb.")
     ] = 10,
@@ -110,8 +93,7 @@ def design(
     Example: optid design --like data.csv --inputs u --outputs y --kind multisine --levels 12 -o excitation.csv
     """
     from optid.cli import arguments as words
-    from optid.errors import DataError, StructureError
-    from optid.examples import example as built_in
+    from optid.errors import StructureError
     from optid.experiment import design as designed
 
     for name, value in (("--band", band), ("--amplitude", amplitude)):
@@ -120,13 +102,7 @@ def design(
     words.check_folders(output)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
-        if example is not None and like:
-            raise DataError("give --like or --example, not both")
-        if example is None and not like:
-            raise DataError("give a record of the plant: --like FILE, or --example NAME (see optid examples)")
-        how = {"inputs": inputs, "outputs": outputs, "dt": dt, "time": time, "experiment": experiment,
-               "columns": columns, "delimiter": delimiter, "decimal": decimal}
-        record: Any = words.read_record(like, how) if example is None else built_in(example, seed=seed).data
+        record: Any = words.record(like, how, example, seed, asked="--like FILE")[0]
         waiting.step(f"designing a {kind}")
         pairs = None if amplitude is None else list(zip(amplitude[::2], amplitude[1::2]))
         found = designed(
@@ -137,9 +113,4 @@ def design(
         )
         if output is not None:
             found.save(output)
-    say(str(found))
-    for sentence in heard:
-        if sentence not in str(found):
-            note(sentence)
-    if output is not None:
-        say(f"excitation written to {output}")
+    conclude(str(found), heard, excitation=output)

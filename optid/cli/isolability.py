@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from optid.cli.options import MODEL, RESULT
-from optid.cli.terminal import Waiting, coloured, hearing, note, say
+from optid.cli.options import MODEL, Picture
+from optid.cli.results import conclude, save_picture
+from optid.cli.terminal import Waiting, hearing
 
 
 def isolability(
@@ -42,63 +43,35 @@ def isolability(
         int, typer.Option("--draws", rich_help_panel=MODEL, help="Simulated windows per fault.")
     ] = 1000,
     seed: Annotated[int, typer.Option("--seed", rich_help_panel=MODEL, help="Seed of the simulation.")] = 0,
-    picture: Annotated[
-        Path | None,
-        typer.Option("--picture", "-p", metavar="FILE", rich_help_panel=RESULT, help="Write the picture (PNG, PDF)."),
-    ] = None,
+    picture: Picture = None,
 ) -> None:
     """Find how large every fault must be to be noticed, and to be told from the others; no data are needed.
 
     Example: optid isolability model.json --window 100 --load pump=0.5,-0.3,0.4,0.2 --picture isolability.png
     """
     from optid.cli import arguments as words
-    from optid.errors import DataError, StructureError
+    from optid.errors import StructureError
     from optid.faults import dictionary
-    from optid.io import load as load_model
 
+    if onset != "unknown" and not onset.isdecimal():
+        raise StructureError(f"--onset {onset}: the number of a sample, or unknown, is needed")
     words.check_folders(picture)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
-        plant = load_model(model)
-        if plant.kind != "HammersteinSS":
-            raise StructureError(
-                f"{model} is a {plant.kind}: faults are judged with a state-space model that has noise covariances "
-                "(optid fit ... --formulation hammerstein_ss.asivid)."
-            )
+        plant = words.state_space_model(model)
         waiting.step("signatures")
         found = dictionary(
-            plant, kinds=words.listed(kinds) or ["bias"], process=_directions(load), state_jump=state_jump
+            plant,
+            kinds=words.listed(kinds) or ["bias"],
+            process=words.directions(load, "--load"),
+            state_jump=state_jump,
         )
         waiting.step("simulating faults")
-        if onset != "unknown" and not onset.isdigit():
-            raise StructureError(f"--onset {onset}: the number of a sample, or unknown, is needed")
         study = found.isolability(
             window, onset=onset if onset == "unknown" else int(onset), prob=prob, false_alarm=false_alarm, draws=draws,
             seed=seed,
         )
         if picture is not None:
             waiting.step("drawing")
-            try:
-                study.plot().savefig(picture, dpi=150)
-            except ValueError as error:  # an ending that matplotlib does not know
-                raise DataError(f"{picture}: {error}") from None
-    say(coloured(str(study)))
-    for sentence in heard:
-        note(sentence)
-    if picture is not None:
-        say(f"picture written to {picture}")
-
-
-def _directions(load: list[str] | None) -> dict[str, list[float]]:
-    from optid.errors import StructureError
-
-    found = {}
-    for text in load or []:
-        name, equals, numbers = text.partition("=")
-        try:
-            found[name] = [float(number) for number in numbers.split(",")]
-        except ValueError:
-            equals = ""
-        if not (name and equals):
-            raise StructureError(f"--load {text}: write NAME=E1,E2,..., one number per state")
-    return found
+            save_picture(study.plot(), picture)
+    conclude(str(study), heard, picture=picture)

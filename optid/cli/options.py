@@ -1,7 +1,10 @@
 """Options that several commands share."""
 
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +16,13 @@ Files = Annotated[
         metavar="DATA...", help="CSV, Parquet, MAT, NPZ or npy files, one experiment each.", show_default=False
     ),
 ]
+Example = Annotated[
+    str | None,
+    typer.Option(
+        "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
+    ),
+]
+Seed = Annotated[int, typer.Option("--seed", rich_help_panel=RECORD, help="Seed of the noise of an example.")]
 Inputs = Annotated[
     list[str] | None,
     typer.Option(
@@ -64,3 +74,48 @@ Report = Annotated[
     Path | None,
     typer.Option("--report", "-o", metavar="FILE", rich_help_panel=RESULT, help="Write a self-contained HTML report."),
 ]
+Picture = Annotated[
+    Path | None,
+    typer.Option("--picture", "-p", metavar="FILE", rich_help_panel=RESULT, help="Write the picture (PNG, PDF)."),
+]
+FeedbackBasis = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--feedback-basis",
+        metavar="NAME:SIZE...",
+        rich_help_panel=MODEL,
+        help="Basis of the functions of the outputs that are fed back, one or one per output.",
+    ),
+]
+
+READING: dict[str, tuple[Any, Any]] = {
+    "inputs": (Inputs, None),
+    "outputs": (Outputs, None),
+    "dt": (Dt, None),
+    "time": (Time, None),
+    "experiment": (Runs, None),
+    "columns": (Columns, None),
+    "delimiter": (Delimiter, ","),
+    "decimal": (Decimal, "."),
+}
+"""How the files of a record are read: the type of each option and its default."""
+
+
+def reads_a_record(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `READING` in place of its keyword-only parameter `how`, which gets them all.
+
+    `optid.cli.arguments.record` turns them into a record.
+    """
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    options = [inspect.Parameter(key, keyword, default=d, annotation=kind) for key, (kind, d) in READING.items()]
+    parameters = []
+    for parameter in inspect.signature(command).parameters.values():
+        parameters += options if parameter.name == "how" else [parameter]
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        command(how={key: given.pop(key) for key in READING}, **given)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run

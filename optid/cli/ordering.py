@@ -1,30 +1,20 @@
 """The command `optid order`: how many states and lags a record asks for, and why."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RECORD, RESULT, Columns, Decimal, Delimiter, Dt, Files, Inputs, Outputs, Runs, Time
-from optid.cli.terminal import Waiting, coloured, hearing, note, say
+from optid.cli.options import MODEL, Example, FeedbackBasis, Files, Picture, Seed, reads_a_record
+from optid.cli.results import conclude, save_picture
+from optid.cli.terminal import Waiting, hearing
 
 
+@reads_a_record
 def order(
     data: Files = None,
-    example: Annotated[
-        str | None,
-        typer.Option(
-            "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
-        ),
-    ] = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    dt: Dt = None,
-    time: Time = None,
-    experiment: Runs = None,
-    columns: Columns = None,
-    delimiter: Delimiter = ",",
-    decimal: Decimal = ".",
+    example: Example = None,
+    *,
+    how: dict[str, Any],
     basis: Annotated[
         list[str] | None,
         typer.Option(
@@ -35,15 +25,7 @@ def order(
             help="Basis of the nonlinearity, one or one per input, e.g. polynomial:4. [dim]linear[/]",
         ),
     ] = None,
-    feedback_basis: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--feedback-basis",
-            metavar="NAME:SIZE...",
-            rich_help_panel=MODEL,
-            help="Basis of the functions of the outputs that are fed back, one or one per output.",
-        ),
-    ] = None,
+    feedback_basis: FeedbackBasis = None,
     block_rows: Annotated[
         int | None,
         typer.Option(
@@ -65,29 +47,20 @@ def order(
             "--level", rich_help_panel=MODEL, help="Probability of rejecting the true order. [dim]at most 0.01[/]"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=RECORD, help="Seed of the noise of an example.")] = 0,
-    picture: Annotated[
-        Path | None,
-        typer.Option("--picture", "-p", metavar="FILE", rich_help_panel=RESULT, help="Write the picture (PNG, PDF)."),
-    ] = None,
+    seed: Seed = 0,
+    picture: Picture = None,
 ) -> None:
     """Find the order of a record: singular values, thresholds, criteria, a recommendation with its reasons.
 
     Example: optid order data.csv --inputs u1 u2 --outputs y1 y2 --picture order.png
     """
     from optid.cli import arguments as words
-    from optid.errors import DataError
-    from optid.examples import example as built_in
     from optid.model_order import order as study
 
     words.check_folders(picture)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
-        if example is not None and data:
-            raise DataError("give data files or --example, not both")
-        how = {"inputs": inputs, "outputs": outputs, "dt": dt, "time": time, "experiment": experiment,
-               "columns": columns, "delimiter": delimiter, "decimal": decimal}
-        record: Any = words.read_record(data, how) if example is None else built_in(example, seed=seed).data
+        record: Any = words.record(data, how, example, seed)[0]
         waiting.step("comparing orders")
         found = study(
             record,
@@ -103,15 +76,5 @@ def order(
         )
         if picture is not None:
             waiting.step("drawing")
-            try:
-                found.picture().savefig(picture, dpi=150)
-            except ValueError as error:  # an ending that matplotlib does not know
-                raise DataError(f"{picture}: {error}") from None
-    text = str(found)
-    say(coloured(text))
-    said = " ".join(text.split())
-    for sentence in heard:
-        if " ".join(sentence.split()) not in said:
-            note(sentence)
-    if picture is not None:
-        say(f"picture written to {picture}")
+            save_picture(found.picture(), picture)
+    conclude(str(found), heard, picture=picture)
