@@ -5,14 +5,18 @@ Parquet the way common tools write their numbers (float64; Snappy is the default
 1.6 GB each), and as the file that is cheapest to read (float32, no dictionary). Every measurement runs in a process of
 its own, with the file on the disk and in the page cache, pinned to one core and with a thread for every core. Just
 reading is measured in the same way: the same columns in chunks of float64, checked, and as the library of the format
-hands them out. CPU time counts all threads, and is the figure to trust on a machine that others use too.
+hands them out. The three take turns, the median of the rounds is printed, and before every measurement from the disk
+the system is asked whether a page of the file is still in its cache (a virtual machine cannot ask its host). CPU time
+counts all threads, and is the figure to trust on a machine that others use too.
 
 The goals: at least 15 million samples/s on one core from cached npy, less than 500 MB resident, and statistics from
 Parquet on disk in at most twice the time of just reading it.
 """
 
 import argparse
+import ctypes
 import json
+import mmap
 import os
 import resource
 import shutil
@@ -95,8 +99,8 @@ def read_stored(path: Path) -> int:
     return samples
 
 
-def measure(path: Path, work: str, threads: int, repeats: int, cells: int, lags: int) -> dict[str, float]:
-    """Read the record, or take its statistics, in this process; the shortest of some repetitions."""
+def measure(path: Path, work: str, threads: int, cells: int, lags: int) -> dict[str, float]:
+    """Read the record, or take its statistics, in this process."""
     if threads == 1:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import optid
@@ -108,38 +112,60 @@ def measure(path: Path, work: str, threads: int, repeats: int, cells: int, lags:
     layout = Layout(na=NA, nb=(lags,), nk=(0,), bases=(basis,), outputs=stream.outputs, inputs=stream.inputs)
     rng = np.random.default_rng(0)
     collect(optid.Data(u=rng.uniform(-1, 1, 50_000), y=rng.standard_normal(50_000)), layout)  # compiles
-    wall, cpu, error = [], [], float("nan")
-    for _ in range(repeats):
-        start = time.perf_counter(), time.process_time()
-        if work == "stored":
-            read_stored(path)
-        elif work == "stream":
-            for _chunk in stream:
-                pass
-        else:
-            root, n = collect(stream, layout, threads=threads).root, layout.n_columns
-            error = float(np.max(np.abs(np.linalg.solve(root[:n, :n], root[:n, n])[:NA] - [-1.5, 0.7])))
-        wall.append(time.perf_counter() - start[0])
-        cpu.append(time.process_time() - start[1])
-    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    return {"seconds": min(wall), "cpu": min(cpu), "MB": resident, "error": error}
+    start, error = (time.perf_counter(), time.process_time()), float("nan")
+    if work == "stored":
+        read_stored(path)
+    elif work == "stream":
+        for _chunk in stream:
+            pass
+    else:
+        root, n = collect(stream, layout, threads=threads).root, layout.n_columns
+        error = float(np.max(np.abs(np.linalg.solve(root[:n, :n], root[:n, n])[:NA] - [-1.5, 0.7])))
+    taken = {"seconds": time.perf_counter() - start[0], "cpu": time.process_time() - start[1]}
+    return taken | {"MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, "error": error}
+
+
+def resident(path: Path) -> float:
+    """Return the share of the file's pages that the system holds in memory, as mincore tells it."""
+    with open(path, "r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
+        pages = (ctypes.c_ubyte * -(-len(mapped) // mmap.PAGESIZE))()
+        first = ctypes.c_char.from_buffer(mapped)
+        try:
+            system = ctypes.CDLL(None, use_errno=True)
+            if system.mincore(ctypes.c_void_p(ctypes.addressof(first)), ctypes.c_size_t(len(mapped)), pages):
+                raise OSError(ctypes.get_errno(), "mincore failed")
+        finally:
+            del first
+    return float(np.mean(np.frombuffer(pages, np.uint8) & 1))
+
+
+def place_file(path: Path, place: str) -> None:
+    """Bring the file into the page cache or out of it."""
+    with open(path, "rb") as file:
+        os.fsync(file)
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        while place == "cache" and file.read(1 << 24):
+            pass
+    share = resident(path)
+    if share != (place == "cache"):
+        sys.exit(f"{share:.1%} of {path} is in the page cache: nothing can be said of reading it from the {place}.")
 
 
 def compare(path: Path, form: str, place: str, threads: int, arguments: argparse.Namespace) -> None:
     """Print how long the statistics take, and how long just reading takes."""
-    found = {}
-    for work in ("stored", "stream", "statistics"):
-        with open(path, "rb") as file:
-            os.fsync(file)
-            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-            while place == "cache" and file.read(1 << 24):
-                pass
-        repeats = arguments.repeats if place == "cache" else 1
-        sizes = ["--cells", str(arguments.cells), "--lags", str(arguments.lags), "--repeats", str(repeats)]
-        command = [sys.executable, __file__, *sizes, "--measure", str(path), work, str(threads)]
-        limits = LIBRARIES | {"OMP_NUM_THREADS": str(threads)}  # the latter also counts for pyarrow
-        run = subprocess.run(command, env=os.environ | limits, check=True, stdout=subprocess.PIPE, text=True)
-        found[work] = json.loads(run.stdout)
+    works = ("stored", "stream", "statistics")
+    limits = LIBRARIES | {"OMP_NUM_THREADS": str(threads)}  # the latter also counts for pyarrow
+    sizes = ["--cells", str(arguments.cells), "--lags", str(arguments.lags)]
+    rounds: dict[str, list[dict[str, float]]] = {work: [] for work in works}
+    for _ in range(arguments.rounds):
+        for work in works:
+            place_file(path, place)
+            command = [sys.executable, __file__, *sizes, "--measure", str(path), work, str(threads)]
+            run = subprocess.run(command, env=os.environ | limits, check=True, stdout=subprocess.PIPE, text=True)
+            rounds[work].append(json.loads(run.stdout))
+    found = {
+        work: {key: float(np.median([one[key] for one in runs])) for key in runs[0]} for work, runs in rounds.items()
+    }
     passed, scale = found["statistics"], 1e9 / arguments.samples
     print(
         f"{form:15} {place:5} {threads} thread{'s' if threads > 1 else ' '} "
@@ -148,8 +174,12 @@ def compare(path: Path, form: str, place: str, threads: int, arguments: argparse
     )
     for work, words in (("statistics", "statistics"), ("stream", "just reading chunks"), ("stored", "as stored")):
         wall, cpu = (scale * found[work][clock] for clock in ("seconds", "cpu"))
-        ratio = f", ratio {passed['seconds'] / found[work]['seconds']:.1f}" if work != "statistics" else ""
-        print(f"    {words:20} {wall:6.1f} ns a sample, {cpu:6.1f} ns of CPU{ratio}", flush=True)
+        ratios = [one["seconds"] / other["seconds"] for one, other in zip(rounds["statistics"], rounds[work])]
+        spread = f", ratio {np.median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})"
+        print(
+            f"    {words:20} {wall:6.1f} ns a sample, {cpu:6.1f} ns of CPU{spread if work != 'statistics' else ''}",
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -159,13 +189,13 @@ def main() -> None:
     parser.add_argument("--lags", type=int, default=10)
     parser.add_argument("--forms", nargs="+", choices=FORMS, default=list(FORMS))
     parser.add_argument("--folder", type=Path, help="where the temporary folder is made")
-    parser.add_argument("--repeats", type=int, default=3, help="passes over a cached file; the fastest counts")
+    parser.add_argument("--places", nargs="+", choices=("disk", "cache"), default=["disk", "cache"])
+    parser.add_argument("--rounds", type=int, default=5, help="measurements of each kind, taken in turns")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.measure:
         path, work, threads = arguments.measure
-        sizes = arguments.repeats, arguments.cells, arguments.lags
-        print(json.dumps(measure(Path(path), work, int(threads), *sizes)))
+        print(json.dumps(measure(Path(path), work, int(threads), arguments.cells, arguments.lags)))
         return
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         needed = 20 * arguments.samples
@@ -175,7 +205,7 @@ def main() -> None:
         print(f"{arguments.samples:,} samples, {sizes}, one core", flush=True)
         for form in arguments.forms:
             path = write(Path(folder), arguments.samples, form)
-            for place in ("disk", "cache"):
+            for place in arguments.places:
                 for threads in sorted({1, len(os.sched_getaffinity(0))}):
                     compare(path, form, place, threads, arguments)
             path.unlink()
