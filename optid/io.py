@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -29,13 +30,7 @@ def save(model: Any, path: str | Path) -> Path:
     Returns:
         The path.
     """
-    path = Path(path)
-    text = json.dumps({"format": FORMAT, "version": VERSION, **to_dict(model)}, indent=1, allow_nan=False)
-    # a file that is complete or not there: an interrupted write must not leave half a model
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, path)
-    return path
+    return write(to_dict(model), path, FORMAT, VERSION)
 
 
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
@@ -50,38 +45,69 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
         ModelFileError: the file is truncated, of another version, or not a model.
         StructureError: functions that the model needs are not supplied.
     """
+    return read(path, FORMAT, VERSION, lambda content: from_content(content, functions))
+
+
+def write(content: dict[str, Any], path: str | Path, form: str, version: int) -> Path:
+    """Write JSON types to a file that says of what form and version it is, and is complete or not there.
+
+    Args:
+        content: what to write.
+        path: the file, replaced when it exists.
+        form: "optid " and what it is.
+        version: of that form.
+    """
     path = Path(path)
+    text = json.dumps({"format": form, "version": version, **content}, indent=1, allow_nan=False)
+    # an interrupted write must not leave half a file
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_text(text, encoding="utf-8")
+    os.replace(unfinished, path)
+    return path
+
+
+def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
+    """Read a file written by `write`.
+
+    Args:
+        path: the file.
+        form: what it has to be.
+        version: the version that is read.
+        build: makes the object of the content.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ModelFileError: the file is truncated, damaged, of another version, or of another form.
+    """
+    path, what = Path(path), form.removeprefix("optid ")
+    remedy = f"Use a file written by {what}.save(...)."
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise ModelFileError(
-            f"{path} is not a model: it is not text. Use a file written by model.save(...)."
-        ) from error
+        raise ModelFileError(f"{path} is not a {what}: it is not text. {remedy}") from error
     if not text.strip():
-        raise ModelFileError(f"{path} is empty. Save the model again.")
+        raise ModelFileError(f"{path} is empty. Save the {what} again.")
     try:
         content = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
-        if text.lstrip()[0] == "{" and f'"{FORMAT}"' in text:
-            raise ModelFileError(f"{path} is truncated or damaged ({error}). Save the model again.") from error
+        if text.lstrip()[0] == "{" and f'"{form}"' in text:
+            raise ModelFileError(f"{path} is truncated or damaged ({error}). Save the {what} again.") from error
+        raise ModelFileError(f"{path} is not a {what}: it is not JSON. {remedy}") from error
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ModelFileError(f"{path} is JSON but not a {what}. {remedy}")
+    if content.get("version") != version:
         raise ModelFileError(
-            f"{path} is not a model: it is not JSON. Use a file written by model.save(...)."
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ModelFileError(f"{path} is JSON but not a model. Use a file written by model.save(...).")
-    if content.get("version") != VERSION:
-        raise ModelFileError(
-            f"{path} is of version {content.get('version')!r}; this release reads version {VERSION}. "
+            f"{path} is of version {content.get('version')!r}; this release reads version {version}. "
             "Load it with the release that wrote it and save it again, or install that release."
         )
     try:
-        return from_content(content, functions)
+        return build(content)
     except KeyError as error:
-        raise ModelFileError(f"{path} lacks {error}: it is damaged. Save the model again.") from error
+        raise ModelFileError(f"{path} lacks {error}: it is damaged. Save the {what} again.") from error
     except (TypeError, ValueError, AttributeError, LookupFailed) as error:
         if isinstance(error, StructureError) and "functions=" in str(error):
             raise
-        raise ModelFileError(f"{path} is damaged: {error} Save the model again.") from error
+        raise ModelFileError(f"{path} is damaged: {error} Save the {what} again.") from error
 
 
 def to_dict(model: Any) -> dict[str, Any]:
