@@ -1,0 +1,205 @@
+"""A diagnosis in words."""
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from optid.faults.answers import Answer, Diagnosis, Estimate
+
+WIDTH = 80
+
+KINDS = {
+    "bias": "offset", "drift": "drift", "jump": "jump", "loss": "loss", "stuck": "stuck", "frozen": "frozen",
+    "noise": "added noise", "spike": "outlier",
+}
+"""The kinds of the dictionary in words."""
+
+
+def estimate_line(fault: "Estimate") -> str:
+    """Say in one or more lines what a fault is, since when and how large."""
+    return "\n".join([fault.label, *("  " + line for line in (onset_words(fault), *size_words(fault)))])
+
+
+def onset_words(fault: "Estimate") -> str:
+    """Say when it began."""
+    low, high = fault.onset_interval
+    if fault.onset_censored:
+        return f"onset at or before sample {high}" if low == 0 else f"onset at or after sample {low}"
+    return f"onset at sample {fault.onset}" + (f" ({low} to {high})" if low < high else "")
+
+
+def size_words(fault: "Estimate") -> list[str]:
+    """Say how large each magnitude is, with its interval."""
+    lines = []
+    for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
+        if word == "share lost":
+            value, low, high = (float(np.clip(number, 0.0, 1.0)) for number in (value, low, high))
+        interval = f"{low:.3g} to {high:.3g}"
+        if not np.isfinite([low, high]).all():
+            lines.append(f"{word} unknown")
+        elif np.isfinite(value):
+            lines.append(f"{word} {value:.3g} ({interval})")
+        else:
+            lines.append(f"{word} between {low:.3g} and {high:.3g}")
+    return lines
+
+
+def magnitude_names(fault: "Estimate") -> list[str]:
+    """Return what the entries of the size are."""
+    d = len(fault.size)
+    if fault.kind in ("loss", "stuck"):
+        constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
+        return ["share lost", *constants]
+    word = {"drift": "slope", "jump": "jump", "noise": "standard deviation"}.get(fault.kind, "size")
+    if d == 1:
+        return [word]
+    part = "state" if fault.name.startswith(("state", "process")) else "part"
+    return [f"{word} of {part} {i}" for i in range(1, d + 1)]
+
+
+def printed(found: "Diagnosis") -> str:
+    """Print a diagnosis in 80 columns."""
+    lines = [f"{found.verdict}: {headline(found)}"]
+    lines.append(
+        f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {_probability(found.p_value)}, "
+        f"method {found.method}"
+    )
+    for answer in found.candidates:
+        lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}" + "  <- best" * (answer is found.best)]
+        lines += [f"  {line}" for line in str(answer).splitlines()]
+    if found.detected:
+        lines += ["", certificate_words(found)]
+    if found.remaining is not None:
+        lines += [remaining_words(found)]
+    lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
+    lines += [found.status] * bool(found.status)
+    return "\n".join(wrapped(lines))
+
+
+def wrapped(lines: list[str]) -> list[str]:
+    """Break lines that are too wide, keeping their indent."""
+    result: list[str] = []
+    for line in lines:
+        indent = " " * (len(line) - len(line.lstrip()) + 2)
+        result += textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
+    return result
+
+
+def headline(found: "Diagnosis") -> str:
+    """Say the outcome in one clause."""
+    if found.verdict == "healthy":
+        return "no alarm"
+    if found.verdict == "untestable":
+        return "the input excites nothing that is suspected"
+    if found.verdict == "not isolable":
+        return "something is wrong, and one output cannot tell what"
+    if found.verdict == "unknown":
+        return "something is wrong, and it is none of the candidates"
+    if found.best is None:
+        return f"one of {len(found.candidates)} answers, none of them proved the best"
+    if found.unique:
+        return found.best.label
+    return f"one of {len(found.candidates)} answers, most probably {found.best.label}"
+
+
+def certificate_words(found: "Diagnosis") -> str:
+    """Say what the answer rests on."""
+    proof = found.certificate
+    if proof.kind == "exhaustive":
+        words = f"proof: every candidate and onset was tried; explains {proof.value:.1f} beyond its threshold"
+        return words + (
+            f", {proof.runner_up_margin:.1f} more than the next" if np.isfinite(proof.runner_up_margin) else ""
+        )
+    if proof.kind == "duality gap":
+        return f"proof: duality gap {proof.value:.1e}"
+    if proof.kind == "infeasible healthy":
+        return (
+            f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
+            "wide; the parity vector is kept"
+        )
+    return "no proof"
+
+
+def remaining_words(found: "Diagnosis") -> str:
+    """Say what is left unexplained."""
+    rest = found.remaining
+    assert rest is not None
+    words = (
+        f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings, p-value "
+        f"{_probability(rest.p_value)}"
+    )
+    if found.verdict != "unknown":
+        return words
+    return f"{words} ({rest.test}); {course_words(found)}"
+
+
+def course_words(found: "Diagnosis") -> str:
+    """Say in which direction the rest lies and how fast it changes."""
+    rest = found.remaining
+    assert rest is not None
+    names = found.outputs or tuple(f"y{i + 1}" for i in range(len(rest.direction)))
+    direction = ", ".join(f"{name} {part:+.2f}" for name, part in zip(names, rest.direction))
+    if rest.frequency <= 1 / max(found.window, 1):
+        speed = "slow or constant"
+    else:
+        speed = f"strongest at {rest.frequency:.3g} cycles per sample (period {1 / rest.frequency:.3g} samples)"
+    return f"direction {direction}; {speed}, {100 * rest.share:.0f} % of its energy there"
+
+
+def explained(found: "Diagnosis") -> str:
+    """Say in three sentences what was found, how sure that is, and what it rests on."""
+    if found.verdict == "healthy":
+        sentences = [
+            f"The record of {found.window} samples is what the healthy {found.model} predicts.",
+            f"A healthy plant gives an alarm at least as near with probability {_probability(found.p_value)}; below "
+            f"{found.false_alarm:g} it would count.",
+        ]
+    elif found.verdict == "untestable":
+        sentences = [f"Nothing can be said about {_list(list(found.untestable))}: the input does not excite it."]
+    elif found.verdict in ("unknown", "not isolable"):
+        sentences = [
+            f"The record departs from the healthy {found.model} (p-value {_probability(found.p_value)}), but "
+            + ("no fault of the dictionary fits it." if found.verdict == "unknown" else
+               "with one output any fault of an arbitrary course explains it."),
+        ]
+        if found.remaining is not None:
+            rest = course_words(found)
+            sentences.append(rest[0].upper() + rest[1:] + ".")
+    else:
+        sentences = _faulty(found)
+    if found.untestable and found.verdict != "untestable":
+        sentences.append(f"This record cannot judge {_list(list(found.untestable))}.")
+    if found.status:
+        sentences.append(found.status)
+    return " ".join(sentences)
+
+
+def _faulty(found: "Diagnosis") -> list[str]:
+    answers = found.candidates
+    best = answers[0]
+    names = _list([_phrase(answer) for answer in answers], "or")
+    first = f"The record is not healthy (p-value {_probability(found.p_value)}): {names}."
+    if len(answers) == 1:
+        sure = f"It is the only one left of the candidates at {100 * found.coverage:g} %"
+        second = f"{sure} (probability {best.posterior:.3f})."
+    else:
+        shares = ", ".join(f"{answer.label} {answer.posterior:.2f}" for answer in answers)
+        second = f"The record cannot choose between them at {100 * found.coverage:g} %: {shares}."
+    proof = certificate_words(found)
+    return [first, second, proof[0].upper() + proof[1:] + "."]
+
+
+def _phrase(answer: "Answer") -> str:
+    return " and ".join(
+        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in answer.faults
+    )
+
+
+def _list(words: list[str], joint: str = "and") -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def _probability(value: float) -> str:
+    return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"
