@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from formulations.equation_error import per_channel
-from formulations.hammerstein_arx import GAUGES
+from formulations.gauges import check_gauge
 from formulations.noise_models import (
     PredictionErrors,
     extended_least_squares,
@@ -82,8 +82,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int,
         StructureError: impossible orders, unknown gauge, several outputs.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    check_gauge(gauge)
     return _posed("hammerstein_armax.exact", data, basis, True, gauge, na, nb, nc, nk, constraints, offset, starts,
                   seed)
 

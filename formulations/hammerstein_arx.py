@@ -21,6 +21,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.equation_error import EquationError, compress, residual_programme
+from formulations.gauges import check_gauge, scale_fixed
 from formulations.losses import with_loss
 from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
@@ -35,8 +36,6 @@ from optid.rank_one.bilinear import starts
 from optid.rank_one.whitening import leading_pair
 from optid.solving import Procedure
 from optid.streams import Stream
-
-GAUGES = ("norm", "gain", "b0")
 
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -63,8 +62,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         StructureError: impossible orders, unknown gauge, constraints that do not fit.
         RankError: the record does not determine the parameters.
     """
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    check_gauge(gauge)
     options = {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature}
 
     def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
@@ -87,7 +85,7 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         mu = cp.Variable(problem.layout.bases[c].size, name=names[0])
         b = cp.Variable(problem.b_shape(c), name=names[1])
         theta = cp.outer(mu, cp.vec(b, order="F") if b.ndim == 2 else b)
-        gauges.append(_gauge(gauge, b, linear.get("a"), problem))
+        gauges.append(scale_fixed(gauge, b, linear.get("a")))
         blocks.append(names)
         thetas.append(theta)
         variables[names[0]], variables[names[1]] = mu, b
@@ -128,16 +126,6 @@ def _signed_start(program: Program, blocks: Sequence[tuple[str, str]]) -> dict[s
         if sizes[1] < sizes[0]:
             start = turned
     return start
-
-
-def _gauge(gauge: str, b: cp.Variable, a: cp.Variable | None, problem: EquationError) -> Any:
-    if gauge == "norm":
-        return cp.sum_squares(b) == 1
-    if gauge == "b0":
-        return (b[0] if b.ndim == 1 else b[0, 0]) == 1
-    if problem.outputs > 1:
-        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
-    return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
 
 
 def _in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, channel: str
@@ -208,8 +196,7 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
 
 def _relaxed(name: str, data: Data | Stream, constraints: Sequence[Any], loss: str, gauge: str, weight: float,
              svd: str, options: dict[str, Any]) -> Program | Procedure:
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    check_gauge(gauge)
     if not weight >= 0:
         raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
 

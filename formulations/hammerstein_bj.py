@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from formulations.hammerstein_arx import GAUGES
-from formulations.hammerstein_oe import OutputError, search
+from formulations.gauges import check_gauge
+from formulations.hammerstein_oe import search
 from formulations.noise_models import (
     PredictionErrors,
     arma,
@@ -30,6 +30,7 @@ from formulations.noise_models import (
     procedure,
     whole_number,
 )
+from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import stable_poles, with_poles
 from optid.bases import Linear
@@ -94,8 +95,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    check_gauge(gauge)
     record, layout = plant_record(one_output(data), na, nb, nk, basis)
     check_excited(record, layout)
     return _posed("hammerstein_bj.exact", record, layout, True, gauge, nc, nd, constraints, offset, starts, seed)
@@ -139,4 +139,4 @@ def _armax_plant(criterion: PredictionErrors, plain: OutputError) -> Array | Non
         return None
     x = unknowns.plant.pack(alike.unpack(x).plant)
     at = unknowns.plant.slices["a"]
-    return with_poles(plain, unknowns.plant, plain.normalised(x), stable_poles(x[at]), "ARMAX").x
+    return with_poles(plain, plain.normalised(x), stable_poles(x[at]), "ARMAX").x

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from formulations.equation_error import compress
-from formulations.hammerstein_oe import STABLE, OutputError, Posing
+from formulations.output_error import STABLE, OutputError
+from formulations.output_error_programme import Posing
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
 from optid.data import Data

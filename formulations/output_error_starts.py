@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 
 from formulations.equation_error import compress
+from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
 from optid.data import Data
 from optid.errors import DataWarning, OptidError
@@ -71,7 +72,7 @@ def subspace(data: Data, unknowns: Unknowns) -> Array | None:
     return stable_poles(a) if a.size == layout.na and np.all(np.isfinite(a)) else None
 
 
-def blank(data: Data, unknowns: Unknowns) -> Array:
+def blank(unknowns: Unknowns) -> Array:
     """Return a start without any estimate: real poles, identity-like nonlinearities."""
     layout = unknowns.layout
     mus = []
@@ -96,16 +97,16 @@ def stable_poles(a: Array, radius: float = RADIUS) -> Array:
     return np.real(np.poly(np.where(size > radius, roots * radius / np.maximum(size, 1e-300), roots)))[1:]
 
 
-def with_poles(criterion, unknowns: Unknowns, x: Array, a: Array, start: str) -> Descent:
+def with_poles(criterion: OutputError, x: Array, a: Array, start: str) -> Descent:
     """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
-    moved = x.copy()
+    unknowns, moved = criterion.unknowns, x.copy()
     moved[unknowns.slices["a"]] = a
     held = np.zeros(unknowns.shared, dtype=bool)
     held[unknowns.slices["a"]] = True
     return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3, start=start)
 
 
-def iterated(criterion, data: Data, unknowns: Unknowns, x: Array, method: str) -> Descent | None:
+def iterated(criterion: OutputError, x: Array, method: str) -> Descent | None:
     """Return the best point on the way of Steiglitz-McBride ("sm") or of the refined instrumental variable ("iv").
 
     Both linearise as Gauss-Newton does in everything but a, whose columns hold the measured output: as regressors in
@@ -114,15 +115,14 @@ def iterated(criterion, data: Data, unknowns: Unknowns, x: Array, method: str) -
 
     Args:
         criterion: the errors.
-        data: the record.
-        unknowns: their order.
         x: an admissible start.
         method: "sm" or "iv".
     """
+    unknowns = criterion.unknowns
     p, na = unknowns.shared, unknowns.layout.na
     at, best = unknowns.slices["a"], None
     for _ in range(PASSES if na else 0):
-        gram = instruments(data, unknowns, unknowns.unpack(x), functions=criterion.functions)
+        gram = instruments(criterion.data, unknowns, unknowns.unpack(x), functions=criterion.functions)
         regressors = np.arange(p)
         regressors[at] = p + np.arange(na)
         tested = regressors if method == "sm" else np.arange(p)
@@ -135,7 +135,7 @@ def iterated(criterion, data: Data, unknowns: Unknowns, x: Array, method: str) -
         x[:p] += step
         if not np.all(np.isfinite(x)):
             break
-        found = with_poles(criterion, unknowns, x, stable_poles(x[at], 0.9999), method)
+        found = with_poles(criterion, x, stable_poles(x[at], 0.9999), method)
         settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
         best = found if best is None or found.value < best.value else best
         if settled:

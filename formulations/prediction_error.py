@@ -10,6 +10,7 @@ optimal" means here.
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,7 +71,7 @@ class Criterion(Protocol):
         """Their name: "simulation errors" or "prediction errors"."""
         ...
 
-    @property
+    @cached_property
     def energy(self) -> float:
         """Sum of squares of the record about its mean."""
         ...

@@ -26,9 +26,9 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.equation_error import model_meta
-from formulations.hammerstein_arx import GAUGES
-from formulations.hammerstein_oe import OutputError
+from formulations.gauges import check_gauge, scale_fixed
 from formulations.noise_models import one_output
+from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import blank, equation_error, iterated, stable_poles, with_poles
 from optid.bases.basis import Basis
@@ -72,8 +72,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+    check_gauge(gauge)
     record, layout = plant_record(one_output(data), na, nb, nk, basis)
     if record.n_samples > LIMIT:
         raise StructureError(
@@ -121,7 +120,8 @@ class _Shooting:
             residuals.append(self.variables[f"residual{label}"])
         if layout.na:
             structural["stability"] = self._stable()
-        structural["gauge"] = tuple(self._gauge(c) for c in range(layout.m))
+        structural["gauge"] = tuple(scale_fixed(gauge, self.variables[self.key("b", c)], self.variables.get("a"))
+                                    for c in range(layout.m))
         start = self._start()
         reference = {name: start[name] for name in ("a", "offset") if name in start}
         view = View(expressions, kind="exact", channels=layout.inputs, bases=dict(zip(layout.inputs, layout.bases)),
@@ -178,21 +178,13 @@ class _Shooting:
             below = level
         return tuple(constraints)
 
-    def _gauge(self, c: int) -> Any:
-        b, gauge = self.variables[self.key("b", c)], self.criterion.gauge
-        if gauge == "norm":
-            return cp.sum_squares(b) == 1
-        if gauge == "b0":
-            return b[0] == 1
-        return cp.sum(b) == 1 + (cp.sum(self.variables["a"]) if "a" in self.variables else 0)
-
     def _start(self) -> dict[str, Array]:
         """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
         criterion, unknowns = self.criterion, self.criterion.unknowns
         first = equation_error(self.data, unknowns)
-        first = criterion.normalised(blank(self.data, unknowns) if first is None else first)
-        found = [with_poles(criterion, unknowns, first, stable_poles(first[unknowns.slices["a"]]), "ARX")]
-        others = [iterated(criterion, self.data, unknowns, found[0].x, method) for method in ("sm", "iv")]
+        first = criterion.normalised(blank(unknowns) if first is None else first)
+        found = [with_poles(criterion, first, stable_poles(first[unknowns.slices["a"]]), "ARX")]
+        others = [iterated(criterion, found[0].x, method) for method in ("sm", "iv")]
         best = min([*found, *(one for one in others if one is not None)], key=lambda one: one.value)
         point = unknowns.unpack(criterion.normalised(best.x))
         start = {"a": point.a, "offset": np.array([point.offset])}

@@ -51,13 +51,9 @@ class StateError:
         """What they are called."""
         return "prediction errors" if self.unknowns.innovations else "simulation errors"
 
-    @property
+    @cached_property
     def energy(self) -> float:
         """Weighted sum of squares of the outputs about their means."""
-        return self._energy
-
-    @cached_property
-    def _energy(self) -> float:
         y = np.vstack([e.y for e in self.data.experiments])
         y = np.nan_to_num(y - np.nanmean(y, axis=0))
         return float(np.sum((y @ self.weight) * y))

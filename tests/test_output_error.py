@@ -10,12 +10,13 @@ from systems import by_hand, nonlinearity, siso
 
 import optid
 from formulations import hammerstein_oe, shape
+from formulations.output_error import OutputError
 from formulations.output_error_records import plant_layout
 from formulations.output_error_starts import stable_poles
 from formulations.prediction_error import descend
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinARX, Nonlinearity, noise_filter
 from optid.regressors.sensitivities import PlantPoint, Unknowns, simulate
 from optid.solution import Status
 
@@ -106,7 +107,7 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     data = record(true, count=250, noise=0.3, seed=seed)
     layout = plant_layout(data, 3, 3, seed % 2, (BASIS,))
     unknowns = Unknowns(layout, 1, (True,))
-    criterion = hammerstein_oe.OutputError(data, unknowns, "norm")
+    criterion = OutputError(data, unknowns, "norm")
     start = criterion.normalised(unknowns.pack(PlantPoint(
         stable_poles(a + 0.05 * rng.normal(size=3)), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
         (true.b[0] + 0.1 * rng.normal(size=3),), 0.0, np.zeros((1, unknowns.memory)))))
@@ -265,7 +266,7 @@ def test_every_point_of_a_descent_is_stable():
 
     class Watched(hammerstein_oe.OutputError):
         def linearise(self, x):
-            assert hammerstein_oe.largest_pole(x[self.unknowns.slices["a"]]) < 1
+            assert noise_filter.radius(x[self.unknowns.slices["a"]]) < 1
             return super().linearise(x)
 
     hammerstein_oe.search(Watched(data, unknowns, "norm"), 8, 0)
@@ -419,7 +420,7 @@ def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
     # no model with its poles inside the same circle, nearby, has smaller errors by more than the boundary's curvature
     plant = fit.model.plant
     unknowns = Unknowns(plant_layout(record, 3, 2, 0, (plant.f.basis,)), 1, (True,))
-    criterion = hammerstein_oe.OutputError(record, unknowns, "norm")
+    criterion = OutputError(record, unknowns, "norm")
     at_rest = np.zeros((1, unknowns.memory))
     x = unknowns.pack(PlantPoint(plant.a, (plant.f.mu,), plant.b, float(plant.offset[0]), at_rest))
     rng = np.random.default_rng(0)
