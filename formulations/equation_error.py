@@ -12,6 +12,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from formulations.arguments import per_channel, whole_number
 from optid.bases import fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
@@ -191,10 +192,9 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     inputs, outputs = data.inputs, data.outputs
     nbs = per_channel("nb", nb, inputs, low=1)
     nks = per_channel("nk", nk, inputs, low=0)
-    if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
-        raise StructureError(f"na is the number of past outputs, a whole number from 0; got {na!r}")
+    order = whole_number("na", na, 0, "the number of past outputs")
     bases = fitted_bases(data, basis)
-    layout = Layout(na=int(na), nb=nbs, nk=nks, bases=bases, outputs=tuple(outputs), inputs=tuple(inputs))
+    layout = Layout(na=order, nb=nbs, nk=nks, bases=bases, outputs=tuple(outputs), inputs=tuple(inputs))
     if ridge < 0 or curvature < 0:
         raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
     statistics = collect(data, layout, weights=weights)
@@ -206,17 +206,6 @@ def model_meta(data: Data | Stream) -> dict[str, Any]:
     return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
             "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
             "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
-
-
-def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
-    """Expand a scalar to one whole number per input and check it."""
-    values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
-    if len(values) != len(inputs):
-        raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
-    for channel, entry in zip(inputs, values):
-        if isinstance(entry, bool) or not isinstance(entry, int | np.integer) or entry < low:
-            raise StructureError(f"{name} of input {channel!r} must be a whole number from {low}; got {entry!r}")
-    return tuple(int(v) for v in values)
 
 
 def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> RankOne:

@@ -17,20 +17,12 @@ allow, C gets a small bias when gaps are many, a few hundredths with a third of 
 from collections.abc import Sequence
 from typing import Any
 
-from formulations.equation_error import per_channel
+from formulations.arguments import one_output, per_channel, whole_number
 from formulations.gauges import check_gauge
-from formulations.noise_models import (
-    PredictionErrors,
-    extended_least_squares,
-    one_output,
-    other_zeros,
-    procedure,
-    whole_number,
-)
+from formulations.noise_models import PredictionErrors, extended_least_squares, other_zeros, procedure
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import StructureError
 from optid.regressors import Layout
 from optid.regressors.noise_sensitivities import NoiseUnknowns
 from optid.regressors.sensitivities import Unknowns
@@ -89,14 +81,13 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int,
 
 def _posed(name: str, data: Data, basis: Any, free: bool, gauge: str, na: int, nb: Any, nc: int, nk: Any,
            constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
-    record = one_output(data)
+    record = one_output(data, "prediction errors")
     inputs = record.inputs
     layout = Layout(whole_number("na", na), per_channel("nb", nb, inputs, low=1), per_channel("nk", nk, inputs, low=0),
                     fitted_bases(record, basis), record.outputs, inputs)
-    if whole_number("starts", starts) < 1:
-        raise StructureError("starts is the number of starts, a whole number from 1; got 0")
+    count = whole_number("starts", starts, 1, "the number of starts")
     plant = Unknowns(layout, record.n_experiments, (free,) * layout.m, bool(offset))
     unknowns = NoiseUnknowns(plant, whole_number("nc", nc))
     criterion = PredictionErrors(record, unknowns, "norm" if free else "none")
-    found = other_zeros(extended_least_squares(criterion), unknowns, starts, seed)
+    found = other_zeros(extended_least_squares(criterion), unknowns, count, seed)
     return procedure(name, criterion, found, constraints, gauge)

@@ -19,16 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from formulations.arguments import one_output, whole_number
 from formulations.gauges import check_gauge
 from formulations.hammerstein_oe import search
 from formulations.noise_models import (
     PredictionErrors,
     arma,
     extended_least_squares,
-    one_output,
     other_zeros,
     procedure,
-    whole_number,
 )
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
@@ -36,7 +35,7 @@ from formulations.output_error_starts import stable_poles, with_poles
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import OptidError, StructureError
+from optid.errors import OptidError
 from optid.regressors import Layout
 from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns
 from optid.regressors.sensitivities import Unknowns, simulate
@@ -66,7 +65,7 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns.
     """
-    record, layout = plant_record(one_output(data), na, nb, nk, Linear())
+    record, layout = plant_record(one_output(data, "prediction errors"), na, nb, nk, Linear())
     return _posed("bj.exact", record, layout, False, "none", nc, nd, constraints, offset, starts, seed)
 
 
@@ -96,21 +95,20 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     check_gauge(gauge)
-    record, layout = plant_record(one_output(data), na, nb, nk, basis)
+    record, layout = plant_record(one_output(data, "prediction errors"), na, nb, nk, basis)
     check_excited(record, layout)
     return _posed("hammerstein_bj.exact", record, layout, True, gauge, nc, nd, constraints, offset, starts, seed)
 
 
 def _posed(name: str, data: Data, layout: Layout, free: bool, gauge: str, nc: int, nd: int,
            constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
-    if whole_number("starts", starts) < 1:
-        raise StructureError("starts is the number of starts, a whole number from 1; got 0")
+    count = whole_number("starts", starts, 1, "the number of starts")
     plant = Unknowns(layout, data.n_experiments, (free,) * layout.m, bool(offset))
     unknowns = NoiseUnknowns(plant, whole_number("nc", nc), whole_number("nd", nd))
     check_rows(data, plant)
     check_inputs_differ(data, layout)
     criterion = PredictionErrors(data, unknowns, "norm" if free else "none")
-    return procedure(name, criterion, _starts(criterion, starts, seed), constraints, gauge)
+    return procedure(name, criterion, _starts(criterion, count, seed), constraints, gauge)
 
 
 def _starts(criterion: PredictionErrors, count: int, seed: int) -> dict[str, Array]:

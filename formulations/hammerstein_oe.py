@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from formulations.arguments import one_output, whole_number
 from formulations.gauges import check_gauge
 from formulations.output_error import OutputError
 from formulations.output_error_programme import Posing
@@ -32,7 +33,7 @@ from formulations.prediction_error import Descent, agreement, best_of, descend, 
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import RankError, StructureError
+from optid.errors import RankError
 from optid.regressors import Layout
 from optid.regressors.sensitivities import Unknowns
 from optid.solving import Procedure
@@ -66,7 +67,7 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or inputs that the record does not tell apart.
     """
-    record, layout = plant_record(data, na, nb, nk, Linear())
+    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, Linear())
     check_inputs_differ(record, layout)
     return _procedure("oe.exact", record, layout, False, offset, constraints, "none", starts, seed)
 
@@ -96,7 +97,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
             does not tell apart.
     """
     check_gauge(gauge)
-    record, layout = plant_record(data, na, nb, nk, basis)
+    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis)
     check_excited(record, layout)
     check_inputs_differ(record, layout)
     return _procedure("hammerstein_oe.exact", record, layout, True, offset, constraints, gauge, starts, seed)
@@ -107,11 +108,10 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
 
 def _procedure(name: str, data: Data, layout: Layout, free: bool, offset: bool, constraints: Sequence[Any], gauge: str,
                starts: int, seed: int) -> Procedure:
-    if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-        raise StructureError(f"starts is the number of starts, a whole number from 1; got {starts!r}")
+    count = whole_number("starts", starts, 1, "the number of starts")
     unknowns = Unknowns(layout, data.n_experiments, (free,) * layout.m, bool(offset))
     check_rows(data, unknowns)
-    return _run(name, OutputError(data, unknowns, "norm" if free else "none"), constraints, gauge, int(starts), seed)
+    return _run(name, OutputError(data, unknowns, "norm" if free else "none"), constraints, gauge, count, seed)
 
 
 def _run(name: str, criterion: OutputError, constraints: Sequence[Any], gauge: str, starts: int, seed: int

@@ -18,14 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from formulations.subspace_procedure import NOISES, Plan, identified, one_of
-from optid.bases.basis import Basis
+from formulations.arguments import one_of
+from formulations.subspace_procedure import NOISES, Plan, identified
 from optid.data import Data
 from optid.errors import StructureError
+from optid.experiment.expansion import Bases, FeedbackBases
 from optid.solving import Procedure
-
-Bases = Basis | str | Sequence[Basis | str]
-FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
 
 
 def sid(

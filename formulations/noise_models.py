@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from formulations.arguments import enough_rows
 from formulations.equation_error import compress
 from formulations.output_error import STABLE, OutputError
 from formulations.output_error_programme import Posing
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
 from optid.data import Data
-from optid.errors import DataError, DataWarning, OptidError, RankError, StructureError
+from optid.errors import DataWarning, OptidError, RankError
 from optid.models import HammersteinARX, HammersteinTF, noise_filter
 from optid.program import Values
 from optid.rank_one.bilinear import minimise
@@ -37,8 +38,6 @@ MORE = 8
 
 RADIUS = 0.98
 """Zeros of C of a start lie inside this radius."""
-
-ROWS_PER_UNKNOWN = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,36 +75,6 @@ class PredictionErrors(OutputError):
         return found
 
 
-def whole_number(name: str, value: Any) -> int:
-    """Check an order.
-
-    Raises:
-        StructureError: not a whole number from 0.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise StructureError(f"{name} must be a whole number from 0; got {value!r}")
-    return int(value)
-
-
-def one_output(data: Any) -> Data:
-    """Refuse streams and several outputs.
-
-    Raises:
-        StructureError: naming the remedy.
-        DataError: an output without a single sample.
-    """
-    if not isinstance(data, Data):
-        raise StructureError("prediction errors need the record in memory, every sample in order: read it with "
-                             "optid.read instead of a stream")
-    if data.l > 1:
-        raise StructureError(
-            f"a transfer-function model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by "
-            "itself (data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
-    if not any(np.isfinite(e.y).any() for e in data.experiments):
-        raise DataError(f"output {data.outputs[0]!r} has no sample that is present: there is nothing to fit")
-    return data
-
-
 def procedure(name: str, criterion: PredictionErrors, starts: Mapping[str, Array], constraints: Sequence[Any],
               gauge: str) -> Procedure:
     """Descend from every start, then bring the best optimum to a point that a back end confirms.
@@ -123,11 +92,7 @@ def procedure(name: str, criterion: PredictionErrors, starts: Mapping[str, Array
     found = best_of(criterion, starts.items())
     if not found:
         raise RankError("no start has a stable predictor; use other orders")
-    rows, size = found[0].at.rows, criterion.unknowns.size
-    if rows < ROWS_PER_UNKNOWN * size:
-        raise RankError(f"{rows} prediction errors for {size} unknowns: at least "
-                        f"{int(np.ceil(ROWS_PER_UNKNOWN * size))} are needed. Use a longer record, fewer lags or "
-                        "fewer basis functions")
+    enough_rows(found[0].at.rows, "prediction errors", criterion.unknowns.size, "lags")
     agreed, sentence = agreement(found, 1e-12 * criterion.energy)
     best = descend(criterion, found[0].x, start=found[0].start)
     best = replace(best, steps=best.steps + found[0].steps)

@@ -23,10 +23,11 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.hammerstein_ss import Bases, FeedbackBases
-from formulations.subspace_procedure import Plan, completed, one_of, preliminary, prepared
+from formulations.arguments import one_of
+from formulations.subspace_procedure import Plan, completed, preliminary, prepared
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.experiment.expansion import Bases, FeedbackBases
 from optid.nuclear_norm import NuclearProblem, Predictor
 from optid.nuclear_norm.problem import window_starts
 from optid.program import NuclearForm, Program, Values, View

@@ -5,36 +5,28 @@ from typing import Any
 
 import numpy as np
 
-from formulations.equation_error import compress, per_channel
+from formulations.arguments import ROWS_PER_UNKNOWN, enough_rows, outputs_present, per_channel, whole_number
+from formulations.equation_error import compress
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import RankError, StructureError
+from optid.errors import RankError
 from optid.regressors import Layout
 from optid.regressors.sensitivities import CHUNK, Unknowns
 from optid.stretches import with_whole_inputs
 
-ROWS_PER_UNKNOWN = 1.1
 
-
-def plant_record(data: Any, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str]
+def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str]
                  ) -> tuple[Data, Layout]:
     """Return the record with whole inputs and the checked orders of the plant.
 
     Where inputs are missing the record is cut into stretches, each an experiment with an initial state of its own.
 
     Raises:
-        StructureError: a stream, several outputs, or impossible orders.
+        StructureError: impossible orders.
         DataError: no stretch with every input is long enough.
         RankError: an experiment that its initial state would explain.
     """
-    if not isinstance(data, Data):
-        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
-                             "with optid.read instead of a stream")
-    if data.l > 1:
-        raise StructureError(
-            f"an output-error model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by itself "
-            "(data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
     reach = plant_layout(data, na, nb, nk, fitted_bases(data, Linear())).first_row
     record = with_whole_inputs(data, 2 * reach + 1)
     return record, plant_layout(record, na, nb, nk, fitted_bases(record, basis))
@@ -47,10 +39,8 @@ def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]
         StructureError: impossible orders.
         RankError: an experiment that its initial state would explain.
     """
-    if isinstance(na, bool) or not isinstance(na, int | np.integer) or na < 0:
-        raise StructureError(f"na is the number of poles, a whole number from 0; got {na!r}")
-    layout = Layout(int(na), per_channel("nb", nb, data.inputs, low=1), per_channel("nk", nk, data.inputs, low=0),
-                    bases, data.outputs, data.inputs)
+    layout = Layout(whole_number("na", na, 0, "the number of poles"), per_channel("nb", nb, data.inputs, low=1),
+                    per_channel("nk", nk, data.inputs, low=0), bases, data.outputs, data.inputs)
     for number, e in enumerate(data.experiments, start=1):
         label = f"experiment {number}: " if data.n_experiments > 1 else ""
         if e.n_samples <= layout.first_row:
@@ -61,11 +51,7 @@ def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]
 
 def check_rows(data: Data, unknowns: Unknowns) -> None:
     """Refuse a record with fewer than 1.1 outputs per unknown (`RankError`)."""
-    rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
-    if rows < ROWS_PER_UNKNOWN * unknowns.size:
-        raise RankError(f"{rows} output samples for {unknowns.size} unknowns (initial states included): at least "
-                        f"{int(np.ceil(ROWS_PER_UNKNOWN * unknowns.size))} are needed. Use a longer record, fewer "
-                        "lags or fewer basis functions")
+    enough_rows(outputs_present(data), "output samples", unknowns.size, "lags")
 
 
 def check_excited(data: Data, layout: Layout) -> None:

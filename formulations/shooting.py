@@ -25,9 +25,9 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.arguments import one_output
 from formulations.equation_error import model_meta
 from formulations.gauges import check_gauge, scale_fixed
-from formulations.noise_models import one_output
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import blank, equation_error, iterated, stable_poles, with_poles
@@ -73,7 +73,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     check_gauge(gauge)
-    record, layout = plant_record(one_output(data), na, nb, nk, basis)
+    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis)
     if record.n_samples > LIMIT:
         raise StructureError(
             f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "

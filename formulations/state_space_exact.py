@@ -26,16 +26,17 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.arguments import enough_rows, in_memory, one_of, outputs_present
 from formulations.equation_error import flat
 from formulations.prediction_error import Descent, Posed, best_of, descend, refine
 from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.subspace_procedure import Plan, feedback_bases, identified
 from optid.bases import fitted_bases
-from optid.bases.basis import Basis
 from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataWarning, RankError, StructureError
+from optid.experiment.expansion import Bases
 from optid.judging import measure_violation
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.noise import with_noise
@@ -57,10 +58,7 @@ ROUNDS = 10
 
 SAME_WEIGHT = 1e-4
 FINALISTS = 2
-ROWS_PER_UNKNOWN = 1.1
 AGREE = 1e-4
-
-Bases = Basis | str | Sequence[Basis | str]
 
 
 def linear(
@@ -135,14 +133,11 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
                constraints: Sequence[Any]) -> Procedure:
     for what, word, known in (("criterion", criterion, CRITERIA), ("weighting", weighting, WEIGHTINGS),
                               ("stability", stability, STABILITIES)):
-        if word not in known:
-            raise StructureError(f"{what}={word!r}: use one of {', '.join(known)}.")
+        one_of(what, word, known)
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 1:
         raise StructureError(f"iterations={iterations!r}: a whole number from 1 is needed.")
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-    if not isinstance(data, Data):
-        raise StructureError("simulation errors need the record in memory, with every input sample in order: read it "
-                             "with optid.read instead of a stream")
+    in_memory(data, f"{criterion} errors")
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
     data = data.mapped(lambda u: u, lambda y: y, transform=Transform.identity(data.m, data.l))
     plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
@@ -188,7 +183,8 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     data = with_whole_inputs(data, 2 * nx + 1)
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), criterion == "prediction", plan.offset)
-    _check_rows(data, unknowns)
+    # similarity takes away the freedom of as many unknowns as A has entries
+    enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
     y = np.vstack([e.y for e in data.experiments])
     variances = np.nanvar(y, axis=0)
     error = StateError(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)), limit,
@@ -259,15 +255,6 @@ def _block_rows(plan: Plan) -> list[int | None]:
     shortest = min(e.n_samples for e in plan.data.experiments)
     most = max(shortest // (4 * (plan.data.m + plan.data.l + 1)), least)
     return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
-
-
-def _check_rows(data: Data, unknowns: StateUnknowns) -> None:
-    rows = sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
-    free = unknowns.size - unknowns.n**2
-    if rows < ROWS_PER_UNKNOWN * free:
-        raise RankError(f"{rows} output samples for {free} unknowns (initial states included): at least "
-                        f"{int(np.ceil(ROWS_PER_UNKNOWN * free))} are needed. Use a longer record, fewer states or "
-                        "fewer basis functions")
 
 
 def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, weighting: str, iterations: int

@@ -1,12 +1,12 @@
 """The steps that the subspace methods of `formulations.hammerstein_ss` share."""
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from formulations.arguments import one_of
 from formulations.equation_error import model_meta
 from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
@@ -49,12 +49,6 @@ WEAK = 0.1
 
 INSIDE = 0.999
 """Modulus to which poles outside the unit circle are brought by ``stability="auto"``."""
-
-
-def one_of(name: str, value: str, known: Sequence[str]) -> None:
-    """Refuse a word that is not known."""
-    if value not in known:
-        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,104 @@
+"""Checks of arguments and records that the formulations share."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from optid.data import Data
+from optid.errors import DataError, RankError, StructureError
+
+ROWS_PER_UNKNOWN = 1.1
+"""Errors that a fit needs for each of its unknowns."""
+
+
+def one_of(name: str, value: str, known: Sequence[str]) -> None:
+    """Refuse a word that is not known (`StructureError`)."""
+    if value not in known:
+        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
+
+
+def whole_number(name: str, value: Any, low: int = 0, what: str = "") -> int:
+    """Check an order or another number of things.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+        low: least value.
+        what: what it is, for the message.
+
+    Raises:
+        StructureError: not a whole number from ``low``.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
+        raise StructureError(f"{name} {f'is {what},' if what else 'must be'} a whole number from {low}; got {value!r}")
+    return int(value)
+
+
+def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
+    """Expand a scalar to one whole number per input and check it."""
+    values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
+    if len(values) != len(inputs):
+        raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
+    return tuple(whole_number(f"{name} of input {channel!r}", entry, low) for channel, entry in zip(inputs, values))
+
+
+def in_memory(data: Any, errors: str) -> Data:
+    """Refuse a stream.
+
+    Args:
+        data: the record.
+        errors: what the fit minimises, for the message.
+
+    Raises:
+        StructureError: naming the remedy.
+    """
+    if not isinstance(data, Data):
+        raise StructureError(f"{errors} need the record in memory, with every sample in order: read it with optid.read "
+                             "instead of a stream")
+    return data
+
+
+def one_output(data: Any, errors: str) -> Data:
+    """Refuse streams, several outputs, and an output without samples.
+
+    Args:
+        data: the record.
+        errors: what the fit minimises, for the message.
+
+    Raises:
+        StructureError: naming the remedy.
+        DataError: an output without a single sample.
+    """
+    data = in_memory(data, errors)
+    if data.l > 1:
+        raise StructureError(
+            f"a transfer-function model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by "
+            "itself (data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
+    if not any(np.isfinite(e.y).any() for e in data.experiments):
+        raise DataError(f"output {data.outputs[0]!r} has no sample that is present: there is nothing to fit")
+    return data
+
+
+def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
+    """Refuse a record with fewer than 1.1 rows per unknown.
+
+    Args:
+        rows: number of them.
+        what: what they are.
+        unknowns: their number, initial states included.
+        remedy: what a user could have fewer of, basis functions apart.
+
+    Raises:
+        RankError: naming the numbers.
+    """
+    needed = ROWS_PER_UNKNOWN * unknowns
+    if rows < needed:
+        raise RankError(f"{rows} {what} for {unknowns} unknowns (initial states included): at least "
+                        f"{int(np.ceil(needed))} are needed. Use a longer record, fewer {remedy} or fewer basis "
+                        "functions")
+
+
+def outputs_present(data: Data) -> int:
+    """Number of output samples that are not missing."""
+    return sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
