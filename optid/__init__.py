@@ -3,8 +3,7 @@
 The public names are loaded on first use, so that ``import optid`` stays fast.
 """
 
-from importlib import import_module
-from typing import Any
+from optid.lazy import on_first_use
 
 __version__ = "0.1.0"
 
@@ -50,14 +49,4 @@ _HOME = {
 }
 _MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "faults", "tracking"}
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f"optid.{_HOME[name]}"), name)
-    if name in _MODULES:
-        return import_module(f"optid.{name}")
-    raise AttributeError(f"module 'optid' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*_HOME, *_MODULES, "__version__"])
+__getattr__, __dir__ = on_first_use(__name__, _HOME, _MODULES)

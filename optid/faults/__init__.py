@@ -3,8 +3,7 @@
 The public names are loaded on first use.
 """
 
-from importlib import import_module
-from typing import Any
+from optid.lazy import on_first_use
 
 _HOME = {
     "Fault": "faults",
@@ -22,14 +21,15 @@ _HOME = {
     "Dictionary": "signatures",
     "Candidate": "signatures",
     "Isolability": "isolability",
+    "scan": "scanning",
+    "Scan": "scanning",
+    "thresholds": "calibration",
+    "Thresholds": "calibration",
+    "Estimate": "answers",
+    "Answer": "answers",
+    "Certificate": "answers",
+    "Diagnosis": "answers",
+    "load_diagnosis": "answers",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f"optid.faults.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'optid.faults' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+__getattr__, __dir__ = on_first_use(__name__, _HOME)

@@ -1,7 +1,6 @@
 """Signal subspaces: streaming trackers, the theorems behind them, certificates and reconstruction."""
 
-from importlib import import_module
-from typing import Any
+from optid.lazy import on_first_use
 
 _HOME = {
     "SubspaceTracker": "tracker",
@@ -23,12 +22,4 @@ _HOME = {
     "filled": "reconstruction",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f"optid.tracking.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'optid.tracking' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+__getattr__, __dir__ = on_first_use(__name__, _HOME)
