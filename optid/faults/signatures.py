@@ -162,19 +162,33 @@ class Dictionary:
         Raises:
             StructureError: a frozen sensor or a noise, which have no course of their own; a loss without u.
         """
+        into_state, into_output = self.additions(candidate, count, onset, u)
+        return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
+
+    def additions(self, candidate: Candidate | str, count: int, onset: int = 0, u: ArrayLike | None = None
+                  ) -> tuple[Array, Array]:
+        """Return what one unit of each magnitude adds to the state (N, n, d) and to the output (N, l, d).
+
+        Args:
+            candidate: the candidate or its label.
+            count: number of samples N.
+            onset: first sample that it can change.
+            u: (N, m) inputs, for a loss and a stuck actuator.
+
+        Raises:
+            StructureError: a frozen sensor or a noise, which have no course of their own; a loss without u.
+        """
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
         if c.additive:
             course = {"bias": since >= 0, "jump": since == 0, "drift": np.maximum(since + 1, 0)}[c.kind].astype(float)
-            into_state, into_output = course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
-        elif c.columns:
-            into_state, into_output = self._multiplicative(c, since, u)
-        else:
+            return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
+        if not c.columns:
             raise StructureError(
                 f"{c.label}: its course may be anything, so that there is no signature: test it as an arbitrary "
                 "waveform or by its covariance."
             )
-        return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
+        return self._multiplicative(c, since, u)
 
     def _multiplicative(self, c: Candidate, since: np.ndarray, u: ArrayLike | None) -> tuple[Array, Array]:
         if u is None:

@@ -1,0 +1,220 @@
+"""The search for one fault: equal to dense least squares on random models, thresholds that keep their rate."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fault_plants import levels, noisy, standard
+from state_systems import with_feedback
+from test_fault_injection import small
+
+from optid import Data
+from optid.errors import DataError, DataWarning, LookupFailed, StructureError
+from optid.faults import Fault, dictionary, inject, model_uncertainty, scan, thresholds, whiten
+from optid.faults.signature_space import signature_space
+from optid.faults.sweeps import sweep
+
+LOAD = np.array([0.3, -0.2, 0.5])
+KINDS = ["bias", "drift", "loss", "stuck"]
+
+
+def random_model(seed, n=3, m=2, l=2):  # noqa: E741
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
+    Q = rng.normal(size=(n, n))
+    return noisy(A, rng.normal(size=(n, m)), rng.normal(size=(l, n)), 0.1 * Q @ Q.T + 0.01 * np.eye(n),
+                 np.diag(rng.uniform(0.1, 1.0, l)), D=rng.normal(size=(l, m)), L=0.1 * rng.normal(size=(n, l)))
+
+
+def record(model, count, seed, gaps=0.0, fault=()):
+    rng = np.random.default_rng(seed)
+    u = levels(count, seed, model.m)
+    y = inject(model, u, fault, seed=seed)
+    return Data(u, np.where(rng.random(y.shape) < gaps, np.nan, y), dt=model.dt, outputs=model.outputs)
+
+
+def dense(found, white, u, label):
+    """Energies, magnitudes and covariances of a candidate at every onset, by least squares on the whole window."""
+    count, l = white.r.shape  # noqa: E741
+    energies, sizes, spreads = [], [], []
+    for onset in range(count):
+        G = found.signature(label, count, onset, u=u, present=white.present)
+        if white.nuisance is not None:
+            G = white.nuisance(G)
+        G = G.reshape(count * l, -1)
+        nu = np.linalg.lstsq(G, white.r.ravel(), rcond=1e-6)[0]
+        energies.append(float(np.sum((G @ nu) ** 2)))
+        sizes.append(nu)
+        spreads.append(np.linalg.pinv(G.T @ G, rcond=1e-12))
+    return np.array(energies), np.array(sizes), np.array(spreads)
+
+
+def compare(found, white, u):
+    result = scan(found, white, u)
+    for c, candidate in enumerate(found.candidates):
+        energies, sizes, spreads = dense(found, white, u, candidate.label)
+        tested = ~np.isnan(result.statistic[c])
+        needed = -(-candidate.dimension // found.model.l)
+        assert not tested[len(tested) - needed + 1 :].any() and tested[10:-10].all()
+        np.testing.assert_allclose(result.statistic[c, tested], energies[tested], rtol=1e-7, atol=1e-7)
+        for onset in np.flatnonzero(tested)[5:-10:7]:
+            found_nu, covariance = result.estimate(candidate, int(onset))
+            np.testing.assert_allclose(found_nu, sizes[onset], rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(covariance, spreads[onset], rtol=1e-4, atol=1e-8)
+        peak = result.peak(candidate.label)
+        assert tested[peak] and abs(energies[peak] - energies[tested].max()) < 1e-7 * (1 + energies[peak])
+        np.testing.assert_allclose(
+            result.signature(candidate, 20), white.seen(white.predictor.respond(
+                *found.additions(candidate, len(white.r), 20, u), white.present)))
+
+
+@pytest.mark.parametrize("gaps", [0.0, 0.15])
+@pytest.mark.parametrize("shape", [(3, 2, 2), (1, 1, 1), (5, 1, 3), (2, 3, 1)])
+def test_every_candidate_at_every_onset_is_dense_least_squares(shape, gaps):
+    for seed in range(3):
+        model = random_model(seed, *shape)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # groups and angles are not the matter here
+            found = dictionary(model, kinds=KINDS, process={"load": np.ones(shape[0])})
+        data = record(model, 50, seed, gaps)
+        compare(found, whiten(model, data, x0="zero"), data.experiments[0].u)
+
+
+def test_several_functions_of_one_input():
+    model = with_feedback(feedback=(), E=None, output_of=())
+    found = dictionary(model, kinds=KINDS)
+    data = Data(0.5 * np.random.default_rng(0).normal(size=(45, 2)), np.zeros((45, 2)), dt=0.5, outputs=["p", "q"])
+    y = inject(model, data.experiments[0].u, seed=1)
+    data = Data(data.experiments[0].u, y, dt=0.5, outputs=["p", "q"])
+    assert sorted({c.dimension for c in found.candidates}) == [1, 2, 3]
+    compare(found, whiten(model, data, x0="zero"), data.experiments[0].u)
+
+
+@pytest.mark.parametrize("x0", ["fit", "zero"])
+def test_an_uncertain_model(x0):
+    model = small()
+    identified = model_uncertainty(model, record(model, 120, 7))
+    found = dictionary(model, kinds=KINDS, process={"load": LOAD})
+    data = record(model, 50, 3, 0.05)
+    white = whiten(model, data, x0=x0, uncertainty=identified)
+    assert white.nuisance is not None
+    compare(found, white, data.experiments[0].u)
+
+
+def test_the_convolution_of_the_forecast_agrees():
+    found = dictionary(small(), kinds=["bias", "drift"], process={"load": LOAD})
+    windows = np.random.default_rng(0).normal(size=(5, 40, 2))
+    np.testing.assert_allclose(sweep(found, 40).largest(windows), signature_space(found, 40).statistics(windows))
+
+
+def test_a_fault_is_found_where_it_is(real_data):
+    model, load = standard(real_data)
+    found = dictionary(model, kinds=["bias", "loss", "stuck"], process={"load": load})
+    u = levels(300, 2)
+    y = inject(model, u, Fault.loss("actuator:u1", 200, 0.5), seed=3)
+    result = scan(found, whiten(model, Data(u, y), x0="zero"), u)
+    limits = thresholds(found, 300, u=u, draws=5000)
+    gains = result.gains(limits)
+    c, onset = np.unravel_index(np.nanargmax(gains), gains.shape)
+    assert found.labels[c] == "actuator:u1 loss" and abs(onset - 200) <= 2
+    nu, covariance = result.estimate("actuator:u1 loss", int(onset))
+    assert abs(nu[0] - 0.5) < 4 * np.sqrt(covariance[0, 0]) < 0.3
+    assert max(map(len, str(result).splitlines())) <= 80
+
+
+def test_only_the_onsets_asked_for():
+    found, data = dictionary(small()), record(small(), 60, 0)
+    white = whiten(small(), data)
+    whole = scan(found, white)
+    for onsets in ([20, 25, 30], slice(20, 31, 5)):
+        part = scan(found, white, onsets=onsets)
+        np.testing.assert_array_equal(np.flatnonzero(~np.isnan(part.statistic[0])), [20, 25, 30])
+        np.testing.assert_array_equal(part.statistic[:, 25], whole.statistic[:, 25])
+    for onsets in ([-1], [60], [], [1.5]):
+        with pytest.raises(StructureError, match="onsets"):
+            scan(found, white, onsets=onsets)
+
+
+def test_what_has_no_signature_is_not_tested():
+    found = dictionary(small(), kinds=["bias", "loss", "frozen", "noise"])
+    data = record(small(), 60, 0)
+    white = whiten(small(), data)
+    result, limits = scan(found, white), thresholds(found, 60, draws=5000)
+    silent = np.array([c.kind in ("loss", "frozen", "noise") for c in found.candidates])
+    np.testing.assert_array_equal(np.isnan(result.statistic).all(axis=1), silent)
+    np.testing.assert_array_equal(np.isnan(limits.q), silent)
+    assert "not tested" in str(result) and "not tested" in str(limits)
+    with pytest.raises(StructureError, match="no peak"):
+        result.peak("sensor:y1 frozen")
+    with pytest.raises(StructureError, match="arbitrary waveform"):
+        result.signature("sensor:y1 frozen", 10)
+    still = scan(found, white, np.zeros((60, 2)))
+    assert np.isnan(still.statistic[result.index("actuator:u1 loss")]).all()  # f(0) = 0: nothing to lose
+
+
+# -- thresholds ------------------------------------------------------------------------------------------------------
+
+
+def test_thresholds_keep_the_rate_of_the_family():
+    found = dictionary(small(), kinds=["bias", "loss", "stuck"])
+    u = levels(60, 0)
+    limits = thresholds(found, 60, 0.02, u=u, seed=1)
+    fresh = sweep(found, 60, u=u).largest(np.random.default_rng(2).normal(size=(20_000, 60, 2)))
+    assert abs(np.mean(np.any(fresh > limits.q, axis=1)) - 0.02) < 0.004
+    shares = np.mean(fresh > limits.q, axis=0)
+    assert shares.max() / shares.min() < 1.8
+    np.testing.assert_array_equal(thresholds(found, 60, 0.02, u=u, seed=1).q, limits.q)
+
+
+def test_thresholds_of_a_typical_input_hold_on_the_average():
+    found = dictionary(small(), kinds="loss", state_jump=False)
+    limits, rng = thresholds(found, 40, 0.05, u=levels(4000, 0), seed=1), np.random.default_rng(2)
+    rates = [
+        np.mean(np.any(prepared.largest(rng.normal(size=(200, 40, 2))) > limits.q, axis=1))
+        for prepared in (sweep(found, 40, u=levels(40, 100 + i)) for i in range(100))
+    ]
+    assert abs(np.mean(rates) - 0.05) < 0.006
+
+
+def test_thresholds_of_a_window_with_gaps_and_an_uncertain_model():
+    model = small()
+    found, data = dictionary(model), record(model, 60, 3, 0.3)
+    white = whiten(model, data, uncertainty=model_uncertainty(model, record(model, 120, 7)))
+    limits = thresholds(found, white, 0.02, seed=1)
+    fresh = np.random.default_rng(2).normal(size=(3000, 60, 2))
+    shown = np.where(white.present, fresh, 0.0)
+    windows = [np.nanmax(scan(found, replace(white, r=r)).statistic, axis=1) for r in shown]
+    assert abs(np.mean(np.any(windows > limits.q, axis=1)) - 0.02) < 0.01
+
+
+def test_bad_input():
+    found, data = dictionary(small(), kinds=["bias", "loss"]), record(small(), 60, 0)
+    white, u = whiten(small(), data), data.experiments[0].u
+    with pytest.raises(StructureError, match="one by one"):
+        scan(found, (white, white))
+    with pytest.raises(DataError, match="u has 50 samples; the window has 60"):
+        scan(found, white, u[:50])
+    with pytest.raises(DataError, match="'u2' is missing at sample 7"):
+        scan(found, white, np.where((np.arange(60)[:, None] == 7) & [False, True], np.nan, u))
+    with pytest.raises(DataError, match="'y1' at sample 3 is not finite"):
+        scan(found, replace(white, r=np.where((np.arange(60)[:, None] == 3) & [True, False], np.inf, white.r)))
+    with pytest.raises(DataError, match="1 outputs"):
+        scan(found, replace(white, r=white.r[:, :1]))
+    with pytest.raises(StructureError, match="at least 8 samples"):
+        thresholds(found, 7)
+    with pytest.raises(StructureError, match="false_alarm="):
+        thresholds(found, 60, 1.0)
+    with pytest.raises(DataError, match="at least 50000000 draws"):
+        thresholds(found, 60, 1e-6)
+    with pytest.raises(DataError, match="as many are needed"):
+        thresholds(found, 60, u=u[:30])
+    with pytest.raises(StructureError, match="other candidates"):
+        scan(found, white).gains(thresholds(dictionary(small()), 60, draws=5000))
+    with pytest.raises(LookupFailed, match="actuator:u9"):
+        scan(found, white).peak("actuator:u9")
+    with pytest.raises(StructureError, match="No candidate has a signature"):
+        scan(dictionary(small(), kinds="loss", state_jump=False), white)
+    with pytest.raises(StructureError, match="not tested at onset 60"):
+        scan(found, white).estimate("actuator:u1", 60)
