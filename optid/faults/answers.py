@@ -1,4 +1,4 @@
-"""What a diagnosis says: a verdict, a set of answers with their probabilities, estimates with intervals, and a proof."""
+"""What a diagnosis says: a verdict, a set of answers with probabilities, estimates with intervals, and a proof."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -67,7 +67,8 @@ def printed(found: "Diagnosis") -> str:
         f"method {found.method}"
     )
     for answer in found.candidates:
-        lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}" + "  <- best" * (answer is found.best)]
+        mark = "  <- best" * (answer is found.best)
+        lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
         lines += [f"  {line}" for line in str(answer).splitlines()]
     if found.detected:
         lines += ["", certificate_words(found)]
