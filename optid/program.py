@@ -155,6 +155,35 @@ class NuclearForm:
 
 
 @dataclass(frozen=True)
+class GroupForm:
+    """The group-sparse least-squares structure behind a convex programme, for methods that exploit it.
+
+    ``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
+
+    Attributes:
+        problem: the numbers (`optid.group_sparse.GroupProblem`).
+        blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
+        penalty: name of the parameter that holds lambda.
+        residual: name of the variable of the residual, and of the constraint that defines it.
+    """
+
+    problem: Any
+    blocks: Mapping[str, tuple[int, ...]]
+    penalty: str = "lambda"
+    residual: str = "residual"
+
+    def flat(self, values: Values) -> np.ndarray:
+        """Return a from named values."""
+        return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
+
+    def shaped(self, a: np.ndarray) -> dict[str, np.ndarray]:
+        """Return named values from a, the residual included."""
+        cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
+        parts = {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
+        return {**parts, self.residual: self.problem.target - self.problem.design @ a}
+
+
+@dataclass(frozen=True)
 class Program:
     """One optimisation problem with named parts, independent of who solves it.
 
@@ -172,6 +201,7 @@ class Program:
             variables; they are recomputed at every point before it is judged.
         rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
         nuclear: nuclear-norm structure for the ADMM, or None.
+        group: group-sparse structure for the block descent, or None.
         least_squares: a `RankOneForm` without products, where the objective without the user's constraints is such a
             sum of squares and the structural constraints only fix directions that do not change it; it is judged from
             these numbers then.
@@ -194,6 +224,7 @@ class Program:
     derived: Mapping[str, cp.Expression] = field(default_factory=dict)
     rank_one: RankOneForm | None = None
     nuclear: NuclearForm | None = None
+    group: GroupForm | None = None
     least_squares: RankOneForm | None = None
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
@@ -313,7 +344,7 @@ class Program:
             return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
-                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None,
+                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None, group=None,
                        least_squares=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})

@@ -12,7 +12,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.program import NuclearForm, Program, RankOneForm, View
+from optid.program import GroupForm, NuclearForm, Program, RankOneForm, View
 
 SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 
@@ -45,8 +45,8 @@ class Case:
 
 @cache
 def cases() -> tuple[Case, ...]:
-    """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one and nuclear among them."""
-    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), *_nuclear())
+    """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one, nuclear and group-sparse among them."""
+    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), *_nuclear(), *_group_sparse())
 
 
 def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: list[cp.Variable],
@@ -361,6 +361,34 @@ def _nuclear() -> list[Case]:
 
     return [Case(nuclear_shrinkage, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
                  point={"yhat": best}, duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})]
+
+
+def _group_sparse() -> list[Case]:
+    """With an orthonormal design every group of coefficients is shrunk by itself."""
+    rng = np.random.default_rng(5)
+    design, target = np.linalg.qr(rng.normal(size=(12, 7)))[0], 3.0 * rng.normal(size=12)
+    weights, penalty = np.array([1.0, 2.0, 0.5, 1.5]), 0.9
+    free = design.T @ target
+    groups = [free[:1], free[1:2], free[2:5], free[5:]]
+    shrunk = [max(0.0, 1 - penalty * w / float(np.linalg.norm(z))) * z for w, z in zip(weights, groups)]
+    rest = target - design @ np.concatenate(shrunk)
+    value = 0.5 * float(rest @ rest) + penalty * sum(w * float(np.linalg.norm(z)) for w, z in zip(weights, shrunk))
+
+    def group_shrinkage() -> Program:
+        from optid.group_sparse import GroupProblem
+
+        parts = [cp.Variable(z.size, name=f"a{i + 1}") for i, z in enumerate(groups)]
+        e, parameter = cp.Variable(12, name="residual"), cp.Parameter(nonneg=True, name="lambda", value=penalty)
+        misfit = target - design @ cp.hstack(parts)
+        norms: Any = sum(w * cp.norm(part, 2) for w, part in zip(weights, parts))
+        form = GroupForm(GroupProblem(design, target, np.array([0, 1, 2, 5, 7]), weights),
+                         {part.name(): part.shape for part in parts})
+        return pose("group_shrinkage", 0.5 * cp.sum_squares(e) + parameter * norms, {"residual": e == misfit},
+                    [*parts, e], structural=frozenset({"residual"}), derived={"residual": misfit},
+                    parameters={"lambda": parameter}, group=form, scale=0.5 * float(target @ target))
+
+    return [Case(group_shrinkage, value=value, point={f"a{i + 1}": z for i, z in enumerate(shrunk)},
+                 duals={"residual": -rest})]
 
 
 def _search(matrix: np.ndarray, y: np.ndarray, *, convex: bool) -> float:

@@ -64,7 +64,8 @@ class BackEnd:
 
     Attributes:
         name: the word, in lower case.
-        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one", "nuclear".
+        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one", "nuclear",
+            "group-sparse".
         run: (program, settings) -> Answer.
         installed: whether it can run here.
         pip: what to install where it cannot.
@@ -91,6 +92,10 @@ class BackEnd:
         if program.nuclear is not None and "nuclear" in self.classes:
             names = ", ".join(map(repr, program.user_constraints))
             return "" if not names else (f"{self.name} takes no further constraints ({names}); use an SDP back end "
+                                         "(clarabel, scs)")
+        if program.group is not None and "group-sparse" in self.classes:
+            names = ", ".join(map(repr, program.user_constraints))
+            return "" if not names else (f"{self.name} takes no further constraints ({names}); use a conic back end "
                                          "(clarabel, scs)")
         kind = program.kind
         if kind in self.classes:
@@ -155,6 +160,8 @@ def choose(program: Program) -> tuple[BackEnd, str]:
         )
     if program.nuclear is not None and not program.user_constraints:
         return find("admm"), f"admm: nuclear norm of a Hankel matrix, {program.nuclear.problem.shape} entries"
+    if program.group is not None and not program.user_constraints:
+        return find("block_descent"), f"block_descent: {program.group.problem.weights.size} groups"
     kind = program.kind
     order = ("uno", "ipopt") if kind == "NLP" and program.size <= 200 else ("ipopt", "uno")
     if kind != "NLP":
