@@ -11,12 +11,10 @@ length; no verdict where the inputs stand still. Losses of 30 % are shown as the
 """
 
 import argparse
-import json
-import os
 import warnings
-from pathlib import Path
 
 import numpy as np
+from plants import PLANT, standard_plant
 from scipy.stats import chi2
 
 import optid
@@ -44,20 +42,6 @@ def judged(plant: optid.HammersteinSS, fault: Fault | None, seed: int, n: int = 
 def lost(name: str | None, onset: int = 0, share: float = 1.0) -> Fault | None:
     """Fault of a record whose first 2 N samples are the healthy ones."""
     return None if name is None else Fault.loss(name, 2 * N + onset, share)
-
-
-def standard() -> optid.HammersteinSS | None:
-    """Build the standard plant, or None without its file."""
-    path = Path(os.environ.get("OPTID_DATA", "")) / "fault_plant.json"
-    if not path.is_file():
-        return None
-    plant = json.loads(path.read_text())
-    functions = [lambda u: u + 0.25 * u**3, lambda u: np.tanh(1.5 * u) + 0.15 * u]
-    shapes = [optid.Nonlinearity(optid.UserFunctions([f], names=[f"f{i + 1}"]).fitted(-1.2, 1.2), np.ones(1))
-              for i, f in enumerate(functions)]
-    a, b, c, d, q, r = (np.array(plant[key]) for key in "ABCDQR")
-    return optid.HammersteinSS(a, b, c, d, nonlinearities=tuple(shapes),
-                               noise=optid.NoiseCovariances(q, r, np.zeros((4, 2)), np.eye(2)))
 
 
 def decisions(runs: int) -> None:
@@ -128,11 +112,10 @@ def main() -> None:
     warnings.simplefilter("ignore", optid.errors.DataWarning)
     decisions(runs)
     streams(two_mode_plant(True, 0.1), "coupled plant", runs, 1, False)
-    plant = standard()
-    if plant is None:
+    if not PLANT.is_file():
         print("The standard plant is left out: OPTID_DATA does not lead to fault_plant.json.")
         return
-    streams(plant, "standard plant", runs, 5, True)
+    streams(standard_plant()[0], "standard plant", runs, 5, True)
 
 
 if __name__ == "__main__":

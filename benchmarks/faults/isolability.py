@@ -10,37 +10,17 @@ formula for two rivals at a known onset, which ignores that the onset is searche
 """
 
 import argparse
-import json
-import os
 import time
 from pathlib import Path
 
 import numpy as np
+from plants import BEFORE, PLANT, levels, standard_plant
 from scipy.stats import norm
 
 from optid import Data
-from optid.bases import UserFunctions
 from optid.faults import Fault, dictionary, inject, whiten
 from optid.faults.isolability import MIDDLE, study
 from optid.faults.signatures import Dictionary
-from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
-from optid.models.kalman import kalman_gain
-
-BEFORE = 100
-
-
-def plant(path: Path) -> tuple[HammersteinSS, np.ndarray]:
-    """Return the standard plant and the direction of its load."""
-    content = json.loads(path.read_text())
-    A, B, C, D, E, Q, R = (np.array(content[name]) for name in "ABCDEQR")
-    first = UserFunctions((lambda u: u + 0.25 * u**3,), interval=(-1.2, 1.2), outside="extrapolate", names=("f1",))
-    second = UserFunctions(
-        (lambda u: np.tanh(1.5 * u) + 0.15 * u,), interval=(-1.2, 1.2), outside="extrapolate", names=("f2",)
-    )
-    steady = kalman_gain(A, C, Q, R)
-    noise = NoiseCovariances(Q, R, np.zeros((4, 2)), steady.innovation)
-    functions = tuple(Nonlinearity(f, np.ones(1)) for f in (first, second))
-    return HammersteinSS(A, B, C, D=D, K=steady.K, noise=noise, nonlinearities=functions), E[:, 0]
 
 
 def dense(found: Dictionary, window: int) -> list[np.ndarray]:
@@ -66,9 +46,9 @@ def main() -> None:
     parser.add_argument("--window", type=int, default=100)
     parser.add_argument("--draws", type=int, default=4000)
     parser.add_argument("--shares", type=float, nargs="+", default=[0.6, 1.0, 1.5], help="of the isolable size")
-    parser.add_argument("--plant", type=Path, default=Path(os.environ.get("OPTID_DATA", ".")) / "fault_plant.json")
+    parser.add_argument("--plant", type=Path, default=PLANT)
     options = parser.parse_args()
-    model, load = plant(options.plant)
+    model, load = standard_plant(options.plant)
     found = dictionary(model, process={"load": load})
     start = time.process_time()
     forecast = study(found, options.window, draws=options.draws)
@@ -89,7 +69,7 @@ def main() -> None:
             for _ in range(options.runs):
                 low, high = (int(part * options.window) for part in MIDDLE)
                 onset = int(rng.integers(low, high))
-                u = np.repeat(rng.uniform(-1.2, 1.2, (count // 5 + 1, 2)), 5, axis=0)[:count]
+                u = levels(count, rng)
                 fault = Fault.step(label, BEFORE + onset, size)
                 y = inject(model, u, fault, seed=int(rng.integers(2**32)), process={"load": load})
                 excess = search(banks, whiten(model, Data(u, y), x0="zero").r[BEFORE:]) - forecast.thresholds
@@ -107,7 +87,7 @@ def main() -> None:
         bool(np.any(search(banks, whiten(model, Data(u, inject(model, u, seed=run)), x0="zero").r[BEFORE:])
                     > forecast.thresholds))
         for run in range(options.runs)
-        for u in [np.repeat(rng.uniform(-1.2, 1.2, (count // 5 + 1, 2)), 5, axis=0)[:count]]
+        for u in [levels(count, rng)]
     )
     print(f"\nfigure 27: named, forecast off by at most {worst:.3f}   (goal .03)"
           f"\n           noticed, off by at most {worst_noticed:.3f}"
