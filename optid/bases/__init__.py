@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from optid.bases.basis import Basis
 from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions, restore
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
@@ -21,6 +23,7 @@ __all__ = [
     "Triangular",
     "Trigonometric",
     "UserFunctions",
+    "feedback_bases",
     "fitted_bases",
     "from_dict",
     "parse",
@@ -97,6 +100,35 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
                             "excite the input or drop the channel")
         fitted.append(family.fitted(float(lo), float(hi)))
     return tuple(fitted)
+
+
+def feedback_bases(data: "Data", given: "Basis | str | None | Sequence[Basis | str | None]") -> list[Basis | None]:
+    """Return one basis with an interval, or None, per output; a basis without one takes the range of its output.
+
+    Args:
+        data: the record.
+        given: one basis (or its name) for all outputs, or one per output; None or "none" where nothing is fed back.
+
+    Raises:
+        StructureError: a wrong number of bases, or what is not a basis.
+        DataError: a constant output.
+    """
+    several: list[Any] = list(given) if isinstance(given, list | tuple) else [given] * data.l
+    if len(several) != data.l:
+        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
+                             "one each, None for an output that is not fed back.")
+    found: list[Basis | None] = []
+    for o, one in enumerate(several):
+        if one is None or one == "none":
+            found.append(None)
+            continue
+        family: Any = parse(one) if isinstance(one, str) else one
+        if not hasattr(family, "fitted"):
+            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
+                                 "Polynomial(4) or its name, 'polynomial:4'")
+        y = np.concatenate([e.y[:, o] for e in data.experiments])
+        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
+    return found
 
 
 def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:

@@ -2,48 +2,18 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from optid.bases import fitted_bases, parse
+from optid.bases import feedback_bases, fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
-from optid.errors import DataWarning, StructureError
+from optid.errors import DataWarning
 from optid.subspace.expansion import Expansion, expand
 from optid.subspace.hankel import hankel_statistics
 
 Bases = Basis | str | Sequence[Basis | str]
 FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
-
-
-def feedback_bases(data: Data, given: FeedbackBases) -> list[Basis | None]:
-    """Return one basis with an interval, or None, per output; a basis without one takes the range of its output.
-
-    Args:
-        data: the record.
-        given: one basis (or its name) for all outputs, or one per output; None or "none" where nothing is fed back.
-
-    Raises:
-        StructureError: a wrong number of bases, or what is not a basis.
-        DataError: a constant output.
-    """
-    several: list[Any] = list(given) if isinstance(given, list | tuple) else [given] * data.l
-    if len(several) != data.l:
-        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
-                             "one each, None for an output that is not fed back.")
-    found: list[Basis | None] = []
-    for o, one in enumerate(several):
-        if one is None or one == "none":
-            found.append(None)
-            continue
-        family: Any = parse(one) if isinstance(one, str) else one
-        if not hasattr(family, "fitted"):
-            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
-                                 "Polynomial(4) or its name, 'polynomial:4'")
-        y = np.concatenate([e.y[:, o] for e in data.experiments])
-        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
-    return found
 
 
 def expansion_of(data: Data, basis: Bases, feedback_basis: FeedbackBases = None) -> Expansion:
@@ -52,7 +22,7 @@ def expansion_of(data: Data, basis: Bases, feedback_basis: FeedbackBases = None)
     Args:
         data: the record.
         basis: of the inputs, one for all or one per input.
-        feedback_basis: of the outputs, as in `feedback_bases`.
+        feedback_basis: of the outputs, as in `optid.bases.feedback_bases`.
 
     Raises:
         StructureError: a wrong number of bases.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases import Linear, fitted_bases, parse
+from optid.bases import Linear, feedback_bases, fitted_bases
 from optid.bases.basis import Array, Basis
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
@@ -141,7 +141,7 @@ def order(
     records = _records(data)
     check_channels(records, data.inputs, data.outputs)
     bases = fitted_bases(data, Linear() if basis is None else basis)
-    expansion = expand(records, bases, _feedback(data, feedback_basis), data.inputs, data.outputs)
+    expansion = expand(records, bases, feedback_bases(data, feedback_basis), data.inputs, data.outputs)
     alpha = block_rows_for(records, expansion, block_rows, nx)
     notes: list[str] = []
     shown, extended = expansion, records
@@ -174,20 +174,6 @@ def _records(data: Data) -> list[Array]:
 
 def _centre(centre: Array, expansion: Any) -> Array:
     return centre[: expansion.p + expansion.q + expansion.l]
-
-
-def _feedback(data: Data, given: Any) -> list[Basis | None]:
-    if given is None:
-        return []
-    several = list(given) if isinstance(given, list | tuple) else [given] * data.l
-    if len(several) != data.l:
-        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs: one each, None for no feedback.")
-    found: list[Basis | None] = []
-    for o, one in enumerate(several):
-        family: Any = None if one == "none" else parse(one) if isinstance(one, str) else one
-        y = np.concatenate([e.y[:, o] for e in data.experiments])
-        found.append(None if family is None else family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
-    return found
 
 
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
