@@ -10,6 +10,7 @@ from optid.errors import LookupFailed, StructureError, nearest
 
 FORMULATIONS = "optid.formulations"
 CONSTRAINTS = "optid.constraints"
+FAULTS = "optid.fault_formulations"
 
 
 @cache
@@ -30,6 +31,18 @@ def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]
     if not isinstance(name, str) or name not in known:
         raise LookupFailed(f"no formulation is called {name!r}. {nearest(str(name), known)}")
     return name, known[name].load()
+
+
+def fault_formulation(name: str) -> Callable[..., Any]:
+    """Return a programme about a fault by its name.
+
+    Raises:
+        LookupFailed: no such name; the message has the nearest one.
+    """
+    known = registered(FAULTS)
+    if name not in known:
+        raise LookupFailed(f"no programme about faults is called {name!r}. {nearest(name, known)}")
+    return known[name].load()
 
 
 def named_constraint(text: str) -> Any:
