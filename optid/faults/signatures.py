@@ -1,7 +1,7 @@
 """The dictionary: what every possible fault leaves in the whitened innovations, and which of them look the same."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,13 +17,22 @@ if TYPE_CHECKING:
     from optid.faults.isolability import Isolability
     from optid.models import HammersteinSS
 
-ADDITIVE = ("bias", "drift", "jump")
+ADDITIVE = ("bias", "drift", "jump", "spike")
 """Kinds whose signature depends on nothing but the model and the time since the onset."""
+
+COURSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "bias": lambda since: since >= 0,
+    "drift": lambda since: np.maximum(since + 1, 0),
+    "jump": lambda since: since == 0,
+    "spike": lambda since: since == 0,
+}
+"""Their course over the samples since the onset."""
 
 KINDS = {
     "bias": ("actuator", "sensor", "process"),
     "drift": ("actuator", "sensor", "process"),
     "jump": ("state",),
+    "spike": ("sensor",),
     "loss": ("actuator",),
     "stuck": ("actuator",),
     "frozen": ("sensor",),
@@ -181,7 +190,7 @@ class Dictionary:
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
         if c.additive:
-            course = {"bias": since >= 0, "jump": since == 0, "drift": np.maximum(since + 1, 0)}[c.kind].astype(float)
+            course = COURSES[c.kind](since).astype(float)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
         if not c.columns:
             raise StructureError(
@@ -236,7 +245,7 @@ def dictionary(
         model: the healthy model, with noise covariances.
         actuators: "all" or names of inputs.
         sensors: "all" or names of outputs.
-        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise"; each where it can be.
+        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each where it can be.
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
         unknown: whether "none of these" is an answer.
@@ -301,7 +310,7 @@ def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     direct = np.zeros((count, *candidate.into_output.shape))
     direct[0] = candidate.into_output
     found = steady.whitened(steady.respond(impulse, direct))
-    for _ in range({"jump": 0, "drift": 2}.get(candidate.kind, 1)):
+    for _ in range({"jump": 0, "spike": 0, "drift": 2}.get(candidate.kind, 1)):
         found = np.cumsum(found, axis=0)
     return found
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SHARE = 1e-9
 """Directions of a signature with less than this share of the energy of the largest one explain nothing."""
 
-ORDERS = {"drift": 1, "jump": 2}
+ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 """Where the columns of a kind stand: those that last, drifts, jumps."""
 
 
@@ -142,6 +142,14 @@ class Sweep:
         return result
 
 
+    def along(self) -> Array:
+        """Return V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one."""
+        columns = self.blocks.group.size
+        if self.nuisance is None:
+            return np.zeros((self.window, 0, columns))
+        return _along(self.tables, self.nuisance, columns)
+
+
 _KEPT: "WeakKeyDictionary[Dictionary, dict[Any, Sweep]]" = WeakKeyDictionary()
 _MOST = 4
 
@@ -208,7 +216,7 @@ def _prepared(
     found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
     nuisance: "Nuisance | None", able: tuple[bool, ...],
 ) -> Sweep:
-    from optid.faults.sweep_kernels import correlate, grams
+    from optid.faults.sweep_kernels import grams
 
     blocks, tables = _tables(found, window, steady, present, u, able)
     columns = blocks.group.size
@@ -216,11 +224,8 @@ def _prepared(
     grams(tables, blocks.group, False, products, np.empty((1, steady.A.shape[0], columns)))
     largest = [_largest(products, blocks, c) for c in range(len(able))]
     if nuisance is not None:
-        shares = 1 - 1 / (1 + nuisance.s**2)
-        for axis, share in zip(nuisance.U.T, shares):
-            along = np.empty((window, columns))
-            correlate(tables, np.ascontiguousarray(axis.reshape(window, -1)), along)
-            products -= share * along[:, :, None] * along[:, None, :]
+        along = _along(tables, nuisance, columns)
+        products -= np.einsum("kqi,kqj->kij", along, along, optimize=True)
     roots, tested = np.zeros((window, int(np.sum(blocks.sizes**2)))), np.zeros((len(able), window), dtype=bool)
     for c, (d, place, begin) in enumerate(zip(blocks.sizes, blocks.places, blocks.first)):
         if d:
@@ -230,6 +235,17 @@ def _prepared(
             tested[c] = np.any(root, axis=(1, 2))
             tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
     return Sweep(found, steady, window, present, nuisance, tables, blocks, roots, tested)
+
+
+def _along(tables: Tables, nuisance: "Nuisance", columns: int) -> Array:
+    from optid.faults.sweep_kernels import correlate
+
+    window = tables.of.size
+    result, one = np.empty((window, nuisance.s.size, columns)), np.empty((window, columns))
+    for i, (axis, s) in enumerate(zip(nuisance.U.T, nuisance.s)):
+        correlate(tables, np.ascontiguousarray(axis.reshape(window, -1)), one)
+        result[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
+    return result
 
 
 def _largest(products: Array, blocks: Blocks, c: int) -> Array:
@@ -268,7 +284,7 @@ def _tables(
     drifts = [i for i in order if found.candidates[i].kind == "drift"]
     # the helpers of the drifts are the last of the columns that last
     lasting = [i for i in order if found.candidates[i].kind not in ORDERS] + drifts
-    line = lasting + drifts + [i for i in order if found.candidates[i].kind == "jump"]
+    line = lasting + drifts + [i for i in order if ORDERS.get(found.candidates[i].kind) == 2]
     into = [_into(found, found.candidates[i], window, u) for i in line]
     driven = any(len(x) > 1 for x, _ in into)
     if driven:
