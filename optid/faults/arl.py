@@ -1,0 +1,176 @@
+"""Thresholds of a running search from the mean time between false alarms that is asked for, by simulation.
+
+The whitened innovations of a healthy plant are white with unit covariance, so that the search itself can be run on
+random numbers, without the plant. The largest statistics of blocks as long as the window are kept; alarms are rare, so
+that those of different blocks are nearly independent and their rate is
+
+    1 / ARL0 = -log(1 - share of blocks with an alarm) / length of a block
+
+after blocks that follow one another have been counted once. Every candidate gets the same rate of its own, which is
+found such that all of them together have the rate asked for.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.monitor_tables import Tables, blank
+
+ALARMS = 200
+"""False alarms that a simulation must see, so that their rate is known to 7 %."""
+
+FEWEST = 50
+"""With fewer alarms than this the threshold is extrapolated, or refused."""
+
+LONGEST = 4_000_000
+"""Samples simulated at most, unless more are asked for."""
+
+CHUNK = 20_000
+"""Samples simulated at a time; every one of them has random numbers of its own."""
+
+HOLD = 5
+"""Samples over which the simulated input keeps its level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Thresholds and what they rest on.
+
+    Attributes:
+        labels: the candidates.
+        q: (C,) their thresholds.
+        arl0: samples between false alarms, asked for.
+        window: samples of the window.
+        samples: samples simulated.
+        alarms: false alarms among them at these thresholds.
+        seed: of the simulation.
+        extrapolated: whether the simulation was too short for so rare an alarm and the tail was extrapolated.
+    """
+
+    labels: tuple[str, ...]
+    q: Array
+    arl0: float
+    window: int
+    samples: int
+    alarms: int
+    seed: int | None
+    extrapolated: bool = False
+
+    def __str__(self) -> str:
+        """Say what the thresholds rest on."""
+        tail = ", the tail extrapolated" if self.extrapolated else ""
+        lines = [f"false alarm every {self.arl0:g} samples: {self.alarms} alarms in {self.samples} simulated{tail}"]
+        return "\n".join(lines + [f"  {label:<40} {q:7.2f}" for label, q in zip(self.labels, self.q)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe it in JSON types."""
+        return {**self.__dict__, "labels": list(self.labels), "q": [float(q) for q in self.q]}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "Calibration":
+        """Build what `to_dict` described."""
+        return cls(**{**content, "labels": tuple(content["labels"]), "q": np.array(content["q"], dtype=float)})
+
+
+def calibrate(
+    t: Tables, labels: tuple[str, ...], f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
+    extrapolate: bool = False,
+) -> Calibration:
+    """Find the thresholds of a search.
+
+    Args:
+        t: its tables.
+        labels: of the candidates.
+        f: (T, r) functions of the input of a healthy plant, repeated as often as needed; it matters for losses and
+            stuck actuators only.
+        arl0: samples between false alarms.
+        samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
+        seed: of the simulation.
+        extrapolate: whether the tail may be extrapolated where the simulation is too short.
+
+    Raises:
+        StructureError: an ARL0 below the length of the window.
+        DataError: a simulation that cannot support so rare an alarm.
+    """
+    window = t.H.shape[2]
+    if not (np.isfinite(arl0) and arl0 >= window):
+        raise StructureError(
+            f"arl0={arl0!r}: a mean time between false alarms of at least the window, {window} samples, is needed."
+        )
+    wanted = int(min(ALARMS * arl0, LONGEST)) if samples is None else int(samples)
+    extrapolated = wanted < FEWEST * arl0
+    if extrapolated and not extrapolate:
+        raise DataError(
+            f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {FEWEST} alarms are needed. "
+            f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), ask for a lower arl0, or let the tail be "
+            "extrapolated (extrapolate=True)."
+        )
+    largest = maxima(t, f, wanted, seed)
+    q, alarms = equalised(largest, window, arl0)
+    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
+
+
+def maxima(t: Tables, f: Array, samples: int, seed: int | None) -> Array:
+    """Return the largest statistics (B, C) of blocks of W samples of a healthy search."""
+    from optid.faults.monitor_kernels import rehearse
+
+    window, l = t.H.shape[2], t.C.shape[0]  # noqa: E741
+    blocks = max(CHUNK // window, 1)
+    count = max(1, -(-samples // (blocks * window)))
+    streams = np.random.SeedSequence(seed).spawn(count + 1)
+    s, found = blank(t), np.empty((count * blocks, t.size.size))
+    inputs = np.resize(f, (blocks * window, f.shape[1])) if f.size else np.zeros((blocks * window, f.shape[1]))
+    # the first window fills up
+    rehearse(t, s, inputs, np.random.default_rng(streams[0]).standard_normal((window, l)), np.empty((1, t.size.size)))
+    for number, stream in enumerate(streams[1:]):
+        r = np.random.default_rng(stream).standard_normal((blocks * window, l))
+        shifted = np.roll(inputs, -number * blocks * window % max(len(f), 1), axis=0)
+        rehearse(t, s, shifted, r, found[number * blocks : (number + 1) * blocks])
+    return found
+
+
+def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
+    """Return thresholds (C,) at one rate of their own, all together at the rate 1 / ARL0, and the alarms counted.
+
+    Args:
+        largest: (B, C) statistics of blocks.
+        length: samples of a block.
+        arl0: samples between alarms.
+    """
+    level = length / arl0 / largest.shape[1]  # as if the candidates had nothing in common
+    for _ in range(30):
+        q = np.array([tail(column, level) for column in largest.T])
+        alarms = clusters((largest > q).any(axis=1))
+        rate = alarms / len(largest)
+        goal = length / arl0
+        if rate * len(largest) < FEWEST or abs(rate / goal - 1) < 0.005:
+            break
+        level *= goal / rate
+    return q, alarms
+
+
+def clusters(above: np.ndarray) -> int:
+    """Count runs of blocks with an alarm."""
+    return int(above[0]) + int(np.sum(above[1:] & ~above[:-1]))
+
+
+def tail(column: Array, level: float) -> float:
+    """Return the statistic that a share `level` of the blocks exceeds, from an exponential tail where they are few."""
+    count = len(column)
+    ordered = np.sort(column)
+    exceed = level * count
+    base = min(count // 10, max(500, int(4 * exceed)))
+    if exceed >= 500 or base < 20:
+        return float(np.quantile(ordered, 1 - level))
+    start = ordered[count - base - 1]
+    scale = float(np.mean(ordered[count - base :] - start))
+    return float(start + scale * np.log(base / exceed))
+
+
+def held_levels(low: Array, high: Array, count: int, seed: int | None) -> Array:
+    """Return inputs (N, m), uniform between two bounds, every level held."""
+    drawn = np.random.default_rng(seed).uniform(low, high, (-(-count // HOLD), len(low)))
+    return np.repeat(drawn, HOLD, axis=0)[:count]

@@ -1,0 +1,350 @@
+"""The monitor: the search for faults on a stream, sample by sample."""
+
+import hashlib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.arl import Calibration, calibrate, held_levels
+from optid.faults.monitor_tables import State, Tables, blank, monitored, tables
+from optid.faults.signatures import Dictionary, dictionary
+from optid.models.feedback_tables import tabulated
+from optid.models.state_simulation import state_like
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+RULES = {
+    "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
+    "forgiven": 0.3, "wide": 0.0, "odd": 4.3,
+}
+"""Numbers of the decisions, in the order of `optid.faults.monitor_kernels`.
+
+A fault is named once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
+samples with all statistics below `release` of their thresholds. A named fault is carried `settle` samples later.
+A transient is dropped when what is left of it has this energy (`faded`). A carried fault is no longer estimated when
+the error of its size has this energy in a window (`learned`), and is gone when its significance falls below this share
+of the threshold (`forgiven`). `wide` is the variance of an unknown state, set by the model. Nothing explains an alarm
+when the energy that is left is so many standard deviations too large (`odd`).
+"""
+
+WIDE = 1e8
+"""Energy that a state of which nothing is known may have in one innovation."""
+
+KINDS = ("alarm", "isolated", "cleared", "untestable", "testable", "isolated")
+EVENTS = 64
+"""Events taken out of the compiled loop at a time."""
+
+INPUTS = 20_000
+"""Samples of simulated input for the calibration."""
+
+_KNOWN: dict[str, Calibration] = {}
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened.
+
+    Attributes:
+        kind: "alarm", "isolated" (the set of candidates shrank to one, or did not in time), "cleared", "untestable" (a
+            whole loss of the actuator would go unnoticed, or be taken for a constant) or "testable" (again).
+        sample: when, counted from the first sample that the monitor saw.
+        candidates: (label, posterior), most probable first, those of the 95 % set; ("unknown", 1.0) where nothing
+            explains the alarm.
+        onset: sample that the fault began at, of the first candidate; for "untestable" the sample since when.
+        size: magnitudes of the first candidate, as in `Dictionary.signature`.
+        statistic: energy that the first candidate explains; of "untestable" the energy that a whole loss would have.
+        note: what else is to be known.
+    """
+
+    kind: str
+    sample: int
+    candidates: tuple[tuple[str, float], ...] = ()
+    onset: int | None = None
+    size: tuple[float, ...] = ()
+    statistic: float = 0.0
+    note: str = ""
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        text = f"{self.sample}: {self.kind}"
+        if self.candidates:
+            names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates]
+            text += ": " + ", ".join(names)
+        if self.kind == "untestable":
+            text += f" since {self.onset}"
+        elif self.onset is not None:
+            text += f", since {self.onset}"
+        if self.size:
+            text += ", size " + " ".join(f"{value:.4g}" for value in self.size)
+        return text + (f" ({self.note})" if self.note else "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe it in JSON types."""
+        return {**self.__dict__, "candidates": [[label, p] for label, p in self.candidates], "size": list(self.size)}
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A fault that was named and is accounted for since.
+
+    Attributes:
+        label: the candidate.
+        size: its magnitudes.
+        deviation: their standard deviations; zero once they are known well enough and no longer estimated.
+    """
+
+    label: str
+    size: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+
+class Monitor:
+    """A search for the faults of a dictionary on a stream.
+
+    It is a state: `step` and `run` change it. Missing readings correct nothing and count for nothing; after a missing
+    input the state of the plant is taken as unknown.
+
+    Attributes:
+        dictionary: the faults.
+        labels: of those that are looked for.
+        skipped: {label: why} of the others.
+        calibration: the thresholds and what they rest on.
+        window: samples of the window.
+    """
+
+    def __init__(
+        self,
+        model: "HammersteinSS",
+        faults: Dictionary | None = None,
+        arl0: float = 10_000,
+        window: int = 100,
+        seed: int | None = 0,
+        thresholds: Any = None,
+        *,
+        x0: Any = "unknown",
+        u: ArrayLike | None = None,
+        samples: int | None = None,
+        extrapolate: bool = False,
+        **rules: float,
+    ) -> None:
+        """Set up a monitor; the thresholds are simulated unless they are known.
+
+        Args:
+            model: the healthy model, with noise covariances.
+            faults: what is thought possible; biases of all parts and a jump of the state by default.
+            arl0: mean number of samples between false alarms.
+            window: samples that an onset is looked for in.
+            seed: of the simulation.
+            thresholds: a `Calibration` of an earlier monitor, {label: threshold} or (C,), instead of a simulation.
+            x0: the state before the first sample: "unknown", "zero" or (n,).
+            u: (N, m) inputs typical of the healthy plant, for the thresholds of losses and stuck actuators; levels over
+                the intervals of the nonlinearities by default.
+            samples: length of the simulation.
+            extrapolate: whether thresholds may be extrapolated beyond what the simulation supports.
+            rules: numbers of the decisions, see `RULES`.
+
+        Raises:
+            StructureError: a dictionary of another model, a window that is too short, an unknown rule, no candidate.
+            DataError: a simulation too short for the ARL0.
+
+        Warns:
+            DataWarning: candidates that a monitor cannot look for.
+        """
+        found = dictionary(model) if faults is None else faults
+        if found.model is not model:
+            raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
+        least = 2 * model.nx + 2
+        if isinstance(window, bool) or int(window) != window or window < least:
+            raise StructureError(f"window={window!r}: at least {least} samples are needed for {model.nx} states.")
+        unknown = set(rules) - (set(RULES) - {"wide"})
+        if unknown:
+            raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
+        self.dictionary, self.window, self.seed = found, int(window), seed
+        self._chosen = tuple(c for c in found.candidates if monitored(c))
+        self.skipped = {
+            c.label: "its course may be anything, which only a record can be tested for"
+            for c in found.candidates if not monitored(c)
+        }
+        if not self._chosen:
+            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
+        for label, why in self.skipped.items():
+            warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
+        self.labels = tuple(c.label for c in self._chosen)
+        strength = float(np.max(np.sum((found.predictor.root @ found.predictor.C) ** 2, axis=0), initial=1e-300))
+        numbers = np.array([*({**RULES, **rules} | {"wide": WIDE / strength}).values()])
+        t = tables(found, self._chosen, self.window, numbers)
+        self._functions = tabulated(model.nonlinearities)
+        self.calibration = self._calibrated(t, arl0, thresholds, u, samples, extrapolate)
+        self._start(t._replace(q=np.array(self.calibration.q, dtype=float)), blank(t))
+        if isinstance(x0, str) and x0 == "unknown":
+            from optid.faults.monitor_kernels import lose_state
+
+            lose_state(self._tables, self._state)
+        elif not (isinstance(x0, str) and x0 == "zero"):
+            self._state.x[:] = state_like(model, x0)
+
+    def _start(self, t: Tables, s: State) -> None:
+        self._tables, self._state = t, s
+        model = self.dictionary.model
+        self._u, self._y = np.empty((1, model.m)), np.empty((1, model.l))
+        self._f = np.empty((1, t.B.shape[1]))
+        self._input_of = np.array(model.input_of, dtype=np.int64)
+        width = 5 + t.size.size + int(t.size.max())
+        self._events, self._event = np.zeros((EVENTS, width)), np.zeros((1, width))
+
+    def _calibrated(
+        self, t: Tables, arl0: float, thresholds: Any, u: ArrayLike | None, samples: int | None, extrapolate: bool
+    ) -> Calibration:
+        if thresholds is not None:
+            return self._given(thresholds, arl0)
+        f = self._rehearsed(u)
+        key = hashlib.sha256(repr((self.labels, float(arl0), samples, self.seed, extrapolate)).encode())
+        for part in (f, t.H, t.N, t.trace, t.course, t.size, t.drive_state, t.drive_output, t.into_state):
+            key.update(np.ascontiguousarray(part).tobytes())
+        name = key.hexdigest()
+        if name not in _KNOWN:
+            _KNOWN[name] = calibrate(
+                t, self.labels, f, arl0, samples=samples, seed=self.seed, extrapolate=extrapolate
+            )
+        return _KNOWN[name]
+
+    def _given(self, thresholds: Any, arl0: float) -> Calibration:
+        if isinstance(thresholds, Calibration):
+            if thresholds.labels != self.labels or thresholds.window != self.window:
+                raise StructureError(
+                    f"thresholds: they are those of {', '.join(thresholds.labels)} in a window of "
+                    f"{thresholds.window}; this monitor looks for {', '.join(self.labels)} in {self.window}."
+                )
+            return thresholds
+        if isinstance(thresholds, Mapping):
+            missing = [label for label in self.labels if label not in thresholds]
+            if missing:
+                raise StructureError(f"thresholds: none for {', '.join(missing)}.")
+            thresholds = [thresholds[label] for label in self.labels]
+        q = np.array(thresholds, dtype=float)
+        if q.shape != (len(self.labels),) or not np.all(q > 0):
+            raise StructureError(f"thresholds: one positive number for each of {', '.join(self.labels)} is needed.")
+        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None)
+
+    def _rehearsed(self, u: ArrayLike | None) -> Array:
+        model = self.dictionary.model
+        if not any(c.columns for c in self._chosen):
+            return np.zeros((0, model.B.shape[1]))
+        if u is not None:
+            inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
+            if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < self.window:
+                raise DataError(
+                    f"u has shape {np.shape(u)}: at least {self.window} samples of {model.m} inputs, none missing."
+                )
+            return model.expanded(inputs)
+        spans = [(-1.0, 1.0)] * model.m
+        for c, nonlinearity in zip(model.input_of, model.nonlinearities):
+            spans[c] = nonlinearity.basis.interval or spans[c]
+        low, high = np.array(spans).T
+        return model.expanded(held_levels(low, high, INPUTS, self.seed))
+
+    # -- samples -------------------------------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        """Samples seen."""
+        return int(self._state.counts[0])
+
+    def step(self, u: ArrayLike, y: ArrayLike) -> Event | None:
+        """Take in one sample; NaN is a missing value.
+
+        Args:
+            u: (m,) inputs.
+            y: (l,) readings.
+
+        Returns:
+            what happened, if anything; at most one event per sample.
+
+        Raises:
+            DataError: another number of channels, or an infinite value.
+        """
+        from optid.faults.monitor_kernels import march
+
+        self._u[0], self._y[0] = u, y
+        self._expand(self._u, self._f)
+        _, found, refused = march(self._tables, self._state, self._f, self._y, self._event)
+        if refused:
+            self._refuse()
+        return self._told(self._event[0]) if found else None
+
+    def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
+        """Take in a block of samples, with the same result as `step` for each of them.
+
+        Args:
+            u: (N, m) inputs.
+            y: (N, l) readings.
+        """
+        from optid.faults.monitor_kernels import march
+
+        model = self.dictionary.model
+        u, y = (np.ascontiguousarray(np.asarray(part, dtype=float).reshape(-1, width))
+                for part, width in ((u, model.m), (y, model.l)))
+        f = np.empty((len(u), self._tables.B.shape[1]))
+        self._expand(u, f)
+        events, done = [], 0
+        while done < len(y):
+            taken, found, refused = march(self._tables, self._state, f[done:], y[done:], self._events)
+            events += [self._told(line) for line in self._events[:found]]
+            if refused:
+                self._refuse()
+            done += taken
+        return events
+
+    def _expand(self, u: Array, f: Array) -> None:
+        if self._functions.compiled:
+            from optid.faults.monitor_kernels import expand
+
+            bad = expand(self._functions, self._input_of, u, f)
+            if bad >= 0:
+                raise DataError(f"sample {self.samples + bad}: an input is outside the interval of its basis.")
+        else:
+            f[:] = self.dictionary.model.expanded(u)
+
+    def _refuse(self) -> None:
+        raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it.")
+
+    def _told(self, line: Array) -> Event:
+        from optid.faults import monitor_kernels as kernels
+
+        code, sample, best, onset = (int(value) for value in line[:4])
+        kind, count = KINDS[code], len(self.labels)
+        label = self.labels[best] if best >= 0 else ""
+        if code in (kernels.UNTESTABLE, kernels.TESTABLE):
+            since = sample - self.window + 1 if code == kernels.UNTESTABLE else None
+            return Event(kind, sample, ((label, 1.0),), since, (), float(line[4]))
+        if code == kernels.CLEARED:
+            return Event(kind, sample, ((label, 1.0),) if label else (), None, (), 0.0)
+        if code == kernels.STRANGE:
+            return Event(kind, sample, (("unknown", 1.0),), onset, (), float(line[4]), "no candidate explains it")
+        gains = line[5 : 5 + count]
+        weight = np.exp((gains - gains.max()) / 2)
+        weight /= weight.sum()
+        order = [best, *(int(c) for c in np.argsort(-weight, kind="stable") if c != best)]
+        kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
+        size = tuple(float(v) for v in line[5 + count : 5 + count + self._chosen[best].dimension])
+        named = tuple((self.labels[c], float(weight[c])) for c in order[:kept])
+        return Event(kind, sample, named, onset, size, float(line[4]))
+
+    # -- what is known now ---------------------------------------------------------------------------------------
+
+    @property
+    def statistics(self) -> dict[str, float]:
+        """{label: largest energy explained over the onsets of the window} at the last sample."""
+        return dict(zip(self.labels, self._state.statistic.tolist()))
+
+    @property
+    def onsets(self) -> dict[str, int]:
+        """{label: onset at which it explains most}; -1 where it cannot be looked for yet."""
+        return dict(zip(self.labels, self._state.peak.tolist()))
