@@ -3,9 +3,15 @@
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from optid.data import Data
 from optid.errors import DataError, DataWarning
+
+
+def runs_of(present: ArrayLike) -> NDArray[np.intp]:
+    """Return first and one past the last position of every run of marks, (R, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(present, dtype=np.int8), [0]]))).reshape(-1, 2)
 
 
 def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice]]]:
@@ -23,9 +29,7 @@ def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice
     """
     kept, places = [], []
     for i, e in enumerate(data.experiments):
-        whole = np.isfinite(e.u).all(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(np.int8)))
-        for first, last in edges.reshape(-1, 2):
+        for first, last in runs_of(np.isfinite(e.u).all(axis=1)):
             # more outputs than states, or the initial state would repeat them
             if np.min(np.sum(~np.isnan(e.y[first:last]), axis=0)) >= shortest:
                 kept.append(data.select(experiments=i).window(int(first), int(last)))
@@ -52,7 +56,7 @@ def with_whole_inputs(data: Data, shortest: int) -> Data:
     if not lost.any():
         return data
     cut, _ = between_gaps(data, shortest)
-    total = sum(_stretches(gap) for gap in gaps)
+    total = sum(len(runs_of(~gap.any(axis=1))) for gap in gaps)
     channels = ", ".join(f"{name!r} ({count} samples)" for name, count in zip(data.inputs, lost) if count)
     dropped = total - cut.n_experiments
     short = f"; {dropped} shorter than {shortest} outputs {'is' if dropped == 1 else 'are'} left out" if dropped else ""
@@ -61,9 +65,3 @@ def with_whole_inputs(data: Data, shortest: int) -> Data:
         f"{cut.n_experiments} stretch{'es' if cut.n_experiments > 1 else ''}, each with an initial state of its own"
         f"{short}. Interpolated inputs would lose less where gaps are short", DataWarning, stacklevel=5)
     return cut
-
-
-def _stretches(gap: np.ndarray) -> int:
-    """Count the runs of samples in which no input is missing."""
-    whole = np.logical_not(np.any(gap, axis=1, keepdims=True))[:, 0]
-    return int(whole[0]) + int(np.count_nonzero(whole[1:] & ~whole[:-1]))

@@ -7,6 +7,7 @@ more than 2 L + 1 dimensions, however long they are.
 import numpy as np
 
 from optid.bases.basis import Array
+from optid.stretches import runs_of
 
 LONGEST = 4096
 """Samples looked at; more would tell nothing new about a few lines."""
@@ -21,8 +22,7 @@ JOINT, STEPS = 6, 3
 
 def longest_run(signals: Array) -> Array:
     """Return the longest stretch of rows (N, s) without NaN, at most `LONGEST` rows of it."""
-    present = ~np.isnan(signals).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8))).reshape(-1, 2)
+    edges = runs_of(~np.isnan(signals).any(axis=1))
     if not len(edges):
         return signals[:0]
     start, stop = edges[np.argmax(edges[:, 1] - edges[:, 0])]

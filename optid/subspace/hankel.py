@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from optid.bases.basis import Array
 from optid.errors import DataError, RankError, StructureError
 from optid.regressors.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.stretches import runs_of
 
 Expand = Callable[[Array], Array]
 """From raw channels (T, c) to signals (T, d), sample by sample."""
@@ -87,6 +88,13 @@ class HankelStatistics:
         """Return the positions of some signals at some block rows (all by default), block rows outermost."""
         block_rows = np.asarray(range(self.rows) if rows is None else rows, dtype=np.intp)
         return (1 + block_rows[:, None] * self.d + np.asarray(signals, dtype=np.intp)[None, :]).ravel()
+
+    def name(self, position: int) -> str:
+        """Name what stands at a position."""
+        if position == 0:
+            return "the constant"
+        row, signal = divmod(position - 1, self.d)
+        return f"{self.names[signal]} at block row {row + 1}"
 
     def triangle(self, order: Sequence[int] | NDArray[np.intp]) -> Array:
         """Return the upper triangular R, diagonal >= 0, with R^T R = gram[order][:, order]."""
@@ -197,9 +205,7 @@ def complete_runs(record: Array, rows: int) -> Iterator[Array]:
     if not np.isnan(record.sum()):  # the usual case, ten times faster
         yield record
         return
-    present = ~np.isnan(record).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs_of(~np.isnan(record).any(axis=1)):
         if stop - start >= rows:
             yield record[start:stop]
 
@@ -215,10 +221,7 @@ def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArra
     column = dependent_column(statistics.triangle(order), order.size, statistics.method)
     if column is None:
         return None
-    if order[column] == 0:
-        return "the constant"
-    row, signal = divmod(int(order[column]) - 1, statistics.d)
-    return f"{statistics.names[signal]} at block row {row + 1}"
+    return statistics.name(int(order[column]))
 
 
 def _means(runs: Sequence[Array], expand: Expand, chunk: int) -> Array:

@@ -5,7 +5,7 @@ innovations e are known; these are the residuals of a long autoregression of r (
 equation then gives the stabilising gain of the same spectrum.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
 from optid.regressors.factors import add_to_root
+from optid.stretches import runs_of
 from optid.subspace.observer import observer_gain
 
 if TYPE_CHECKING:
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 LONGEST = 40
 """Lags of the autoregression at most."""
+
+CHUNK = 4096
+"""Samples whose regressors are formed at once."""
 
 EXACT = 1e-8
 """Prediction errors relative to the outputs below which they are rounding."""
@@ -39,11 +43,12 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
     gain = observer_gain(model.A, model.C)
     errors, outputs = [], []
     for e in data.experiments:
-        for u, y in _complete(e.u, e.y):
-            drive = model.expanded(u) @ model.B.T + y @ model.L.T + model.offset_x
+        for start, stop in runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1))):
+            f, y = model.expanded(e.u[start:stop]), e.y[start:stop]
+            drive = f @ model.B.T + y @ model.L.T + model.offset_x
             for column, g, o in zip(model.E.T, model.feedback, model.output_of):
                 drive = drive + np.outer(g(y[:, o]), column)
-            direct = model.expanded(u) @ model.D.T + model.offset_y
+            direct = f @ model.D.T + model.offset_y
             errors.append(prediction_errors(model.A, model.C, gain, drive, direct, y))
             outputs.append(y)
     if not errors or np.all(np.std(np.concatenate(errors), axis=0) <= EXACT * np.std(np.concatenate(outputs), axis=0)):
@@ -57,13 +62,6 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         return with_noise(model, data), ""
     except StructureError as reason:
         return model, f"none: {reason}"
-
-
-def _complete(u: Array, y: Array) -> list[tuple[Array, Array]]:
-    """Cut a record into stretches without missing samples."""
-    present = ~(np.isnan(u).any(axis=1) | np.isnan(y).any(axis=1))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
-    return [(u[start:stop], y[start:stop]) for start, stop in edges.reshape(-1, 2)]
 
 
 def prediction_errors(a: Array, c: Array, gain: Array, drive: Array, direct: Array, y: Array) -> Array:
@@ -115,7 +113,7 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
     Raises:
         StructureError: errors that determine no gain: too few, zero, or on the stability limit.
     """
-    from optid.subspace.kernels import adjoint_responses
+    from optid.subspace.kernels import state_run
 
     (n, l), total = gain.shape, sum(map(len, errors))  # noqa: E741
     lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))
@@ -124,29 +122,27 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
         raise StructureError(f"{total} prediction errors are too few for a noise model.")
     root = np.zeros((lags * l + l, lags * l + l))
     for part in errors:
-        root = add_to_root(root, _lagged(part, lags))
+        for rows in _lagged(part, lags):
+            root = add_to_root(root, rows)
     regressive = np.linalg.lstsq(root[: lags * l, : lags * l], root[: lags * l, lags * l :], rcond=None)[0]
     size = n * l
     normal = np.zeros((size + 1, size + 1))
-    innovations = [np.concatenate([part[:lags], rows[:, lags * l :] - rows[:, : lags * l] @ regressive])
-                   for part in errors for rows in [_lagged(part, lags)]]
+    innovations = [np.concatenate([part[:lags], *(rows[:, lags * l :] - rows[:, : lags * l] @ regressive
+                                                  for rows in _lagged(part, lags))]) for part in errors]
     spread = np.sqrt(np.mean(np.concatenate([part[lags:] for part in innovations]) ** 2, axis=0))
     if not np.all(spread > 0):
         raise StructureError("an output is predicted exactly: the covariance of the innovations is singular.")
-    inner = np.ascontiguousarray((a - gain @ c).T)
+    inner = np.ascontiguousarray(a - gain @ c)
     for part, e in zip(errors, innovations):
-        out = np.empty((len(part), l, size))
-        adjoint_responses(inner, c, np.ascontiguousarray(e), np.zeros((l, n, l)), out)
-        for o in range(l):
-            rows = np.concatenate([out[lags:, o], (part - e)[lags:, o, None]], axis=1) / spread[o]
-            normal = add_to_root(normal, rows)
+        for out, left in _responses(inner, c, e, part - e, lags):
+            for o in range(l):
+                normal = add_to_root(normal, np.concatenate([out[:, o], left[:, o, None]], axis=1) / spread[o])
     change = np.linalg.lstsq(normal[:size, :size], normal[:size, size], rcond=None)[0].reshape(n, l)
-    k, rest = gain + change, np.zeros((l, l))
-    count = 0
+    k, rest, count = gain + change, np.zeros((l, l)), 0
     for part, e in zip(errors, innovations):
-        out = np.empty((len(part), l, size))
-        adjoint_responses(inner, c, np.ascontiguousarray(e), np.zeros((l, n, l)), out)
-        final = (part - out @ change.ravel())[lags:]
+        x = np.empty((len(e), n))
+        state_run(inner, np.ascontiguousarray(e @ change.T), np.zeros(n), x)
+        final = (part - x @ c.T)[lags:]
         rest += final.T @ final
         count += len(final)
     covariance = rest / count
@@ -155,8 +151,35 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
     return found.K, noise
 
 
-def _lagged(errors: Array, lags: int) -> Array:
-    """Return rows [r(k-1) .. r(k-lags) | r(k)]."""
+def _lagged(errors: Array, lags: int) -> Iterator[Array]:
+    """Yield rows [r(k-1) .. r(k-lags) | r(k)], some at a time."""
     windows = np.lib.stride_tricks.sliding_window_view(errors, lags + 1, axis=0)  # (T - lags, l, lags + 1)
-    past = windows[:, :, -2::-1].transpose(0, 2, 1).reshape(len(windows), -1)
-    return np.concatenate([past, windows[:, :, -1]], axis=1)
+    for start in range(0, len(windows), CHUNK):
+        part = windows[start : start + CHUNK]
+        past = part[:, :, -2::-1].transpose(0, 2, 1).reshape(len(part), -1)
+        yield np.concatenate([past, part[:, :, -1]], axis=1)
+
+
+def _responses(inner: Array, c: Array, e: Array, target: Array, first: int) -> Iterator[tuple[Array, Array]]:
+    """Yield, some samples from the first one on at a time, what the entries of M do to C (qI - F)^-1 M e, and targets.
+
+    Args:
+        inner: (n, n) F.
+        c: (l, n).
+        e: (T, l).
+        target: (T, l).
+        first: sample, less than `CHUNK`.
+
+    Yields:
+        (K, l, n l) and (K, l).
+    """
+    from optid.subspace.kernels import adjoint_responses
+
+    l, n = c.shape  # noqa: E741
+    transposed, state = np.ascontiguousarray(inner.T), np.zeros((l, n, l))
+    for start in range(0, len(e), CHUNK):
+        signals = np.ascontiguousarray(e[start : start + CHUNK])
+        out = np.empty((len(signals), l, n * l))
+        adjoint_responses(transposed, c, signals, state, out)
+        left_out = max(first - start, 0)
+        yield out[left_out:], target[start + left_out : start + CHUNK]

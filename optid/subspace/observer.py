@@ -19,6 +19,7 @@ from optid.bases.basis import Array
 from optid.errors import RankError
 from optid.rank_one import RankOne
 from optid.regressors.factors import add_to_root, conditioning
+from optid.stretches import runs_of
 from optid.subspace.expansion import Expansion
 
 CHUNK = 4096
@@ -207,9 +208,7 @@ def observer_problem(
 
 def _runs(record: Array, needed: NDArray[np.bool_]) -> Iterator[Array]:
     """Yield every stretch of samples in which the channels needed are complete."""
-    present = ~np.isnan(record[:, needed]).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs_of(~np.isnan(record[:, needed]).any(axis=1)):
         yield record[start:stop]
 
 

@@ -103,7 +103,7 @@ def rq(
     l21, l31 = triangle[: z.size, of_phi].T, triangle[: z.size, of_y].T
     size = np.linalg.norm(triangle[:, of_phi], axis=0)  # of the regressors before the projection
     if not size.all():
-        raise RankError(f"{_name(statistics, phi[int(np.argmin(size))])} is zero in every window: leave that basis "
+        raise RankError(f"{statistics.name(int(phi[int(np.argmin(size))]))} is zero in every window: leave that basis "
                         "function or channel out.")
     if form == "correlation":
         weight = triangle[: z.size, : z.size] / statistics.windows
@@ -141,8 +141,3 @@ def _regular(l21: Array, l31: Array) -> tuple[Array, Array, Array]:
 def _condition(matrix: Array) -> float:
     values = np.linalg.svd(matrix, compute_uv=False)
     return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
-
-
-def _name(statistics: HankelStatistics, position: int) -> str:
-    row, signal = divmod(int(position) - 1, statistics.d)
-    return f"{statistics.names[signal]} at block row {row + 1}"
