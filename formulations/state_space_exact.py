@@ -33,7 +33,6 @@ from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.subspace_procedure import Plan, feedback_bases, identified
 from optid.bases import fitted_bases
-from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataWarning, RankError, StructureError
 from optid.experiment.expansion import Bases
@@ -139,7 +138,7 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
     in_memory(data, f"{criterion} errors")
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
-    data = data.mapped(lambda u: u, lambda y: y, transform=Transform.identity(data.m, data.l))
+    data = data.without_transform()
     plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
                 offset=bool(offset), feedthrough=feedthrough, stability="free", iterations=2 * (
                     feedback_basis is not None))
@@ -221,8 +220,7 @@ def _with_noise(evidence: Evidence | None, error: StateError) -> Evidence | None
             errors = np.vstack([e.y for e in data.experiments]) - np.vstack(_listed(model.predict(data)))
             errors = errors[~np.isnan(errors).any(axis=1)]
             covariance = errors.T @ errors / max(len(errors), 1)
-            cross = model.K @ covariance
-            model = replace(model, noise=NoiseCovariances(cross @ model.K.T, covariance, cross, covariance))
+            model = replace(model, noise=NoiseCovariances.of_innovations(model.K, covariance))
         else:
             model = with_noise(model, data)
     except StructureError as reason:

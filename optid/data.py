@@ -332,6 +332,10 @@ class Data:
             self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l)
         )
 
+    def without_transform(self) -> "Data":
+        """Return the same samples without the way back to raw units."""
+        return self._with(transform=Transform.identity(self.m, self.l))
+
     def mapped(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
         """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y).
 

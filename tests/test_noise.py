@@ -8,19 +8,10 @@ from scipy.signal import csd
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.innovation_gain import _equations, _initial, covariance_of, innovations_covariance
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
-from optid.noise import (
-    _covariance,
-    _equations,
-    _initial,
-    _innovations,
-    colour,
-    estimate_noise,
-    noise_spectrum,
-    residuals,
-    with_noise,
-)
+from optid.noise import colour, estimate_noise, noise_spectrum, residuals, with_noise
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])
@@ -95,7 +86,7 @@ def test_no_other_gain_predicts_better():
     rest = residuals(bare(model), data)
 
     def loss(gain):
-        return np.linalg.slogdet(_innovations(A, C, gain.reshape(3, 2), rest))[1]
+        return np.linalg.slogdet(innovations_covariance(A, C, gain.reshape(3, 2), rest))[1]
 
     slope = approx_fprime(found.K.ravel(), loss, 1e-6)
     assert np.abs(slope).max() < 1e-3
@@ -108,7 +99,7 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
     model = truth(7)
     data = record(model, (400, 150), missing=0.1)
     rest, gain = residuals(bare(model), data), 0.5 * model.K
-    covariance = _innovations(A, C, gain, rest)
+    covariance = innovations_covariance(A, C, gain, rest)
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     starts = _initial(A - gain @ C, C, gain, rest)
 
@@ -124,7 +115,7 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
     jacobian = np.column_stack([(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(12)])
     step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0][:6]
     assert np.linalg.solve(*_equations(A, C, gain, rest, covariance)) == pytest.approx(step, rel=1e-4, abs=1e-7)
-    weight = np.diag(1 / np.sqrt(np.diag(_covariance(rest))))  # in which the initial states fit best
+    weight = np.diag(1 / np.sqrt(np.diag(covariance_of(rest))))  # in which the initial states fit best
     best = np.linalg.norm(errors(start))
     assert all(np.linalg.norm(errors(start + sign * h)) > best for h in 0.01 * np.eye(12)[6:] for sign in (-1, 1))
 
@@ -189,8 +180,7 @@ def test_without_noise_there_is_nothing_to_estimate():
 
 def test_covariances_with_missing_samples_by_hand():
     x = np.array([[1.0, 2.0], [np.nan, 1.0], [3.0, np.nan], [0.0, 1.0]])
-    assert _covariance([x])[0, 0] == pytest.approx(10 / 3) and _covariance([x])[0, 1] == pytest.approx(2 / 2)
-    assert _covariance([x], 1)[0, 1] == pytest.approx(3 / 1)
+    assert covariance_of([x])[0, 0] == pytest.approx(10 / 3) and covariance_of([x])[0, 1] == pytest.approx(2 / 2)
 
 
 def test_missing_inputs_cut_the_record():

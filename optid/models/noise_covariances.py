@@ -44,6 +44,16 @@ class NoiseCovariances:
             if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-8 * np.abs(matrix).max(initial=0.0):
                 raise StructureError(f"{name} is not symmetric.")
 
+    @classmethod
+    def of_innovations(cls, gain: Array, covariance: Array) -> "NoiseCovariances":
+        """Return those of ``w = K e, v = e``.
+
+        Args:
+            gain: K, (n, l).
+            covariance: (l, l) of the innovations e.
+        """
+        return cls(_congruent(gain, covariance), covariance, gain @ covariance, covariance)
+
     def mapped(self, states: Array, outputs: Array) -> "NoiseCovariances":
         """Return the covariances of T x and G y.
 
