@@ -1,0 +1,132 @@
+"""The search for two faults: equal to dense least squares over all pairs on random models."""
+
+import warnings
+
+import numpy as np
+import pytest
+from fault_plants import levels, standard
+from test_fault_injection import small
+from test_fault_scan import KINDS, LOAD, random_model, record
+
+from optid import Data
+from optid.errors import DataWarning, StructureError
+from optid.faults import Fault, dictionary, inject, model_uncertainty, pairs, scan, thresholds, whiten
+from optid.faults.calibration import Thresholds
+
+
+def penalties(found, seed=0):
+    q = np.random.default_rng(seed).uniform(5, 20, len(found.candidates))
+    return Thresholds(found.labels, q, 0.01, 0, 0, 0)
+
+
+def dense(result, limits):
+    """Energy less penalties of every pair of candidates, best over the onsets, by least squares on the window."""
+    found, r = result.dictionary, result.whitened.r.ravel()
+    size = len(found.candidates)
+    atoms = []
+    for c, candidate in enumerate(found.candidates):
+        for onset in np.flatnonzero(~np.isnan(result.statistic[c])):
+            G = result.signature(candidate, int(onset)).reshape(r.size, -1)
+            axes, values, _ = np.linalg.svd(G, full_matrices=False)
+            atoms.append((c, onset, axes[:, values > 3e-5 * values[0]]))
+    best, where = np.full((size, size), -np.inf), {}
+    for i, (c, k, first) in enumerate(atoms):
+        for other, j, second in atoms[i + 1 :]:
+            beside = second - first @ (first.T @ second)
+            axes, values, _ = np.linalg.svd(beside, full_matrices=False)
+            axes = axes[:, values > np.sqrt(2e-6)]
+            if not axes.shape[1]:
+                continue
+            gain = np.sum((first.T @ r) ** 2) + np.sum((axes.T @ r) ** 2) - limits.q[c] - limits.q[other]
+            low, high = sorted(((c, k), (other, j)))
+            if gain > best[low[0], high[0]]:
+                best[low[0], high[0]] = gain
+                where[low[0], high[0]] = low[1], high[1]
+    return best, where
+
+
+def compare(result, limits):
+    found = pairs(result, limits)
+    best, where = dense(result, limits)
+    there = np.isfinite(best)
+    np.testing.assert_array_equal(there, ~np.isnan(found.gains))
+    np.testing.assert_allclose(found.gains[there], best[there], rtol=1e-5, atol=1e-5)
+    top = np.unravel_index(np.argmax(best), best.shape)
+    assert found.best is not None and abs(found.gain - best[top]) < 1e-5
+    assert found.best.labels == tuple(result.labels[i] for i in top)
+    again = found.pair(*found.best.labels[::-1])
+    assert again == found.best
+    signatures = [result.signature(label, onset).reshape(result.whitened.r.size, -1)
+                  for label, onset in zip(found.best.labels, found.best.onsets)]
+    nu = np.linalg.lstsq(np.hstack(signatures), result.whitened.r.ravel(), rcond=None)[0]
+    fitted = np.hstack(signatures) @ found.estimate(found.best).nu
+    np.testing.assert_allclose(fitted, np.hstack(signatures) @ nu, atol=1e-5)
+    assert abs(np.sum(fitted**2) - found.best.energy) < 1e-4 * found.best.energy
+    return found
+
+
+@pytest.mark.parametrize("gaps", [0.0, 0.2])
+@pytest.mark.parametrize("shape", [(3, 2, 2), (2, 1, 1)])
+def test_all_pairs_are_dense_least_squares(shape, gaps):
+    model = random_model(1, *shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=KINDS, process={"load": np.ones(shape[0])})
+    data = record(model, 16, 1, gaps)
+    compare(scan(found, whiten(model, data, x0="zero"), data.experiments[0].u), penalties(found))
+
+
+def test_all_pairs_with_an_uncertain_model():
+    model = small()
+    found = dictionary(model, kinds=["bias", "drift", "loss"], process={"load": LOAD})
+    data = record(model, 16, 3, 0.05)
+    white = whiten(model, data, x0="zero", uncertainty=model_uncertainty(model, record(model, 120, 7)))
+    compare(scan(found, white, data.experiments[0].u), penalties(found))
+
+
+def test_two_faults_are_found(real_data):
+    model, load = standard(real_data)
+    found, u = dictionary(model, process={"load": load}), levels(300, 4)
+    y = inject(model, u, [Fault.step("actuator:u1", 160, 0.2), Fault.step("sensor:y2", 220, 0.15)], seed=2)
+    result = scan(found, whiten(model, Data(u, y), x0="zero"))
+    two = pairs(result, thresholds(found, 300, draws=5000))
+    assert two.best is not None and two.two and two.best.labels == ("actuator:u1", "sensor:y2")
+    assert abs(two.best.onsets[0] - 160) <= 2 and abs(two.best.onsets[1] - 220) <= 2
+    nu, covariance = two.estimate(two.best)
+    assert np.all(np.abs(nu - [0.2, 0.15]) < 4 * np.sqrt(np.diag(covariance)))
+    assert two.runner_up is not None and set(two.runner_up.labels) != set(two.best.labels) and two.margin > 0
+    assert two.gain >= np.nanmax(two.gains) and max(map(len, str(two).splitlines())) <= 80
+    same = pairs(result, two.thresholds, same=False)
+    assert same.best == two.best and np.isnan(np.diag(same.gains)).all()
+
+
+def test_one_fault_is_not_called_two():
+    model, u = small(), levels(120, 0)
+    found = dictionary(model)
+    result = scan(found, whiten(model, Data(u, inject(model, u, Fault.step("sensor:y1", 60, 0.8), seed=1)), x0="zero"))
+    two = pairs(result, thresholds(found, 120, draws=5000))
+    assert not two.two and two.single > two.gain > 0
+
+
+def test_faults_that_look_the_same_near_the_end_are_reported():
+    """With one output the last sample shows one number only, whatever it is that began there."""
+    model = random_model(1, 2, 1, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, state_jump=False)
+    two = pairs(scan(found, whiten(model, record(model, 30, 0))), penalties(found))
+    assert (("actuator:u", "sensor:y"), (29, 29)) in [tuple(a) for a in two.indistinguishable]
+    assert two.alike == len(two.indistinguishable) and "cannot be told apart" in str(two)
+
+
+def test_bad_input():
+    model, data = small(), record(small(), 40, 0)
+    found = dictionary(model, kinds=["bias", "loss"])
+    result = scan(found, whiten(model, data), data.experiments[0].u)
+    with pytest.raises(StructureError, match="no threshold for actuator:u1 loss.*u=u"):
+        pairs(result, thresholds(found, 40, draws=5000))
+    with pytest.raises(StructureError, match="other candidates"):
+        pairs(result, penalties(dictionary(model)))
+    long = scan(found, whiten(model, record(model, 12_000, 0)))
+    with pytest.raises(StructureError, match="too many for all pairs"):
+        pairs(long, penalties(found))
