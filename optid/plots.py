@@ -4,12 +4,10 @@ Long records are thinned to the extremes of every bin, so that figures stay smal
 """
 
 import warnings
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections.abc import Sequence
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, ParamSpec, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -20,15 +18,12 @@ from optid.models.functions import has_feedback, static_functions
 from optid.models.responses import response_pairs, step_length
 from optid.showing import panels, summary
 from optid.showing.estimates import uncertainty
-from optid.showing.panels import BLUE, INK, MUTED, ORANGE, STYLE, shorten, with_unit
+from optid.showing.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
 from optid.validation import validate
 from optid.validation.predictions import one_step, simulated
 
 if TYPE_CHECKING:
     from optid.fitting import Fit
-
-ZOOM = 200
-"""Samples in the close-up of a long record."""
 
 MOST_EXPERIMENTS = 3
 """Experiments drawn side by side; the title says how many there are."""
@@ -39,19 +34,7 @@ RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "pro
 THRESHOLD = 1e-8
 """Relative gap that counts as a proof."""
 
-P = ParamSpec("P")
-
-
-def _styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    @wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with matplotlib.rc_context(cast(Any, STYLE)):
-            return draw(*args, **kwargs)
-
-    return inside
-
-
-@_styled
+@styled
 def overview(fit: "Fit", test: Data | None = None) -> Figure:
     """Draw the whole result on one page: fit over time, nonlinearities, residual tests, poles, frequency response.
 
@@ -80,7 +63,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
     """Draw measured, simulated and one-step predicted outputs; long records with a close-up.
 
@@ -98,7 +81,7 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def nonlinearity(fit: "Fit") -> Figure:
     """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie."""
     count = len(static_functions(fit.model))
@@ -107,7 +90,7 @@ def nonlinearity(fit: "Fit") -> Figure:
     return figure
 
 
-@_styled
+@styled
 def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
     """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
 
@@ -124,7 +107,7 @@ def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def poles_and_response(fit: "Fit") -> Figure:
     """Draw poles, frequency response (with 95 % bands) and step response of the linear part."""
     figure = Figure(figsize=(10.0, 3.3), layout="constrained")
@@ -132,7 +115,7 @@ def poles_and_response(fit: "Fit") -> Figure:
     return figure
 
 
-@_styled
+@styled
 def noise(fit: "Fit") -> Figure:
     """Draw the spectral density of the noise at every output, in dB of its squared unit.
 
@@ -146,13 +129,13 @@ def noise(fit: "Fit") -> Figure:
     size = np.sqrt(np.abs(np.einsum("foo->fo", noise_spectrum(model, w))))
     figure = Figure(figsize=(6.4, 3.0), layout="constrained")
     ax = figure.subplots()
-    panels.draw_response(ax, w, size, [None] * model.l, [name.replace("$", r"\$") for name in model.outputs])
+    panels.draw_response(ax, w, size, [None] * model.l, [plain(name) for name in model.outputs])
     ax.set_title("Spectrum of the noise")
     ax.set_ylabel("power per unit of bandwidth (dB)")
     return figure
 
 
-@_styled
+@styled
 def certificate(fit: "Fit") -> Figure:
     """Draw how far the proof of global optimality went: the ladder of proofs and the gap that is left."""
     bound = fit.solution.bound
@@ -168,11 +151,11 @@ def certificate(fit: "Fit") -> Figure:
     threshold = max(THRESHOLD, 1.01 * gap) if fit.solution.proof else THRESHOLD
     panels.draw_gap(axes[-1], gap, threshold)
     reason = bound.reason if bound is not None and bound.reason else "no bound"
-    axes[0].set_title("\n".join(wrap(reason[0].upper() + reason[1:], 95)).replace("$", r"\$"))
+    axes[0].set_title(plain("\n".join(wrap(reason[0].upper() + reason[1:], 95))))
     return figure
 
 
-@_styled
+@styled
 def singular_values(fit: "Fit") -> Figure:
     """Draw the singular values of Theta of every input, before the rank is forced to one.
 
@@ -186,11 +169,11 @@ def singular_values(fit: "Fit") -> Figure:
         raise DataError(f"formulation {fit.formulation!r} has no matrix Theta with more than one row and column")
     figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
     for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
-        panels.draw_singular_values(ax, values, f"Singular values of Theta, {name}".replace("$", r"\$"))
+        panels.draw_singular_values(ax, values, plain(f"Singular values of Theta, {name}"))
     return figure
 
 
-@_styled
+@styled
 def spectra(fit: "Fit") -> Figure:
     """Draw the singular values that a procedure of several steps measured, from which it read the order.
 
@@ -203,7 +186,7 @@ def spectra(fit: "Fit") -> Figure:
     figure = Figure(figsize=(min(9.0, 4.4 * len(found) + 1.0), 2.9), layout="constrained")
     order = fit.model.orders.get("nx", 0)
     for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
-        panels.draw_singular_values(ax, values, (name[:1].upper() + name[1:]).replace("$", r"\$"), order or 1)
+        panels.draw_singular_values(ax, values, plain(name[:1].upper() + name[1:]), order or 1)
     return figure
 
 
@@ -242,7 +225,7 @@ def _longest(record: Data) -> int:
 
 def _needs_closeup(record: Data, factor: int) -> bool:
     """Whether a record is one long experiment, in which single samples cannot be told apart."""
-    return record.n_experiments == 1 and record.n_samples > factor * ZOOM
+    return record.n_experiments == 1 and record.n_samples > factor * CLOSEUP
 
 
 def _shown_simulation(fit: "Fit", record: Data) -> list[Array] | None:
@@ -294,13 +277,8 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
 
 
 def _closeup(ax: Any, below: Any, t: Array, y: Array, lines: Sequence[tuple[str, Array, dict[str, Any]]]) -> None:
-    """Draw the stretch of `ZOOM` samples in which the output moves most, and mark it in the panel above."""
-    starts = range(0, max(1, y.size - ZOOM), max(1, ZOOM // 2))
-    moved = [
-        float(np.nan_to_num(np.nanstd(y[s : s + ZOOM]) if np.any(~np.isnan(y[s : s + ZOOM])) else 0.0)) for s in starts
-    ]
-    first = starts[int(np.argmax(moved))]
-    part = slice(first, first + ZOOM)
+    """Draw the stretch in which the output moves most, and mark it in the panel above."""
+    part = panels.liveliest(y[:, None])
     panels.draw_record(below, t[part], [(label, signal[part], options) for label, signal, options in lines])
     ax.axvspan(t[part][0], t[part][-1], color=MUTED, alpha=0.15, linewidth=0)
     below.set_ylabel("close-up")
@@ -324,9 +302,9 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
             samples,
             None if function.fed_back else _f_band(fit, function.channel),
             name=with_unit(function.name, function.unit),
-            label=function.word.replace("$", r"\$"),
+            label=plain(function.word),
         )
-        ax.set_ylabel(f"{function.word}({function.name})".replace("$", r"\$"))
+        ax.set_ylabel(plain(f"{function.word}({function.name})"))
         what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
         ax.set_title(what if len(functions) == 1 else with_unit(f"{what} of {function.name}", ""))
 
@@ -343,9 +321,9 @@ def _residual_panels(figure: Any, fit: "Fit", record: Data, outputs: int, inputs
         for k, test in enumerate(tests):
             ax = next(axes)
             title = "Autocorrelation" if test.input is None else f"With past {shorten(test.input)}"
-            panels.draw_correlation(ax, test, title.replace("$", r"\$"))
+            panels.draw_correlation(ax, test, plain(title))
             if k == 0:
-                ax.set_ylabel(f"residual of {shorten(name)}".replace("$", r"\$"))
+                ax.set_ylabel(plain(f"residual of {shorten(name)}"))
 
 
 def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
@@ -354,7 +332,7 @@ def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
     widths = [1.0, 1.45, 1.25] if step else [1.0, 1.7]
     poles, response, *last = figure.subplots(1, len(widths), width_ratios=widths)
     panels.draw_poles(poles, model.poles)
-    names = [f"{u} to {y}".replace("$", r"\$") for u, y in response_pairs(model)]
+    names = [plain(f"{u} to {y}") for u, y in response_pairs(model)]
     for ax in last:
         steps = model.step_response(step_length(model))
         panels.draw_steps(ax, model.dt, steps.reshape(len(steps), -1), names)

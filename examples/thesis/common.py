@@ -7,16 +7,14 @@ Florida, 2005. Where its numbers are lost, the systems of `optid.examples` and `
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
 import optid
-from optid.showing.panels import STYLE
+from optid.showing.panels import styled as styled
 
 BETA = 0.75
 """Gauge of the dissertation: b = v_1 / beta, so that b has norm 4/3."""
@@ -46,17 +44,6 @@ def table(title: str, rows: Sequence[tuple[str, Any, str]]) -> None:
     for name, value, reference in rows:
         text = np.array2string(np.asarray(value, dtype=float), precision=4, suppress_small=True)
         print(f"{name:<46}{text:>22}  {reference}")
-
-
-def styled(main: Callable[[Path], Any]) -> Callable[[Path], Any]:
-    """Draw the figures of a script in the style of optid's own."""
-
-    @wraps(main)
-    def inside(folder: Path) -> Any:
-        with matplotlib.rc_context(STYLE):
-            return main(folder)
-
-    return inside
 
 
 def panels(rows: int, columns: int, **settings: Any) -> tuple[Figure, Any]:

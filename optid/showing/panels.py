@@ -1,8 +1,10 @@
 """Drawings on matplotlib axes: each function draws one panel, and knows nothing of the figure around it."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, FancyBboxPatch
@@ -55,14 +57,36 @@ STYLE: dict[str, Any] = {
 LINES = [(colour, dash) for dash in ("-", "--", ":") for colour in (BLUE, ORANGE, GREEN)]
 """Colour and dash of the first, second, ... of several curves."""
 
+CLOSEUP = 200
+"""Samples of a long record that are drawn where single ones are to be told apart."""
+
 POINTS = 2000
 """A line with more samples than this is drawn as the smallest and largest sample of each of half as many bins."""
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Draw in this style; the user's settings stay as they are."""
+
+    @wraps(draw)
+    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(cast(Any, STYLE)):
+            return draw(*args, **kwargs)
+
+    return inside
+
+
+def plain(text: str) -> str:
+    """Write text for a figure: a dollar sign is a dollar sign, not mathematics."""
+    return text.replace("$", r"\$")
+
+
 def with_unit(name: str, unit: str) -> str:
-    """Return "name (unit)", or the name alone; a dollar sign is text, not mathematics."""
-    label = f"{name} ({unit})" if unit else name
-    return label.replace("$", r"\$")
+    """Return "name (unit)", or the name alone, as `plain` text."""
+    return plain(f"{name} ({unit})" if unit else name)
 
 
 def shorten(name: str, most: int = 18) -> str:
@@ -83,6 +107,17 @@ def thinned(t: Array, y: Array) -> tuple[Array, Array]:
             continue
         picked += sorted({a + int(np.nanargmin(part)), a + int(np.nanargmax(part))})
     return t[picked], y[picked]
+
+
+def liveliest(y: Array) -> slice:
+    """Return the stretch of `CLOSEUP` samples in which the signals (N, s) move most, each in units of its spread."""
+    spread = np.nanstd(y, axis=0)
+    scaled = y / np.where(spread > 0, spread, 1.0)
+    starts = range(0, max(1, len(y) - CLOSEUP), CLOSEUP // 2)
+    windows = [scaled[start : start + CLOSEUP] for start in starts]
+    moved = [float(np.sum(np.nanstd(w[:, ~np.isnan(w).all(axis=0)], axis=0))) for w in windows]
+    first = starts[int(np.argmax(moved))]
+    return slice(first, first + CLOSEUP)
 
 
 def draw_record(ax: Axes, t: Array, lines: Sequence[tuple[str, Array, dict[str, Any]]]) -> None:
