@@ -24,7 +24,7 @@ from optid.faults.calibration import Thresholds
 from optid.faults.scanning import Scan
 from optid.faults.sparse import ActiveGroup, SparseResult
 from optid.group_sparse import GroupProblem
-from optid.program import GroupForm, Program, Values, View
+from optid.program import GroupForm, Program, View
 from optid.solution import Bound, Solution, Status
 from optid.solving import Evidence, Procedure
 
@@ -84,7 +84,8 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
     return Program(
         "fault.signature", cp.Minimize(0.5 * cp.sum_squares(residual) + level * norms),
         {"residual": (residual == misfit,)}, {**variables, "residual": residual},
-        {name: np.zeros(a.shape) for name, a in variables.items()}, dict, View({**variables, **sizes}, kind="signature"),
+        {name: np.zeros(a.shape) for name, a in variables.items()}, dict,
+        View({**variables, **sizes}, kind="signature"),
         structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, group=form,
         certify=partial(certify), scale=0.5 * float(r @ r))
 

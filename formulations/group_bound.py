@@ -1,8 +1,8 @@
 """The proof of a group-sparse programme: a lower bound recomputed from a feasible dual point.
 
-For ``min 1/2 ‖r - M a‖² + lambda sum w_g ‖a_g‖`` under affine constraints with the Lagrangian part ``c' a + k`` (k and c
-from their multipliers), every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. What a
-solver returns is scaled into that set, v and multipliers together, so that the bound holds whatever it was.
+For ``min 1/2 ‖r - M a‖² + lambda sum w_g ‖a_g‖`` under affine constraints whose multipliers make the part ``c' a + k``
+of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. What a solver
+returns is scaled into that set, v and multipliers together, so that the bound holds whatever it was.
 """
 
 from collections.abc import Iterable, Mapping

@@ -63,11 +63,11 @@ def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = No
     q = limits.of(found.labels)
     wanted = np.ones(found.statistic.shape[1], dtype=bool) if onsets is None else onsets
     places = [np.flatnonzero(~np.isnan(row) & wanted) for row in found.statistic]
-    size = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates)) * found.whitened.r.size
-    if size > MOST:
+    columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))
+    if columns * found.whitened.r.size > MOST:
         raise StructureError(
-            f"{size / found.whitened.r.size:.0f} columns of {found.whitened.r.size} readings are too many for a "
-            "programme over all onsets: use a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
+            f"{columns} columns of {found.whitened.r.size} readings are too many for a programme over all onsets: use "
+            "a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
     made = []
     for candidate, where, threshold in zip(found.dictionary.candidates, places, q):
         if not where.size:

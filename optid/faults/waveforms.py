@@ -1,0 +1,253 @@
+"""Can a fault of any course at one place explain the window? The test that keeps its promise whatever the course (F7).
+
+The signatures of impulses at all samples of a window span what an arbitrary waveform at a place can leave. What is left
+of the window after projecting on that space is chi-square distributed if the fault is at that place, whatever its
+course was. All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.faults.screening import FlatLine, flat_lines
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened
+
+RANK = 1e-10
+"""Singular values below this share of the largest are none."""
+
+LONGEST = 6000
+"""Readings of a window at most: the cost grows with their cube."""
+
+
+class Consistency(NamedTuple):
+    """Whether a fault of any course at a place explains the window.
+
+    Attributes:
+        name: of the place, as in `Fault`.
+        labels: of the candidates there.
+        energy: what is left of the window, chi-square distributed with `freedom` if the fault is there.
+        freedom: degrees of freedom.
+        limit: the quantile.
+        p_value: probability of more than this energy if the fault is there.
+        course: (N, d) the waveform that explains most; NaN in samples that no reading sees.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    energy: float
+    freedom: int
+    limit: float
+    p_value: float
+    course: Array
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the place is not ruled out."""
+        return self.energy <= self.limit
+
+
+@dataclass(frozen=True, eq=False)
+class WaveformTest:
+    """Every place, tested for a fault of any course.
+
+    Attributes:
+        places: the results, most probable first.
+        probability: with which the set holds the true place.
+        healthy: the window as it is: energy of a plant without a fault.
+        onset: first sample that the fault can change.
+        untested: {label: why} of the candidates that may explain anything or are of noise.
+        flat: sensors that repeat one reading to the bit, where the record was given.
+    """
+
+    places: tuple[Consistency, ...]
+    probability: float
+    healthy: Consistency
+    onset: int
+    untested: dict[str, str] = field(default_factory=dict)
+    flat: tuple[FlatLine, ...] = ()
+
+    @property
+    def consistent(self) -> tuple[str, ...]:
+        """Places that are not ruled out, most probable first; a frozen sensor alone where one repeats its reading."""
+        if self.flat:
+            return tuple(dict.fromkeys(line.name for line in self.flat))
+        return tuple(place.name for place in self.places if place.consistent)
+
+    @property
+    def best(self) -> str:
+        """The most probable place.
+
+        Raises:
+            StructureError: nothing was tested.
+        """
+        if not self.flat and not self.places:
+            raise StructureError("No place was tested.")
+        return self.consistent[0] if self.flat else self.places[0].name
+
+    @property
+    def energies(self) -> dict[str, float]:
+        """Energy that is left by place."""
+        return {place.name: place.energy for place in self.places}
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a healthy plant is ruled out at the same probability."""
+        return bool(self.flat) or not self.healthy.consistent
+
+    def __getitem__(self, name: str) -> Consistency:
+        """Return the result of a place or of a candidate there.
+
+        Raises:
+            LookupFailed: not tested, with the reason.
+        """
+        for place in self.places:
+            if name == place.name or name in place.labels:
+                return place
+        if name in self.untested:
+            raise LookupFailed(f"{name!r} was not tested: {self.untested[name]}.")
+        raise LookupFailed(f"{name!r} was not tested. {nearest(name, [place.name for place in self.places])}")
+
+    def __str__(self) -> str:
+        """Print the places, and who is consistent."""
+        lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
+                 f"  {'place':<36}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
+        for place in (*self.places, self.healthy):
+            numbers = f"{place.energy:>12.1f}{place.limit:>9.1f}{place.p_value:>10.2g}"
+            lines.append(f"  {place.name[:35]:<36}{numbers}  {'in the set' if place.consistent else 'ruled out'}"[:80])
+        lines += [f"  not tested: {label[:24]}, {why}"[:80] for label, why in self.untested.items()]
+        return "\n".join([*lines, *map(str, self.flat)])
+
+
+def waveform_test(
+    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0, u: ArrayLike | None = None,
+    free_start: bool = True, data: Data | None = None,
+) -> WaveformTest:
+    """Test every place of a dictionary for a fault of any course.
+
+    Losses and stuck actuators are courses of their actuator; a frozen sensor is a course of its sensor.
+
+    Args:
+        found: the candidates.
+        whitened: the window; one experiment.
+        probability: with which the set is to hold the true place.
+        onset: first sample that the fault can change; a later one makes the test sharper.
+        u: not needed; accepted so that all tests are called alike.
+        free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
+        data: the record of the window, for the flat-line test of frozen sensors.
+
+    Raises:
+        DataError: too few readings for a test, or other outputs than the model's.
+        StructureError: one output only, several experiments, a window that is too long.
+    """
+    _check(found, whitened, probability, onset)
+    count = whitened.r.size
+    r, readings = whitened.r.ravel(), int(whitened.present.sum())
+    start = start_matrix(found, whitened) if free_start else np.zeros((count, 0))
+    columns: dict[str, list[Candidate]] = {}
+    untested: dict[str, str] = {}
+    for candidate in found.candidates:
+        if candidate.kind == "noise":
+            untested[candidate.label] = "noise has no course: test its covariance (noise_test)"
+        elif candidate.into_state.shape[1] >= found.model.l:
+            untested[candidate.label] = "a course in as many directions as outputs explains any window"
+        else:
+            place = next((name for name, others in columns.items() if same_place(others[0], candidate)), None)
+            columns.setdefault(place or " | ".join(candidate.places), []).append(candidate)
+    places = []
+    for name, here in columns.items():
+        matrix = waveform_matrix(found, here[0], whitened, onset)
+        places.append(_fitted(name, tuple(c.label for c in here), r, matrix, start, readings, probability,
+                              here[0].into_state.shape[1]))
+    places.sort(key=lambda place: (-place.p_value, place.energy - 2 * place.freedom))
+    healthy = _fitted("healthy", (), r, np.zeros((count, 0)), start, readings, probability, 0)
+    flat = () if data is None else flat_lines(data)
+    return WaveformTest(tuple(places), probability, healthy, onset, untested, flat)
+
+
+def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened, onset: int = 0) -> Array:
+    """Return what unit impulses at every sample from the onset on leave in the window, (N l, (N - onset) d).
+
+    Args:
+        found: the dictionary.
+        candidate: whose place it is; the impulses are in units of a bias there, whatever its kind.
+        whitened: the window.
+        onset: first sample.
+    """
+    count, d = len(whitened.r), candidate.into_state.shape[1]
+    impulses = np.zeros((count, count - onset, d, d))
+    at = np.arange(count - onset)
+    impulses[at + onset, at] = np.eye(d)
+    into_state = np.einsum("ktjd,nj->kntd", impulses, candidate.into_state).reshape(count, found.model.nx, -1)
+    into_output = np.einsum("ktjd,lj->kltd", impulses, candidate.into_output).reshape(count, found.model.l, -1)
+    response = whitened.predictor.respond(into_state, into_output, whitened.present)
+    return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
+
+
+def start_matrix(found: Dictionary, whitened: Whitened) -> Array:
+    """Return what an error of the state at the start leaves in the window, (N l, n)."""
+    into_state = np.zeros((len(whitened.r), found.model.nx, found.model.nx))
+    into_state[0] = np.eye(found.model.nx)
+    into_output = np.zeros((len(whitened.r), found.model.l, found.model.nx))
+    response = whitened.predictor.respond(into_state, into_output, whitened.present)
+    return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
+
+
+def _fitted(name: str, labels: tuple[str, ...], r: Array, matrix: Array, start: Array, readings: int,
+            probability: float, d: int) -> Consistency:
+    from scipy.special import chdtrc, chdtri
+
+    whole = np.hstack([matrix, start])
+    sizes = np.linalg.norm(whole, axis=0)
+    seen = sizes > RANK * max(float(sizes.max(initial=0.0)), 1e-300)
+    course = np.full(matrix.shape[1], np.nan)
+    rank, rest = 0, r
+    if seen.any():
+        left, values, right = np.linalg.svd(whole[:, seen] / sizes[seen], full_matrices=False)
+        kept = values > RANK * values[0]
+        rank, along = int(kept.sum()), left[:, kept].T @ r
+        rest = r - left[:, kept] @ along
+        solved = (right[kept].T @ (along / values[kept])) / sizes[seen]
+        own = seen[: matrix.shape[1]]
+        course[own] = solved[: int(own.sum())]
+    freedom = readings - rank
+    if freedom < 1:
+        raise DataError(
+            f"{name}: {readings} readings leave nothing to test a waveform of {rank} values with: use a longer window.")
+    energy = float(rest @ rest)
+    return Consistency(name, labels, energy, freedom, float(chdtri(freedom, 1 - probability)),
+                       float(chdtrc(freedom, energy)), course.reshape(-1, max(d, 1)))
+
+
+def same_place(first: Candidate, second: Candidate) -> bool:
+    """Whether two candidates are in one place: waveforms of both are the same."""
+    parts = [np.vstack([c.into_state, c.into_output]) for c in (first, second)]
+    return parts[0].shape == parts[1].shape and bool(np.allclose(*parts, rtol=1e-12, atol=0))
+
+
+def _check(found: Dictionary, whitened: Whitened, probability: float, onset: int) -> None:
+    if not isinstance(whitened, Whitened):
+        raise StructureError(
+            "The waveform test takes the whitened innovations of one experiment: test them one by one.")
+    if not 0 < probability < 1:
+        raise StructureError(f"probability={probability!r}; a number between 0 and 1 is needed.")
+    if whitened.r.shape[1] != found.model.l:
+        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
+    if found.model.l < 2:
+        raise StructureError(
+            "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
+            "(bias, drift, loss) can be told apart by the exact search."
+        )
+    if onset != int(onset) or not 0 <= onset < len(whitened.r):
+        raise StructureError(f"onset={onset!r} lies outside the window of {len(whitened.r)} samples.")
+    if whitened.r.size > LONGEST:
+        raise StructureError(
+            f"{whitened.r.size} readings are too many for this test ({LONGEST}): use a shorter window.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
