@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -59,11 +60,17 @@ def write(content: dict[str, Any], path: str | Path, form: str, version: int) ->
     """
     path = Path(path)
     text = json.dumps({"format": form, "version": version, **content}, indent=1, allow_nan=False)
-    # an interrupted write must not leave half a file
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, path)
+    with complete(path) as part:
+        part.write_text(text, encoding="utf-8")
     return path
+
+
+@contextmanager
+def complete(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which becomes the file at the end: an interrupted write must not leave half of it."""
+    part = path.with_name(path.name + ".part")
+    yield part
+    os.replace(part, path)
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:

@@ -1,13 +1,9 @@
-"""The state of a tracker on disk: one npz file, restored bit for bit, read without running code."""
+"""The state of a tracker on disk."""
 
-import json
-import os
-import zipfile
 from pathlib import Path
 
-import numpy as np
-
 from optid.errors import ModelFileError, OptidError
+from optid.state_file import read_state, set_arrays, write_state
 from optid.tracking.tracker import SubspaceTracker
 
 VERSION = 1
@@ -17,13 +13,9 @@ SETTINGS = ("n", "r", "method", "forgetting", "missing", "names")
 
 def save(state: SubspaceTracker, path: str | Path) -> Path:
     """Write the whole state; the file appears complete or not at all."""
-    path = Path(path)
-    head = {"optid": "tracker", "version": VERSION, "settings": {name: getattr(state, name) for name in SETTINGS}}
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        np.savez(file, head=np.array(json.dumps(head)), **{name: getattr(state, name) for name in ARRAYS})
-    os.replace(part, path)
-    return path
+    settings = {name: getattr(state, name) for name in SETTINGS}
+    arrays = {name: getattr(state, name) for name in ARRAYS}
+    return write_state(path, "tracker", VERSION, {"settings": settings}, arrays)
 
 
 def load_tracker(path: str | Path) -> SubspaceTracker:
@@ -32,22 +24,10 @@ def load_tracker(path: str | Path) -> SubspaceTracker:
     Raises:
         ModelFileError: truncated, of another version, or not the state of a tracker.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
-            head, arrays = json.loads(str(file["head"])), {name: file[name] for name in ARRAYS}
-    except (ValueError, KeyError, EOFError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise ModelFileError(f"{path} is not the complete state of a tracker: {error}.") from error
-    if not isinstance(head, dict) or head.get("optid") != "tracker" or head.get("version") != VERSION:
-        raise ModelFileError(f"{path} is not the state of a tracker of version {VERSION}.")
+    head, arrays = read_state(path, "tracker", VERSION, ARRAYS)
     try:
         state = SubspaceTracker(**head["settings"])
     except (KeyError, TypeError, OptidError) as error:
         raise ModelFileError(f"{path}: the settings in the file cannot be read ({error}).") from error
-    for name, array in arrays.items():
-        wanted = getattr(state, name)
-        if array.dtype != wanted.dtype or array.shape != wanted.shape:
-            raise ModelFileError(f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} "
-                                 "is needed.")
-        setattr(state, name, np.ascontiguousarray(array))
+    set_arrays(state, arrays, path)
     return state
