@@ -41,6 +41,7 @@ _HOME = {
     "Certificate": "answers",
     "Diagnosis": "answers",
     "load_diagnosis": "answers",
+    "diagnose": "diagnosis",
 }
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME)

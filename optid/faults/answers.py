@@ -142,12 +142,13 @@ class Certificate:
     """Why the best answer is the best.
 
     Attributes:
-        kind: "exhaustive" (every candidate and onset was tried), "duality gap" (of a convex programme), "infeasible
-            healthy" (no healthy record within the bounds of the noise), or "none".
-        value: energy explained beyond the threshold, duality gap, or the factor by which the bounds of the noise would
-            have to grow.
-        runner_up_margin: by how much the best answer beats the next one in explained energy beyond the thresholds; inf
-            where there is no other.
+        kind: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality gap"
+            (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
+            line" (readings identical to the bit), or "none".
+        value: energy explained beyond the threshold, duality gap, the factor by which the bounds of the noise would
+            have to grow, or the number of equal readings.
+        runner_up_margin: twice the logarithm of the odds of the best answer against the next one, comparable with an
+            energy; inf where there is no other.
         parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None for the other kinds.
     """
 

@@ -10,11 +10,8 @@ if TYPE_CHECKING:
 
 WIDTH = 80
 
-KINDS = {
-    "bias": "offset", "drift": "drift", "jump": "jump", "loss": "loss", "stuck": "stuck", "frozen": "frozen",
-    "noise": "added noise", "spike": "outlier",
-}
-"""The kinds of the dictionary in words."""
+WORDS = {"drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading"}
+"""What the magnitude of a kind is called."""
 
 
 def estimate_line(fault: "Estimate") -> str:
@@ -36,6 +33,9 @@ def size_words(fault: "Estimate") -> list[str]:
     for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
         if word == "share lost":
             value, low, high = (float(np.clip(number, 0.0, 1.0)) for number in (value, low, high))
+        if word == "reading":
+            lines.append(f"{word} {value:.6g}")
+            continue
         interval = f"{low:.3g} to {high:.3g}"
         if not np.isfinite([low, high]).all():
             lines.append(f"{word} unknown")
@@ -52,7 +52,7 @@ def magnitude_names(fault: "Estimate") -> list[str]:
     if fault.kind in ("loss", "stuck"):
         constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
         return ["share lost", *constants]
-    word = {"drift": "slope", "jump": "jump", "noise": "standard deviation"}.get(fault.kind, "size")
+    word = WORDS.get(fault.kind, "size")
     if d == 1:
         return [word]
     part = "state" if fault.name.startswith(("state", "process")) else "part"
@@ -108,11 +108,14 @@ def headline(found: "Diagnosis") -> str:
 def certificate_words(found: "Diagnosis") -> str:
     """Say what the answer rests on."""
     proof = found.certificate
-    if proof.kind == "exhaustive":
-        words = f"proof: every candidate and onset was tried; explains {proof.value:.1f} beyond its threshold"
-        return words + (
-            f", {proof.runner_up_margin:.1f} more than the next" if np.isfinite(proof.runner_up_margin) else ""
-        )
+    if proof.kind in ("exhaustive", "grid"):
+        tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
+        words = f"proof: {tried}; energy explained beyond its threshold {proof.value:.1f}"
+        if np.isfinite(proof.runner_up_margin):
+            words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
+        return words
+    if proof.kind == "flat line":
+        return f"proof: {proof.value:.0f} readings in a row are identical to the bit"
     if proof.kind == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
     if proof.kind == "infeasible healthy":
@@ -154,8 +157,8 @@ def explained(found: "Diagnosis") -> str:
     if found.verdict == "healthy":
         sentences = [
             f"The record of {found.window} samples is what the healthy {found.model} predicts.",
-            f"A healthy plant gives an alarm at least as near with probability {_probability(found.p_value)}; below "
-            f"{found.false_alarm:g} it would count.",
+            f"Healthy records depart as far from it with probability {_probability(found.p_value)}; below "
+            f"{found.false_alarm:g} that would be an alarm.",
         ]
     elif found.verdict == "untestable":
         sentences = [f"Nothing can be said about {_list(list(found.untestable))}: the input does not excite it."]
@@ -179,15 +182,17 @@ def explained(found: "Diagnosis") -> str:
 
 def _faulty(found: "Diagnosis") -> list[str]:
     answers = found.candidates
-    best = answers[0]
-    names = _list([_phrase(answer) for answer in answers], "or")
-    first = f"The record is not healthy (p-value {_probability(found.p_value)}): {names}."
-    if len(answers) == 1:
-        sure = f"It is the only one left of the candidates at {100 * found.coverage:g} %"
-        second = f"{sure} (probability {best.posterior:.3f})."
+    best, others = answers[0], answers[1:]
+    most = "most probably " * bool(others)
+    first = f"The record is not healthy (p-value {_probability(found.p_value)}): {most}{_phrase(best)}."
+    if others:
+        shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
+        second = (
+            f"The record cannot tell it (probability {best.posterior:.2f}) from {shares} at {100 * found.coverage:g} %."
+        )
     else:
-        shares = ", ".join(f"{answer.label} {answer.posterior:.2f}" for answer in answers)
-        second = f"The record cannot choose between them at {100 * found.coverage:g} %: {shares}."
+        sure = f"No other candidate is left at {100 * found.coverage:g} %"
+        second = f"{sure} (probability {best.posterior:.3f})."
     proof = certificate_words(found)
     return [first, second, proof[0].upper() + proof[1:] + "."]
 
@@ -203,4 +208,6 @@ def _list(words: list[str], joint: str = "and") -> str:
 
 
 def _probability(value: float) -> str:
+    if value < 1e-300:
+        return "below 1e-300"
     return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"

@@ -4,16 +4,11 @@ Three tests that know nothing of the dictionary (energy, a line in the spectrum,
 the rest for a further fault of it.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from optid.bases.basis import Array
 from optid.faults.answers import Remaining
 from optid.faults.whitening import Whitened
-
-if TYPE_CHECKING:
-    from optid.faults.scanning import Scan
 
 UNFIT = 1e-3
 """An answer whose rest is less probable than this does not explain the record."""
@@ -28,7 +23,7 @@ def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float =
     Args:
         whitened: the window.
         rest: (N, l) whitened innovations less what the answer explains.
-        magnitudes: number of magnitudes that were estimated.
+        magnitudes: numbers that were estimated from the window, the initial state among them.
         further: p-value of the search of the rest for a further fault.
     """
     from scipy.special import chdtrc
@@ -57,9 +52,9 @@ def alarm_probability(gain: float, false_alarm: float) -> float:
     return float(-np.expm1(np.log1p(-false_alarm) * np.exp(-gain / 2)))
 
 
-def further_fault(scan: "Scan", gains: Array, false_alarm: float) -> float:
+def further_fault(gains: Array, false_alarm: float) -> float:
     """Return the p-value of the largest gain (C, N) of a search of the rest."""
-    return alarm_probability(float(np.nanmax(gains)), false_alarm) if not np.isnan(gains).all() else 1.0
+    return 1.0 if np.isnan(gains).all() else alarm_probability(float(np.nanmax(gains)), false_alarm)
 
 
 def _spectrum(rest: Array, present: np.ndarray) -> tuple[float, float, float]:

@@ -130,6 +130,17 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
     return ModelUncertainty(gained, steady, root, readings)
 
 
+def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
+    """Return the uncertainty of a model that is exact, in records whose initial state is estimated.
+
+    Args:
+        model: with noise covariances.
+        steady: its predictor.
+    """
+    gained = replace(model, K=steady.K)
+    return ModelUncertainty(gained, steady, np.zeros((len(_parameters(gained)[0]), 0)), 0)
+
+
 def _parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
     """Return the parameters, a step for each, and the way back."""
     used = [name for name in MATRICES if np.any(getattr(model, name))]

@@ -52,7 +52,7 @@ class Explanation(NamedTuple):
         """Logarithm of the marginal likelihood, onsets summed out."""
         from scipy.special import logsumexp
 
-        return float(logsumexp(self.logs))
+        return float(np.asarray(logsumexp(self.logs)))
 
     @property
     def weights(self) -> Array:
@@ -135,9 +135,12 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
     covariances, sizes, energies, ranks = _solved(gram, correlation)
     prior = sum(np.log(max(np.sum(~np.isnan(scan.statistic[scan.index(c)])), 1)) for c in candidates)
     logs = marginal(energies, total) - prior
-    logs[ranks < total] = -np.inf  # not distinguishable there
-    if not np.isfinite(logs).any():
-        logs = marginal(energies, total) - prior
+    apart = ranks == total  # elsewhere one of them explains as much
+    for i, first in enumerate(candidates):
+        for j, second in enumerate(candidates[:i]):
+            if first is second:  # counted once
+                apart &= ranges[j][rows[j]] < ranges[i][rows[i]]
+    logs = np.where(apart, logs, -np.inf) if apart.any() else logs
     logs = logs + _bounded(candidates, sizes, covariances)
     kept = logs > logs.max() - NEGLIGIBLE
     where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)

@@ -1,0 +1,136 @@
+"""The search of one experiment: innovations, statistics, thresholds, and what the record cannot tell."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Data, Experiment
+from optid.errors import StructureError
+from optid.faults.calibration import EXCEEDING, Thresholds, thresholds
+from optid.faults.excitation import untestable
+from optid.faults.leftover import alarm_probability, left_over
+from optid.faults.outliers import cleaned
+from optid.faults.records import enough, one_record
+from optid.faults.scanning import Scan, scan
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened, whiten
+
+if TYPE_CHECKING:
+    from optid.faults.answers import Remaining
+    from optid.faults.diagnosis import Question
+
+UNKNOWN_SHARE = 0.1
+"""Share of the false alarms that goes to departures from health that no candidate describes."""
+
+SIMULATED = 2_000_000
+"""Samples of all simulated windows together, above which fewer windows are simulated."""
+
+DRAWS = 20_000
+"""Simulated windows behind the thresholds of a short record."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One experiment as the search sees it.
+
+    Attributes:
+        part: the record, without readings that were taken out.
+        whitened: its innovations, bounded where outliers are.
+        search: of the innovations; None where no candidate has a signature.
+        limits: thresholds of the search; None without a search.
+        gains: (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable.
+        lost: {label: why} of candidates that are not testable.
+        healthy: what is left of the record if nothing is wrong.
+        outliers: (sample, output) of readings that were taken out.
+    """
+
+    part: Experiment
+    whitened: Whitened
+    search: Scan | None
+    limits: Thresholds | None
+    gains: Array
+    lost: dict[str, str]
+    healthy: "Remaining"
+    outliers: tuple[tuple[int, int], ...]
+
+    @property
+    def tested(self) -> list[Candidate]:
+        """The candidates that may be the answer."""
+        if self.search is None:
+            return []
+        candidates = self.search.dictionary.candidates
+        return [c for c, gains in zip(candidates, self.gains) if not np.isnan(gains).all()]
+
+    def p_value(self, asked: "Question", unknown: bool) -> float:
+        """Return the probability of so strong a departure from health; an alarm is at or below the false-alarm rate.
+
+        Args:
+            asked: with the false-alarm rate.
+            unknown: whether departures that no candidate describes count.
+        """
+        values = [1.0]
+        if self.limits is not None and not np.isnan(self.gains).all():
+            rate = self.limits.false_alarm
+            values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * asked.false_alarm / rate)
+        if unknown:
+            values.append(self.healthy.p_value / UNKNOWN_SHARE)
+        return min(values)
+
+
+def look(
+    record: Data, part: Experiment, found: Dictionary, asked: "Question", noise: Mapping[str, Any]
+) -> Seen:
+    """Search one experiment.
+
+    Args:
+        record: that it belongs to.
+        part: the experiment, without readings that stand still.
+        found: the candidates.
+        asked: what is asked.
+        noise: arguments of `whiten`: uncertainty and scale.
+
+    Raises:
+        DataError: too few samples.
+        StructureError: thresholds of another length or dictionary.
+    """
+
+    def whitened_of(experiment: Experiment) -> Whitened:
+        white = whiten(found.model, one_record(record, experiment), **noise)
+        enough(white, found.model.nx)
+        return white
+
+    white = whitened_of(part)
+    outliers: tuple[tuple[int, int], ...] = ()
+    search = limits = None
+    gains, lost = np.full((len(found.candidates), len(white.r)), np.nan), {}
+    if any(c.additive or c.columns for c in found.candidates):
+        if asked.robust:
+            search, part, outliers = cleaned(found, part, whitened_of)
+        else:
+            search = scan(found, white, part.u)
+        white = search.whitened
+        limits = _limits(found, white, part.u, asked)
+        lost = untestable(search)
+        gains = search.gains(limits)
+        gains[[label in lost for label in found.labels]] = np.nan
+    healthy = left_over(white, white.r, found.model.nx)
+    return Seen(part, white, search, limits, gains, lost, healthy, outliers)
+
+
+def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> Thresholds:
+    given, count = asked.thresholds, len(white.r)
+    if given is not None:
+        if given.window != count:
+            raise StructureError(
+                f"The thresholds are for windows of {given.window} samples; the record has {count}. Calibrate them "
+                f"with thresholds(faults, {count}, ...), or leave them out."
+            )
+        return given
+    rate = asked.false_alarm * (1 - UNKNOWN_SHARE) if found.unknown else asked.false_alarm
+    needed = int(np.ceil(EXCEEDING / rate))
+    draws = max(needed, min(DRAWS, SIMULATED // count))
+    inputs = u if any(c.columns for c in found.candidates) else None
+    return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)

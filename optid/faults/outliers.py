@@ -1,0 +1,114 @@
+"""Searches that wild readings do not lead astray.
+
+Two things are done. A single reading that a spike explains better than any other candidate is taken out, and the
+predictor run without it, so that it leaves no trace in later innovations. What remains is bounded: with the best answer
+so far, what it leaves of an innovation beyond `BOUND` is cut to it, and the search is repeated on the sum. That is the
+algorithm of pseudo-values for the M-estimate of Huber (Huber, Robust Statistics, 1981, section 7.8).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.data import Experiment
+from optid.faults.posterior import marginal
+from optid.faults.records import without
+from optid.faults.scanning import Scan, scan
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened
+
+BOUND = 2.5
+"""Standard deviations beyond which an innovation counts no more than that."""
+
+WILD = 4.5
+"""Standard deviations that a spike must have to be taken out."""
+
+MOST = 0.05
+"""Share of the readings that may be taken out."""
+
+ROUNDS = 20
+"""Repetitions of the search on bounded innovations at most."""
+
+
+class Cleaned(NamedTuple):
+    """A search without the influence of wild readings.
+
+    Attributes:
+        search: of the bounded innovations.
+        part: the record without the readings that were taken out.
+        readings: (sample, output) that were taken out.
+    """
+
+    search: Scan
+    part: Experiment
+    readings: tuple[tuple[int, int], ...]
+
+
+def cleaned(found: Dictionary, part: Experiment, whitened_of: Callable[[Experiment], Whitened]) -> Cleaned:
+    """Search a record without the influence of wild readings.
+
+    Args:
+        found: the candidates.
+        part: the record.
+        whitened_of: its whitened innovations.
+    """
+    wide = with_spikes(found)
+    taken: list[tuple[int, int]] = []
+    whitened = whitened_of(part)
+    while len(taken) < MOST * whitened.present.sum():
+        reading = _wildest(scan(wide, whitened, part.u), len(found.candidates))
+        if reading is None:
+            break
+        taken.append(reading)
+        part = without(part, [reading])
+        whitened = whitened_of(part)
+    return Cleaned(_bounded(found, whitened, part.u), part, tuple(sorted(taken)))
+
+
+def _wildest(search: Scan, count: int) -> tuple[int, int] | None:
+    """The reading that a spike explains better than any of the first `count` candidates explains anything."""
+    statistic = np.nan_to_num(search.statistic, nan=-np.inf)
+    c = _likeliest(search.dictionary, statistic)
+    if c < count or statistic[c].max() < WILD**2:
+        return None
+    o = int(np.flatnonzero(search.dictionary.candidates[c].into_output[:, 0])[0])
+    return int(np.argmax(statistic[c])), o
+
+
+def _likeliest(found: Dictionary, statistic: Array) -> int:
+    return int(np.argmax([marginal(row.max(), c.dimension) for row, c in zip(statistic, found.candidates)]))
+
+
+def with_spikes(found: Dictionary) -> Dictionary:
+    """Return a dictionary that has the outliers of all sensors, behind its own candidates."""
+    n, l = found.model.nx, found.model.l  # noqa: E741
+    known = {c.name for c in found.candidates if c.kind == "spike"}
+    more = []
+    for name, column in zip(found.model.outputs, np.eye(l)):
+        place = f"sensor:{name}"
+        if place not in known:
+            more.append(Candidate(place, "spike", np.zeros((n, 1)), column[:, None], (), (f"{place} spike",), (place,),
+                                  True))
+    count = len(found.candidates) + len(more)
+    sines = np.full((count, count), np.nan)
+    sines[: len(found.candidates), : len(found.candidates)] = found.sines
+    return replace(found, candidates=(*found.candidates, *more), sines=sines)
+
+
+def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:
+    search, before = scan(found, whitened, u), None
+    for _ in range(ROUNDS):
+        statistic = np.nan_to_num(search.statistic, nan=-np.inf)
+        c = _likeliest(found, statistic)
+        candidate, onset = found.candidates[c], int(np.argmax(statistic[c]))
+        nu = search.estimate(candidate, onset).nu
+        fitted = search.signature(candidate, onset) @ nu
+        rest = whitened.r - fitted
+        search = scan(found, replace(whitened, r=fitted + np.clip(rest, -BOUND, BOUND)), u)
+        if before is not None and before[:2] == (c, onset) and np.allclose(nu, before[2], rtol=1e-3):
+            break
+        before = c, onset, nu
+    return search
