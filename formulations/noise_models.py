@@ -24,8 +24,9 @@ from optid.models import HammersteinARX, HammersteinTF, noise_filter
 from optid.program import Values
 from optid.rank_one.bilinear import minimise
 from optid.regressors import Layout
+from optid.regressors.linearised import Linearised
 from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns, linearise, predict
-from optid.regressors.sensitivities import Linearised, PlantPoint
+from optid.regressors.sensitivities import PlantPoint
 from optid.solving import Procedure
 
 Array = np.ndarray

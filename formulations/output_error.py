@@ -10,7 +10,8 @@ from optid.models import HammersteinARX, noise_filter
 from optid.models.gauges import gauge_factor
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.program import Values
-from optid.regressors.sensitivities import Linearised, Unknowns, expanded, linearise
+from optid.regressors.linearised import Linearised
+from optid.regressors.sensitivities import Unknowns, expanded, linearise
 
 Array = np.ndarray
 

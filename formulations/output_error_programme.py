@@ -19,7 +19,7 @@ from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.program import Program, RankOneForm, Values, View
 from optid.regressors import Layout
-from optid.regressors.sensitivities import Linearised
+from optid.regressors.linearised import Linearised
 
 Array = np.ndarray
 

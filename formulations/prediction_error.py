@@ -18,7 +18,7 @@ import numpy as np
 from optid.errors import StructureError
 from optid.judging import measure_violation
 from optid.program import Program
-from optid.regressors.sensitivities import Linearised
+from optid.regressors.linearised import Linearised
 from optid.solution import Bound, Solution, Status
 from optid.solving import Evidence
 

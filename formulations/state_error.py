@@ -17,7 +17,7 @@ from optid.data import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.state_forms import balancing
-from optid.regressors.sensitivities import Linearised
+from optid.regressors.linearised import Linearised
 from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
 
 Array = np.ndarray

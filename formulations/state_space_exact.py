@@ -40,7 +40,7 @@ from optid.judging import measure_violation
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.noise import with_noise
 from optid.program import Program, Values, View
-from optid.regressors.sensitivities import Linearised
+from optid.regressors.linearised import Linearised
 from optid.regressors.state_sensitivities import StateUnknowns
 from optid.solution import Status
 from optid.solving import Evidence, Procedure

@@ -25,20 +25,11 @@ from optid.models import noise_filter
 from optid.models.noise_filter import DEAD, PRESENT
 from optid.models.nonlinearity import Nonlinearity
 from optid.regressors.layout import Layout
-from optid.regressors.sensitivities import (
-    CONDITION_LIMIT,
-    Linearised,
-    PlantPoint,
-    Unknowns,
-    assembled,
-    compressed,
-)
+from optid.regressors.linearised import CONDITION_LIMIT, Linearised, assembled, compressed
+from optid.regressors.sensitivities import CHUNK, PlantPoint, Unknowns
 
 if TYPE_CHECKING:
     from optid.data import Data
-
-CHUNK = 4096
-"""Samples whose sensitivities are formed at a time: they stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ The model ``A(q) y = sum_c B_c(q) f_c(u_c) + d``, with an initial state that ent
     dy/da_i = -q^-i y / A,   dy/dmu_c = B_c eta_c / A,   dy/db_cj = q^-(nk_c + j) f_c / A,   dy/dd = 1 / A,
 
 so that one all-pole filter of the basis functions (na columns never, P per input) gives all of them by shifts and
-weighted sums. What leaves a chunk is a Gram matrix of [sensitivities | errors]; the filters keep their states from one
-chunk to the next. The initial states of an experiment are eliminated within it.
+weighted sums. What leaves a chunk is a Gram matrix of [sensitivities | errors] (`optid.regressors.linearised`); the
+filters keep their states from one chunk to the next.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.regressors.factors import add_to_root, conditioning
 from optid.regressors.layout import Layout
+from optid.regressors.linearised import CONDITION_LIMIT, Compressed, Linearised, assembled, compressed, eliminated
 
 if TYPE_CHECKING:
     from optid.data import Data
@@ -28,9 +28,6 @@ CHUNK = 4096
 
 TABLE = 1 << 18
 """Values of basis functions that are kept between linearisations: as many as stay in the processor's cache."""
-
-CONDITION_LIMIT = 1e6
-"""Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
 
 FORGOTTEN = 1e-13
 """Share of its peak below which the response to the initial state no longer informs about it."""
@@ -114,56 +111,6 @@ class Unknowns:
                           x[self.shared :].reshape(self.experiments, self.memory))
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Simulation errors (model less record) near a point: ``|e(x + dx)|² = |root dx_s + pull|² + states + remainder``.
-
-    Attributes:
-        root: (p, p) upper triangular factor for the shared unknowns, initial states eliminated.
-        pull: (p,) compressed errors.
-        states: (X, S, e) of every experiment: its initial state moves by ``-X^+ (S dx_s + e)``.
-        remainder: what no step changes.
-        rows: outputs present.
-        condition: estimated condition number of the column-scaled factor.
-        method: "gram" or "qr".
-    """
-
-    root: Array
-    pull: Array
-    states: tuple[tuple[Array, Array, Array], ...]
-    remainder: float
-    rows: int
-    condition: float
-    method: Literal["gram", "qr"]
-
-    @property
-    def reach(self) -> float:
-        """By how much a full step of the linearised problem would lower the sum of squares."""
-        return float(self.pull @ self.pull) + sum(float(e @ e) for _, _, e in self.states)
-
-    @property
-    def value(self) -> float:
-        """Sum of squared errors at the point."""
-        return self.reach + self.remainder
-
-    def follow(self, step: Array) -> Array:
-        """Return the steps (E n,) of the initial states that belong to a step (p,) of the shared unknowns."""
-        moves = [-np.linalg.lstsq(x, s @ step + e, rcond=1e-12)[0] for x, s, e in self.states]
-        return np.asarray(np.concatenate([*moves, np.zeros(0)]), dtype=float)
-
-    @cached_property
-    def whole(self) -> tuple[Array, Array]:
-        """Factor (p + E n, p + E n) and errors of all unknowns together, initial states last."""
-        p, n = len(self.pull), len(self.states[0][0])
-        total = p + n * len(self.states)
-        matrix, errors = np.zeros((total, total)), np.zeros(total)
-        matrix[:p, :p], errors[:p] = self.root, self.pull
-        for i, (x, s, e) in enumerate(self.states):
-            rows = slice(p + i * n, p + (i + 1) * n)
-            matrix[rows, :p], matrix[rows, rows], errors[rows] = s, x, e
-        return matrix, errors
-
-
 def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, ...] | None:
     """Return the basis functions (N, P) of all inputs side by side for every experiment, None beyond a limit.
 
@@ -204,29 +151,6 @@ def linearise(data: "Data", unknowns: Unknowns, point: PlantPoint, *, gauge: Arr
     return found
 
 
-def assembled(parts: Sequence["Compressed"], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
-              ) -> Linearised:
-    """Put the experiments together.
-
-    Args:
-        parts: one for each experiment.
-        n: size of an initial state.
-        p: number of shared unknowns.
-        gauge: as in `linearise`.
-        method: how the parts were compressed.
-    """
-    states, rest = zip(*(_eliminated(part.factor, n) for part in parts))
-    rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
-    together = len(rest) > 1 or len(rows_of_gauge)
-    stacked = np.vstack([*rest, *rows_of_gauge])
-    triangle = np.linalg.qr(stacked, mode="r") if together else stacked
-    full = np.zeros((p + 1, p + 1))
-    full[: len(triangle)] = triangle
-    condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
-    rows = sum(part.rows for part in parts)
-    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, method)
-
-
 def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK,
                 functions: Sequence[Array] | None = None) -> Array:
     """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors] without initial states.
@@ -237,7 +161,7 @@ def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int 
     total = np.zeros((unknowns.shared + unknowns.layout.na + 1,) * 2)
     for i in range(unknowns.experiments):
         part = _experiment(data, unknowns, point, i, "gram", chunk, None, functions, measured=True)
-        _, rest = _eliminated(part.factor, unknowns.memory)
+        _, rest = eliminated(part.factor, unknowns.memory)
         total += rest.T @ rest
     return total
 
@@ -249,42 +173,6 @@ def simulate(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = C
         run = _Run(unknowns, point, point.x0[i], chunk)
         found.append(np.concatenate([run.advance(e.u[k : k + chunk]) for k in range(0, len(e.u), chunk)]))
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class Compressed:
-    """One experiment: a factor of [x0 | shared | (measured) | errors], and the number of errors in it."""
-
-    factor: Array
-    rows: int
-
-
-def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
-               first: int = 0) -> Compressed:
-    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
-
-    Args:
-        blocks: (rows, columns) and the number of errors in each.
-        columns: number of columns.
-        method: "gram" or "qr".
-        gauge: (rows, p) directions without effect, which are given weight; None for none.
-        first: column of their first unknown.
-    """
-    total, rows = np.zeros((columns, columns)), 0
-    for block, count in blocks:
-        rows += count
-        used = slice(columns - block.shape[1], None)
-        if method == "qr":
-            total[used, used] = add_to_root(total[used, used], block) if used.start else add_to_root(total, block)
-        else:
-            total[used, used] += block.T @ block
-    if gauge is not None and len(gauge):
-        span = slice(first, first + gauge.shape[1])
-        energy = np.sum(total[:, span] ** 2, axis=0) if method == "qr" else np.diag(total)[span]
-        extra = np.zeros((len(gauge), columns))
-        extra[:, first:] = _weighted(gauge, energy)[0]
-        total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
-    return Compressed(total if method == "qr" else _factor(total), rows)
 
 
 def _experiment(data: "Data", unknowns: Unknowns, point: PlantPoint, index: int, method: str, chunk: int,
@@ -416,30 +304,3 @@ def _all_pole() -> Any:
     from numba import njit
 
     return njit(cache=True, nogil=True)(_march)
-
-
-def _factor(gram: Array) -> Array:
-    """Return F (square) with F^T F = gram, whatever its rank; the columns are scaled to norm one in between."""
-    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    size[size == 0] = 1.0
-    scaled = gram / np.outer(size, size)
-    try:
-        return np.asarray(np.linalg.cholesky(scaled).T * size, dtype=float)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(scaled)
-        root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"), dtype=float)
-        return root * size
-
-
-def _eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
-    """Split an upper triangular factor of [x0 | shared | errors] into the part of x0 and the rest."""
-    return (factor[:n, :n], factor[:n, n:-1], factor[:n, -1]), factor[n:, n:]
-
-
-def _weighted(gauge: Array | None, energy: Array) -> list[Array]:
-    """Rows [gauge | 0] that give the directions without effect a weight of the size of the others, of given energy."""
-    if gauge is None or not len(gauge):
-        return []
-    sizes = np.abs(gauge)
-    lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
-    return [np.hstack([gauge * np.where(lengths > 0, lengths, 1.0)[:, None], np.zeros((len(gauge), 1))])]

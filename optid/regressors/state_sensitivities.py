@@ -14,7 +14,8 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.errors import DataError
-from optid.regressors.sensitivities import Linearised, assembled, compressed
+from optid.models import state_simulation
+from optid.regressors.linearised import CONDITION_LIMIT, Linearised, assembled, compressed
 from optid.subspace.expansion import Expansion
 
 if TYPE_CHECKING:
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
 
 NUMBERS = 1_000_000
 """Entries of the sensitivities formed at a time."""
-
-CONDITION_LIMIT = 1e6
-"""Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,12 +256,15 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
 
 def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any) -> list[Array]:
     """Return the errors (N, l) (model less record) of every experiment, NaN where the output is missing."""
-    found = []
-    for i, e in enumerate(data.experiments):
-        point = unknowns.unpack(x)
-        runs = _runs(data, unknowns, point, i, model, 8192, sensitive=False)
-        found.append(np.vstack([outputs for outputs, _ in runs]) - e.y)
-    return found
+    point = unknowns.unpack(x)
+    found = model(point)
+    return [_simulated(unknowns, found, e, x0, None) - e.y for e, x0 in zip(data.experiments, point.x0)]
+
+
+def _simulated(unknowns: StateUnknowns, model: Any, e: Any, x0: Array, limits: Any) -> Array:
+    """Run a model over an experiment, with corrections where K is unknown, without them where it is not, (N, l)."""
+    simulator = "predict" if unknowns.innovations else "measured_feedback"
+    return state_simulation.run(state_simulation.prepared(model, simulator, e.u, e.y, limits, ""), x0)
 
 
 def _infinite(unknowns: StateUnknowns) -> Linearised:
@@ -309,8 +310,8 @@ class _Roots:
         return root
 
 
-def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: Any, chunk: int,
-          sensitive: bool = True) -> Iterator[tuple[Array, Array]]:
+def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: Any, chunk: int
+          ) -> Iterator[tuple[Array, Array]]:
     """Yield outputs (T, l) and sensitivities (T, l, n + shared) chunk by chunk."""
     from optid.regressors.state_sensitivity_kernel import sensitivities
 
@@ -328,7 +329,7 @@ def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, 
         outputs = np.empty((last - first, unknowns.l))
         jacobian = np.empty((last - first, unknowns.l, turn.shape[1]))
         sensitivities(matrices, places, signals, state, turn, outputs, jacobian)
-        yield outputs, jacobian if sensitive else np.zeros((0,))
+        yield outputs, jacobian
 
 
 def _fed_back(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: Any) -> Array:
@@ -337,11 +338,9 @@ def _fed_back(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: i
     missing = np.isnan(e.y)
     if not unknowns.expansion.feedback or not missing.any():
         return e.y
-    single = data.select(experiments=index)
+    limits = None if unknowns.innovations else state_simulation.allowed_range([e.y])
     try:
-        found = model(point)
-        run = found.predict if unknowns.innovations else found.simulate_measured_feedback
-        simulated = run(single, x0=point.x0[index])
+        simulated = _simulated(unknowns, model(point), e, point.x0[index], limits)
     except DataError:
         raise FloatingPointError from None
     return np.where(missing, simulated, e.y)
