@@ -31,7 +31,7 @@ def save(model: Any, path: str | Path) -> Path:
     Returns:
         The path.
     """
-    return write(to_dict(model), path, FORMAT, VERSION)
+    return write(model.to_dict(), path, FORMAT, VERSION)
 
 
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
@@ -117,13 +117,8 @@ def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, A
         raise ModelFileError(f"{path} is damaged: {error} Save the {what} again.") from error
 
 
-def to_dict(model: Any) -> dict[str, Any]:
-    """Describe a model in JSON types."""
-    return model.to_dict()
-
-
 def from_content(content: dict[str, Any], functions: dict[str, Any] | None = None) -> Any:
-    """Build the model that `to_dict` described; the errors are those of the parts."""
+    """Build the model that its `to_dict` described; the errors are those of the parts."""
     kind = content["kind"]
     if kind not in KINDS:
         raise ValueError(f"unknown kind of model {kind!r}.")

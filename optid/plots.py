@@ -292,14 +292,10 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
     for ax in list(axes.flat)[len(functions) :]:
         ax.set_axis_off()
     for ax, function in zip(axes.flat, functions):
-        samples = np.zeros(0)
-        if record is not None:
-            c, fed_back = function.channel, function.fed_back
-            samples = np.concatenate([(e.y if fed_back else e.u)[:, c] for e in record.experiments])
         panels.draw_nonlinearity(
             ax,
             function.nonlinearity,
-            samples,
+            np.zeros(0) if record is None else function.samples(record),
             None if function.fed_back else _f_band(fit, function.channel),
             name=with_unit(function.name, function.unit),
             label=plain(function.word),

@@ -19,6 +19,7 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import simulation
 from optid.streams import Stream
+from optid.stretches import interpolated
 from optid.uncertainty import Quantity, Uncertainty, aligned
 
 if TYPE_CHECKING:
@@ -156,7 +157,7 @@ def _residuals(model: "HammersteinARX", data: Data) -> Array:
 def _simulated(model: "HammersteinARX", u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.memory
-    u, start = _filled(u), _filled(y)[:n]
+    u, start = interpolated(u), interpolated(y)[:n]
     right = simulation.driven(model, u[n:]) + errors[n:]
     state = simulation.following_state(model, u[:n], start)
     count = min(n, len(right))
@@ -167,14 +168,3 @@ def _simulated(model: "HammersteinARX", u: Array, y: Array, errors: Array) -> Ar
                         "identify it with a stability constraint")
     outputs[np.isnan(y)] = np.nan
     return outputs
-
-
-def _filled(signal: Array) -> Array:
-    """Interpolate what is missing, channel by channel."""
-    filled = signal.copy()
-    where = np.arange(len(signal))
-    for column in filled.T:
-        lost = np.isnan(column)
-        if lost.any():
-            column[lost] = np.interp(where[lost], where[~lost], column[~lost])
-    return filled

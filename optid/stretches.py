@@ -1,4 +1,4 @@
-"""Records cut where an input is missing: no state is known beyond such a gap, so what follows starts anew."""
+"""Gaps: records cut where an input is missing, since no state is known beyond, and straight lines across."""
 
 import warnings
 
@@ -12,6 +12,16 @@ from optid.errors import DataError, DataWarning
 def runs_of(present: ArrayLike) -> NDArray[np.intp]:
     """Return first and one past the last position of every run of marks, (R, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(present, dtype=np.int8), [0]]))).reshape(-1, 2)
+
+
+def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
+    """Fill what is missing of samples (N, c) linearly, column by column; zeros where nothing is present."""
+    filled = np.array(samples, dtype=float)
+    for column in filled.T:
+        lost = np.isnan(column)
+        if lost.any() and not lost.all():
+            column[lost] = np.interp(np.flatnonzero(lost), np.flatnonzero(~lost), column[~lost])
+    return np.nan_to_num(filled)
 
 
 def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice]]]:

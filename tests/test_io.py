@@ -11,7 +11,7 @@ from systems import BASES, inputs, mimo, siso
 import optid
 from optid.bases import UserFunctions
 from optid.errors import ModelFileError, StructureError
-from optid.io import from_content, load, to_dict
+from optid.io import from_content, load
 from optid.models import Nonlinearity
 
 
@@ -19,7 +19,7 @@ from optid.models import Nonlinearity
 def test_round_trip_is_exact(model, tmp_path):
     path = model.save(tmp_path / "model.json")
     again = load(path)
-    assert to_dict(again) == to_dict(model)
+    assert again.to_dict() == model.to_dict()
     u = inputs(model)
     assert np.array_equal(again.simulate(u), model.simulate(u))
     assert [p.name for p in tmp_path.iterdir()] == ["model.json"]
@@ -29,8 +29,8 @@ def test_round_trip_is_exact(model, tmp_path):
 @given(numbers=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=9, max_size=9))
 def test_every_float_survives(numbers):
     model = siso(a=numbers[:2], b=(numbers[2:4],), offset=numbers[4])
-    again = from_content(json.loads(json.dumps(to_dict(model))))
-    assert to_dict(again) == to_dict(model)
+    again = from_content(json.loads(json.dumps(model.to_dict())))
+    assert again.to_dict() == model.to_dict()
 
 
 def test_no_outputs_of_a_model_without_past_outputs(tmp_path):

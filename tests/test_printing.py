@@ -6,7 +6,7 @@ import pytest
 from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, output_error_fit, two_by_two
 
 import optid
-from optid.showing.printing import describe, describe_validation
+from optid.showing.printing import describe
 
 
 def rows(text: str, title: str) -> dict[str, list[str]]:
@@ -132,7 +132,7 @@ def test_validation_text_has_the_fit_that_the_formula_gives():
     fit = linear_fit()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optid.errors.DataWarning)  # too short for the structure test
-        text = describe_validation(fit.model, fit.data)
+        text = str(optid.validate(fit.model, fit.data))
     assert re.search(r"y, one step +100\.00", text)
 
 

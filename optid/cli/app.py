@@ -174,7 +174,8 @@ def fit(
     from optid.cli import arguments as words
     from optid.fitting import fit as fit_model
     from optid.selection import fit_by_holdout
-    from optid.showing.printing import describe, describe_validation
+    from optid.showing.printing import describe
+    from optid.validation import validate as check
 
     words.check_folders(model, report)
     with hearing() as heard, Waiting() as waiting:
@@ -214,8 +215,7 @@ def fit(
         text = describe(found)
         if held_out is not None:
             waiting.step("validating")
-            checked = describe_validation(found.model, held_out)
-            text += f"\n\n{held_out.n_samples} samples held out of the fit\n{checked}"
+            text += f"\n\n{held_out.n_samples} samples held out of the fit\n{check(found.model, held_out)}"
         if model is not None:
             found.model.save(model)
         if report is not None:
@@ -248,7 +248,8 @@ def validate(
     """
     from optid.cli import arguments as words
     from optid.io import load
-    from optid.showing.printing import describe_validation
+    from optid.validation import compare_models
+    from optid.validation import validate as check
 
     words.check_folders(report)
     with hearing() as heard, Waiting() as waiting:
@@ -268,10 +269,8 @@ def validate(
         waiting.step("validating")
         found: Any = None
         if len(models) > 1 or report is not None:
-            from optid.validation import compare_models
-
             found = compare_models(models, record, horizon)
-        text = str(found) if len(models) > 1 else f"{first}\n\n{describe_validation(first, record, horizon)}"
+        text = str(found) if len(models) > 1 else f"{first}\n\n{check(first, record, horizon=horizon)}"
         if report is not None:
             from optid.report import write_comparison
 

@@ -3,7 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from optid.bases.basis import Array
 from optid.bases.expansions import Linear
+from optid.data import Data
 from optid.models.nonlinearity import Nonlinearity
 
 
@@ -31,6 +35,10 @@ class StaticFunction:
     def is_linear(self) -> bool:
         """Whether there is nothing to draw."""
         return isinstance(self.nonlinearity.basis, Linear)
+
+    def samples(self, data: Data) -> Array:
+        """Samples (N,) of its argument in a record, all experiments; NaN = missing."""
+        return np.concatenate([(e.y if self.fed_back else e.u)[:, self.channel] for e in data.experiments])
 
 
 def static_functions(model: Any) -> list[StaticFunction]:

@@ -2,14 +2,13 @@
 
 from itertools import zip_longest
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from optid.showing import estimates, summary
 from optid.showing.summary import Facts
 from optid.showing.wording import Table
 
 if TYPE_CHECKING:
-    from optid.data import Data
     from optid.fitting import Fit
     from optid.validation import Validation
 
@@ -68,13 +67,6 @@ def describe(fit: "Fit") -> str:
     )
     lines += [line for finding in fit.findings for line in _wrapped(f"Note: {finding}")]
     return "\n".join([*lines, _rule("=")])
-
-
-def describe_validation(model: Any, data: "Data", horizon: int = 1) -> str:
-    """Return the validation of a model on a record as text."""
-    from optid.validation import validate
-
-    return str(validate(model, data, horizon=horizon))
 
 
 def describe_checks(checked: "Validation") -> str:

@@ -202,8 +202,7 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
         if function.is_linear:  # known everywhere
             shares[function.name] = 0.0
             continue
-        c, name, basis = function.channel, function.name, function.nonlinearity.basis
-        samples = np.concatenate([(e.y if function.fed_back else e.u)[:, c] for e in data.experiments])
+        name, basis, samples = function.name, function.nonlinearity.basis, function.samples(data)
         shares[name] = basis.n_outside(samples) / max(int(np.sum(~np.isnan(samples))), 1)
         if shares[name] and basis.interval is not None:
             lo, hi = basis.interval

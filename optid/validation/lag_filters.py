@@ -10,6 +10,7 @@ from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import RankError
 from optid.model_order.ranks import rank_test
+from optid.stretches import interpolated
 from optid.subspace.hankel import HankelStatistics, hankel_statistics
 from optid.subspace.rq import rq
 
@@ -186,16 +187,6 @@ def convolved(values: Array, filters: Array) -> Array:
 
     columns = [oaconvolve(values, response[:, None], mode="valid", axes=0) for response in filters.T]
     return np.stack(columns, axis=1)
-
-
-def interpolated(u: Array) -> Array:
-    """Fill missing samples linearly, column by column."""
-    filled = u.copy()
-    for column in filled.T:
-        lost = np.isnan(column)
-        if lost.any() and not lost.all():
-            column[lost] = np.interp(np.flatnonzero(lost), np.flatnonzero(~lost), column[~lost])
-    return np.nan_to_num(filled)
 
 
 def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:
