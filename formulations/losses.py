@@ -133,7 +133,7 @@ def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], wei
     objective = _loss(pooled, kind, width) + penalty
     model = program.recover(solution.values)
     if not convex:
-        bound = Bound(-np.inf, False, "none", f"the exact form with the {kind} loss has no proof")
+        bound = Bound.none(f"the exact form with the {kind} loss has no proof")
         return Evidence(model, objective, bound, _settled(solution), bound.reason)
     limit = 2 * width if kind == "huber" else 1.0
     dual = 2 * w * pooled  # satisfies the stationarity of the weighted pass, hence of the dual, exactly

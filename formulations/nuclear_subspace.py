@@ -173,13 +173,13 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     program = nuclear_programme(structured, structured.penalty(weight))
     solution = yield program
     if not solution.has_point:
-        return _without(solution.status, solution.reason)
+        return Evidence.pointless(solution.status, solution.reason)
     vectors, sizes = structured.decomposed(solution.values)
     rank = rank_of(sizes, structured.floor)
     nx = plan.order or order_of(sizes, alpha - 1, structured.floor)
     if nx > rank:
-        return _without(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: use a "
-                                       "larger weight or a smaller order")
+        return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "
+                                                 "use a larger weight or a smaller order")
     figures = {"order": nx, "block rows": alpha, "form": plan.instruments, "singular values": sizes, **trials,
                "weight": weight, "lambda": structured.penalty(weight), "rank": rank,
                "objective of the convex programme": solution.objective,
@@ -191,10 +191,6 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status in (Status.LOCAL, Status.OPTIMAL):
         evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
     return evidence
-
-
-def _without(status: Status, reason: str) -> Evidence:
-    return Evidence(None, float("nan"), Bound(-np.inf, False, "none", reason), status, reason)
 
 
 def _chosen(plan: Plan, weights: tuple[float, ...], hold_out: float
@@ -380,7 +376,7 @@ def _explained(problem: NuclearProblem, predictor: Predictor, theta: cp.Variable
 def certify(problem: NuclearProblem, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the dual bound, recomputed from a feasible dual point near the multipliers, or near the subgradient."""
     if program.user_constraints:
-        return Bound(-np.inf, False, "none", "the dual bound is that of the programme without constraints"), None
+        return Bound.none("the dual bound is that of the programme without constraints"), None
     penalty = float(np.asarray(program.parameters["weight"].value))
     program.assign({name: values[name] for name in values if name not in program.derived})
     objective = float(np.asarray(program.objective.expr.value))

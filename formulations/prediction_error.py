@@ -364,7 +364,7 @@ def _judged(solution: Solution, gain: float, value: float, floor: float, share: 
 
 def _evidence(posed: Posed, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
     unknown = NO_BOUND.format(posed.criterion.errors)
-    bound = Bound(-np.inf, False, "none", unknown)
+    bound = Bound.none(unknown)
     reason = unknown if status is Status.LOCAL else reason
     return Evidence(posed.model(here.x), here.at.value, bound, status, reason, figures)
 

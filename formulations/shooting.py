@@ -127,7 +127,7 @@ class _Shooting:
         view = View(expressions, kind="exact", channels=layout.inputs, bases=dict(zip(layout.inputs, layout.bases)),
                     gauge=gauge, reference=reference)
         objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))
-        bound = Bound(-np.inf, False, "none", NO_BOUND)
+        bound = Bound.none(NO_BOUND)
         program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
                           variables=self.variables, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived=derived, scale=self.criterion.energy,

@@ -28,8 +28,7 @@ def simulation_bound(records: list[np.ndarray], step: ObserverProblem, error: fl
     """
     form = step.form
     if np.any(form.gain) or step.instrumented:
-        return Bound(-np.inf, False, "none", f"{said}; its objective is no simulation error, which the Hankel bound is "
-                                             "about")
+        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
     return bounded(records, form.expansion, form.n, form.weights, error, block_rows, said)
 
 
@@ -52,11 +51,11 @@ def bounded(records: list[np.ndarray], expansion: Expansion, n: int, weights: np
     tried = [a for a in (block_rows, 2 * block_rows, 4 * block_rows)
              if a > 1 and 2 * a * signals < longest and count * (a * signals) ** 2 <= WORK]
     if not tried:
-        return Bound(-np.inf, False, "none", said)
+        return Bound.none(said)
     try:
         bounds = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=n, block_rows=tried,
                                weights=weights)
         found = bounds.bound(n, error, "measured feedback")
     except OptidError as reason:
-        return Bound(-np.inf, False, "none", f"{said}; no Hankel bound: {reason}")
+        return Bound.none(f"{said}; no Hankel bound: {reason}")
     return Bound(found.value, False, found.method, f"{said}; {found.reason}", multipliers=bounds)

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from formulations.equation_error import model_meta
+from formulations.state_models import state_model
 from optid.bases import Linear
 from optid.data import Data
 from optid.errors import DataError, StructureError
-from optid.models import HammersteinSS, Nonlinearity
+from optid.models import HammersteinSS
 from optid.models.state_forms import balancing
 from optid.regressors.linearised import Linearised
 from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
@@ -125,18 +125,9 @@ class StateError:
 
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""
-        expansion, n, outputs = self.unknowns.expansion, self.unknowns.n, self.unknowns.l
-        families = expansion.feedback
-        injection, constant = np.zeros((n, outputs)), np.zeros(n)
-        for family, nu, e in zip(families, point.nus, point.e.T):
-            injection -= np.outer(e, nu @ family.slope)
-            constant -= e * (nu @ family.intercept)
-        return HammersteinSS(
-            A=point.A, B=point.b, C=point.C, D=point.d, K=point.K, E=point.e if families else None, L=injection,
-            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, point.mus)),
-            feedback=tuple(Nonlinearity(g.basis, g.vectors @ nu) for g, nu in zip(families, point.nus)),
-            output_of=tuple(g.output for g in families), offset_x=constant, offset_y=point.offset,
-            **model_meta(self.data))
+        matrices = point.A, point.b, point.C, point.d
+        return state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e, K=point.K,
+                           offset=point.offset)
 
     def point_of(self, model: HammersteinSS) -> StatePoint:
         """Return the point of a model of the same structure, its initial states zero.

@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 
 from formulations.arguments import one_of
-from formulations.equation_error import model_meta
 from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
 from formulations.simulation_bound import simulation_bound
 from formulations.stability import stable
+from formulations.state_models import state_model
 from optid.bases import fitted_bases
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.experiment.expansion import feedback_bases
-from optid.models import Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.solution import Bound, Solution, Status
+from optid.solution import Solution, Status
 from optid.solving import Evidence, Procedure
 from optid.subspace.channels import check_channels
 from optid.subspace.expansion import Expansion, expand
@@ -178,7 +177,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     if rules or unstable:
         shift = yield from constrained_shift(gamma[: -data.l], gamma[data.l :], rules or (stable(INSIDE),))
         if shift.a is None:
-            return Evidence(None, float("nan"), Bound(-np.inf, False, "none", shift.reason), shift.status, shift.reason)
+            return Evidence.pointless(shift.status, shift.reason)
         if shift.applied:
             figures["suboptimality of A under the pole constraints"] = shift.suboptimality
             if not rules:
@@ -192,8 +191,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
                                                  factored=plan.split == "exact")
     solution: Solution = yield program
     if not solution.has_point:
-        return Evidence(None, float("nan"), Bound(-np.inf, False, "none", solution.reason), solution.status,
-                        solution.reason)
+        return Evidence.pointless(solution.status, solution.reason)
     model = _model(plan, step, realisation.factors(solution.values))
     model, remark = model_innovations(model, data)
     figures |= _ratios(step)
@@ -325,22 +323,13 @@ def _inside(a: np.ndarray) -> np.ndarray:
 
 
 def _model(plan: Plan, step: ObserverProblem, factors: Factors) -> HammersteinSS:
-    form, data = step.form, plan.data
+    form = step.form
     n, l = form.n, form.l  # noqa: E741
     b = np.column_stack([part[:n] for part in factors.bs])
     d = np.column_stack([part[n:] if len(part) > n else np.zeros(l) for part in factors.bs])
-    functions = [Nonlinearity(basis, mu) for basis, mu in zip(form.expansion.inputs, factors.mus)]
-    families = form.expansion.feedback
-    feedback = [Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, factors.nus)]
-    injection, constant = np.zeros((n, l)), np.zeros(n)
-    for family, nu, e in zip(families, factors.nus, factors.es):
-        injection -= np.outer(e, nu @ family.slope)
-        constant -= e * (nu @ family.intercept)
-    model = HammersteinSS(
-        A=form.a, B=b, C=form.c, D=d, nonlinearities=tuple(functions),
-        E=np.column_stack(factors.es) if families else None, feedback=tuple(feedback),
-        output_of=tuple(family.output for family in families), L=injection, offset_x=constant, offset_y=factors.offset,
-        **model_meta(data))
+    e = np.column_stack([np.zeros((n, 0)), *factors.es])
+    model = state_model(form.expansion, plan.data, (form.a, b, form.c, d), factors.mus, factors.nus, e,
+                        offset=factors.offset)
     return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
 
 

@@ -43,6 +43,11 @@ class Bound:
     seconds: float = 0.0
     multipliers: Any = field(default=None, repr=False, compare=False)
 
+    @classmethod
+    def none(cls, reason: str) -> "Bound":
+        """Say why there is no bound."""
+        return cls(-np.inf, False, "none", reason)
+
 
 @dataclass(frozen=True)
 class Residuals:

@@ -224,6 +224,11 @@ class Evidence:
     reason: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def pointless(cls, status: Status, reason: str) -> "Evidence":
+        """Say why there is no model."""
+        return cls(None, float("nan"), Bound.none(reason), status, reason)
+
 
 @dataclass(frozen=True)
 class Outcome:

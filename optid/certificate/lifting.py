@@ -82,11 +82,11 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     """
     form = program.rank_one
     if form is None:
-        return Bound(-np.inf, False, "none", f"no proof: {program.name!r} has no rank-one structure left"), None
+        return Bound.none(f"no proof: {program.name!r} has no rank-one structure left"), None
     lifted = lift_exact(program, form)
     if lifted.refused:
-        return Bound(-np.inf, False, "none", f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, "
-                     "offset) and not a cone on mu"), None
+        return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, offset) and not a cone "
+                          "on mu"), None
     problem, point, swapped = _oriented(form.problem, _point(form, values), lifted)
     found = certify(problem, point, cones=lifted.cones or None, linear=lifted.linear(), max_size=max_size)
     if not found.better or swapped:
@@ -281,10 +281,10 @@ def certify_nuclear(problem: RankOne, program: Program, values: Values, duals: V
         for member in group:
             found = _rows(member, columns, lifted.size) if isinstance(member, EQUALITIES | INEQUALITIES) else None
             if found is None:
-                return Bound(-np.inf, False, "none", f"no proof: constraint {name!r} is not linear"), None
+                return Bound.none(f"no proof: constraint {name!r} is not linear"), None
             lifted.add(*found, isinstance(member, EQUALITIES))
         if name not in duals:
-            return Bound(-np.inf, False, "none", f"no proof: the solver gave no multiplier of {name!r}"), None
+            return Bound.none(f"no proof: the solver gave no multiplier of {name!r}"), None
         multipliers.append(duals[name])
     z = np.concatenate([np.ravel(values[name], order="F") for name in names])
     nu = 2.0 * (problem.root @ z - problem.target)

@@ -141,6 +141,16 @@ class Expansion:
             parts += [family.values(raw[:, m + l :]) for family in self.feedback]
         return np.concatenate(parts, axis=1)
 
+    def injection(self, e: Array) -> tuple[Array, Array]:
+        """Return L (n, l) and the constant (n,) that ``E zeta_r`` adds to the state equation beside ``E V^T zeta(y)``.
+
+        Args:
+            e: (n, q) E, families side by side.
+        """
+        slopes = np.concatenate([np.zeros((0, self.l)), *(family.slope for family in self.feedback)])
+        intercepts = np.concatenate([np.zeros(0), *(family.intercept for family in self.feedback)])
+        return -e @ slopes, -e @ intercepts
+
     def with_simulated(self, simulated: bool = True) -> "Expansion":
         """Return the same expansion, with or without the functions of simulated outputs."""
         return replace(self, simulated=simulated)

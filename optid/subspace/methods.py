@@ -244,14 +244,12 @@ def simulate_clipped(
     low = np.nanmin([np.nanmin(record[:, m : m + l], axis=0) for record in records], axis=0)
     high = np.nanmax([np.nanmax(record[:, m : m + l], axis=0) for record in records], axis=0)
     low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
-    tables, injection, constant = np.zeros((l, GRID, n)), np.zeros((n, l)), np.zeros(n)
+    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
     start = 0
     for family in expansion.feedback:
         e = ez[:, start : start + family.size]
         grid = np.linspace(low[family.output], high[family.output], GRID)
         tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
-        injection -= e @ family.slope
-        constant -= e @ family.intercept
         start += family.size
     simulated = []
     open_loop = expansion.without_feedback()
