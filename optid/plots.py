@@ -19,7 +19,7 @@ from optid.models.responses import response_pairs, step_length
 from optid.showing import panels, summary
 from optid.showing.estimates import uncertainty
 from optid.showing.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
-from optid.validation import validate
+from optid.validation import Validation, validate
 from optid.validation.predictions import one_step, simulated
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
         left, right = rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
         _nonlinearity_panels(left, fit)
         _dynamics_panels(right, fit)
-    _residual_panels(rows[-1], fit, record, outputs=1, inputs=min(model.m, 2))
+    _residual_panels(rows[-1], _checked(fit, record), record, outputs=1, inputs=min(model.m, 2))
     return figure
 
 
@@ -91,19 +91,20 @@ def nonlinearity(fit: "Fit") -> Figure:
 
 
 @styled
-def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
+def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | None = None) -> Figure:
     """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
 
     Args:
         fit: the fit.
         data: the record; the estimation record when not given.
+        checked: what `optid.validate` found on it, where that is known.
 
     Raises:
         DataError: the fit was made from a stream and no record is given.
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, fit, record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, checked or _checked(fit, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 
@@ -305,11 +306,14 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
         ax.set_title(what if len(functions) == 1 else with_unit(f"{what} of {function.name}", ""))
 
 
-def _residual_panels(figure: Any, fit: "Fit", record: Data, outputs: int, inputs: int) -> None:
-    """One row per output: autocorrelation, then the cross-correlation with every input."""
+def _checked(fit: "Fit", record: Data) -> Validation:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
-        checked = validate(fit.model, record)
+        return validate(fit.model, record)
+
+
+def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: int, inputs: int) -> None:
+    """One row per output: autocorrelation, then the cross-correlation with every input."""
     axes = iter(figure.subplots(outputs, 1 + inputs, squeeze=False).ravel())
     for name in record.outputs[:outputs]:
         tests = [checked.autocorrelations[name]]

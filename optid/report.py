@@ -128,6 +128,7 @@ def _compared(found: "Comparison", command: str) -> dict[str, Any]:
 
 def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
     tone, word, sentence = summary.verdict(fit)
+    checked = _checked(fit, test)
     tables = [estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
     tables += [noise] if (noise := summary.noise_table(fit)) else []
     return {
@@ -138,7 +139,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "word": word[:1].upper() + word[1:],
         "sentence": sentence,
         "findings": fit.findings,
-        "cards": _cards(fit, test),
+        "cards": _cards(fit, checked.get("test")),
         "equation": [_breakable(line) for line in fit.model.equation().splitlines()],
         "model_notes": [f"{name}: {value}" for name, value in summary.model_facts(fit)],
         "model_tables": tables,
@@ -152,7 +153,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
             lambda: plots.certificate(fit),
             "How far the proof of global optimality went, and the gap that is left.",
         ),
-        "validation": _validation(fit, test),
+        "validation": [_validation(fit, name, test, found) for name, found in checked.items()],
         "record": summary.record_facts(fit),
         "channels": summary.channel_table(fit),
         "solver": summary.solver_facts(fit),
@@ -166,7 +167,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
                 ("figures", "Figures", True),
                 ("constraints", "Constraints", bool(fit.prices)),
                 ("certificate", "Certificate", True),
-                ("validation", "Validation", test is not None or isinstance(fit.data, Data)),
+                ("validation", "Validation", bool(checked)),
                 ("data", "Data", True),
                 ("solver", "Solver", True),
                 ("reproduce", "Reproduce", True),
@@ -176,10 +177,12 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
     }
 
 
-def _checked(fit: "Fit", record: Data) -> Validation:
+def _checked(fit: "Fit", test: Data | None) -> dict[str, Validation]:
+    """Validate on the estimation record, unless it was a stream, and on the test record, where there is one."""
+    records = {"est": fit.data, "test": test}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # they stand in the notes
-        return validate(fit.model, record)
+        return {name: validate(fit.model, record) for name, record in records.items() if isinstance(record, Data)}
 
 
 def _breakable(equation: str) -> str:
@@ -191,12 +194,12 @@ def _length(fit: "Fit") -> str:
     return f"{fit.data.n_samples} samples" if fit.data.n_samples else ""
 
 
-def _cards(fit: "Fit", test: Data | None) -> list[dict[str, str]]:
+def _cards(fit: "Fit", tested: Validation | None) -> list[dict[str, str]]:
     """The figures of the first glance; of several outputs the lowest."""
     solution = fit.solution
     fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
-    if test is not None:
-        simulated = [q.fit for q in _checked(fit, test).simulation.values()]
+    if tested is not None:
+        simulated = [q.fit for q in tested.simulation.values()]
         fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
     which = ", lowest output" if fit.model.l > 1 else ""
     cards = [(label + which, wording.percent(np.min(values))) for label, values in fits]
@@ -250,7 +253,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
             "and step response of the linear part.",
         )
     )
-    if summary.noise_table(fit):
+    if summary.has_noise(fit.model):
         found.append(
             _figure(
                 "noise",
@@ -266,30 +269,26 @@ def _figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, 
     return {"svg": inline(draw(), name, caption), "caption": caption}
 
 
-def _validation(fit: "Fit", test: Data | None) -> list[dict[str, Any]]:
-    blocks = []
-    records = [("est", "Estimation record", fit.data, None), ("test", "Test record, not seen by the fit", test, test)]
-    for name, title, record, given in records:
-        if not isinstance(record, Data):
-            continue
-        checked = _checked(fit, record)
-        figures = [
-            _figure(
-                f"{name}-residuals",
-                lambda given=given: plots.residual_tests(fit, given),
-                "Autocorrelation of the residuals and their cross-correlation with the inputs; shaded: 99 % bands.",
-            )
-        ]
-        if given is not None:
-            figures.insert(
-                0,
-                _figure(
-                    f"{name}-time",
-                    lambda given=given: plots.fit_over_time(fit, given),
-                    "Measured, simulated and one-step predicted output on the test record.",
-                ),
-            )
-        blocks.append(
-            {"title": title, "tables": summary.validation_tables(checked), "notes": checked.notes, "figures": figures}
+TITLES = {"est": "Estimation record", "test": "Test record, not seen by the fit"}
+
+
+def _validation(fit: "Fit", name: str, test: Data | None, checked: Validation) -> dict[str, Any]:
+    record = test if name == "test" else None
+    figures = [
+        _figure(
+            f"{name}-residuals",
+            lambda: plots.residual_tests(fit, record, checked),
+            "Autocorrelation of the residuals and their cross-correlation with the inputs; shaded: 99 % bands.",
         )
-    return blocks
+    ]
+    if record is not None:
+        figures.insert(
+            0,
+            _figure(
+                f"{name}-time",
+                lambda: plots.fit_over_time(fit, record),
+                "Measured, simulated and one-step predicted output on the test record.",
+            ),
+        )
+    tables = summary.validation_tables(checked)
+    return {"title": TITLES[name], "tables": tables, "notes": checked.notes, "figures": figures}

@@ -267,10 +267,12 @@ def validate(
             },
         )
         waiting.step("validating")
-        found: Any = None
-        if len(models) > 1 or report is not None:
-            found = compare_models(models, record, horizon)
-        text = str(found) if len(models) > 1 else f"{first}\n\n{check(first, record, horizon=horizon)}"
+        compared = len(models) > 1 or report is not None
+        found: Any = compare_models(models, record, horizon) if compared else None
+        if len(models) > 1:
+            text = str(found)
+        else:
+            text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
         if report is not None:
             from optid.report import write_comparison
 

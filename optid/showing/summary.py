@@ -236,10 +236,15 @@ def _gauge(model: Any) -> str:
     return known.get(model.gauge, str(model.gauge))
 
 
+def has_noise(model: Any) -> bool:
+    """Whether a model has noise covariances."""
+    return isinstance(getattr(model, "noise", None), NoiseCovariances)
+
+
 def noise_table(fit: "Fit") -> Table | None:
     """Innovations, noise at the outputs and its colour for a state-space model with noise covariances."""
     model = fit.model
-    if not isinstance(getattr(model, "noise", None), NoiseCovariances):
+    if not has_noise(model):
         return None
     from optid.noise import colour, output_noise
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.data import Data
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataWarning, StructureError
 from optid.validation.checks import Validation, validate
 from optid.validation.horizons import HorizonCurve, fit_by_horizon
 from optid.validation.measures import fit_percent
@@ -84,15 +84,19 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
         warnings.simplefilter("ignore", DataWarning)  # they stand in the notes of the validations
         validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
         curves = tuple(fit_by_horizon(model, raw) for model in named.values())
-        outputs = {ONE_STEP: [one_step(model, raw) for model in named.values()]}
+        outputs = {
+            ONE_STEP: [[e.y - r for e, r in zip(raw.experiments, checked.residuals)] for checked in validations]
+        }
         if horizon > 1:
             outputs[f"{horizon} steps"] = [one_step(model, raw, horizon) for model in named.values()]
+        free = [list(checked.simulated) or [np.full(e.y.shape, np.nan) for e in raw.experiments]
+                for checked in validations]
         if any(checked.measured_feedback for checked in validations):
             outputs[MEASURED] = [
-                _or_nothing(model, raw, MEASURED if checked.measured_feedback else SIMULATION, x0)
-                for model, checked in zip(named.values(), validations)
+                simulated(model, raw, MEASURED, x0) if checked.measured_feedback else arrays
+                for model, checked, arrays in zip(named.values(), validations, free)
             ]
-        outputs[SIMULATION] = [_or_nothing(model, raw, SIMULATION, x0) for model in named.values()]
+        outputs[SIMULATION] = free
     fits = {word: found for word, several in outputs.items() if not np.isnan(found := _fits(raw, several)).all()}
     return Comparison(tuple(named), tuple(named.values()), raw, horizon, fits, validations, curves,
                       tuple(checked.simulated for checked in validations))
@@ -108,13 +112,6 @@ def _named(models: Sequence[Any]) -> dict[str, Any]:
         word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
         for i, (word, model) in enumerate(zip(words, models))
     }
-
-
-def _or_nothing(model: Any, data: Data, word: str, x0: Any) -> list[Array]:
-    try:
-        return simulated(model, data, word, x0)
-    except DataError:
-        return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
 def _fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
