@@ -27,6 +27,10 @@ _HOME = {
     "PairSearch": "pair_search",
     "thresholds": "calibration",
     "Thresholds": "calibration",
+    "sliding_scan": "empirical",
+    "SlidingScan": "empirical",
+    "empirical_thresholds": "empirical",
+    "EmpiricalThresholds": "empirical",
     "signature_estimate": "programmes",
     "SparseResult": "sparse",
     "polish": "subsets",
@@ -42,6 +46,17 @@ _HOME = {
     "Diagnosis": "answers",
     "load_diagnosis": "answers",
     "diagnose": "diagnosis",
+    "reformulate": "reformulation",
+    "Reformulation": "reformulation",
+    "observer": "virtual_sensor",
+    "Observer": "virtual_sensor",
+    "conditional_mean": "virtual_sensor",
+    "subspace_projection": "virtual_sensor",
+    "allocate": "allocation",
+    "Allocation": "allocation",
+    "inverse": "inversion",
+    "probe_input": "ambiguity",
+    "Prior": "refitting",
 }
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME)

@@ -94,15 +94,26 @@ def thresholds(
             f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability."
         )
     count = len(window.r) if isinstance(window, Whitened) else int(window)
-    rng = np.random.default_rng(seed)
-    largest = np.vstack([
-        prepared.largest(rng.standard_normal((size, count, found.model.l)))
-        for prepared, share in _searches(found, window, count, u, draws, rng) for size in _batches(share, prepared)
-    ])
+    largest = simulated(found, window, u=u, draws=draws, seed=seed)
     tested = ~np.isnan(largest).all(axis=0)
     q = np.full(len(found.candidates), np.nan)
     q[tested] = family_thresholds(np.nan_to_num(largest[:, tested]), false_alarm)
     return Thresholds(found.labels, q, false_alarm, count, draws, seed)
+
+
+def simulated(
+    found: Dictionary, window: int | Whitened, *, u: ArrayLike | None = None, draws: int = 20_000, seed: int | None = 0
+) -> Array:
+    """Return the largest energies (M, C) that candidates explain of simulated healthy windows; NaN: not tested.
+
+    The arguments are those of `thresholds`.
+    """
+    count = len(window.r) if isinstance(window, Whitened) else int(window)
+    rng = np.random.default_rng(seed)
+    return np.vstack([
+        prepared.largest(rng.standard_normal((size, count, found.model.l)))
+        for prepared, share in _searches(found, window, count, u, draws, rng) for size in _batches(share, prepared)
+    ])
 
 
 def _searches(
