@@ -101,11 +101,9 @@ def ranked(seen: Seen, explanations: Sequence[Explanation], rare: float, coverag
     """
     if not explanations:
         return Ranking((), np.inf, exhaustive)
-    posterior = probabilities(explanations, [np.log(rare) * (len(e.candidates) - 1) for e in explanations])
-    order = np.argsort(-posterior, kind="stable")
-    odds = np.inf
-    if order.size > 1 and posterior[order[1]] > 0:
-        odds = float(2 * np.log(posterior[order[0]] / posterior[order[1]]))
+    logs = np.array([e.log_evidence + np.log(rare) * (len(e.candidates) - 1) for e in explanations])
+    posterior, sorted_logs = probabilities(logs), np.sort(logs)
+    odds = float(2 * (sorted_logs[-1] - sorted_logs[-2])) if logs.size > 1 else np.inf
     chosen = smallest_set(posterior, coverage)
     return Ranking(tuple(_fit(seen, explanations[i], float(posterior[i])) for i in chosen), odds, exhaustive)
 

@@ -177,17 +177,14 @@ def _bounded(candidates: Sequence[Candidate], sizes: Array, covariances: Array) 
     return change
 
 
-def probabilities(explanations: Sequence[Explanation], penalties: Sequence[float]) -> Array:
+def probabilities(logs: Array) -> Array:
     """Return the probability of each explanation.
 
     Args:
-        explanations: those that are thought possible.
-        penalties: logarithm of the prior of each.
+        logs: logarithms of the marginal likelihood times the prior of each.
     """
-    from scipy.special import logsumexp
-
-    logs = np.array([e.log_evidence for e in explanations]) + np.asarray(penalties)
-    return np.exp(logs - logsumexp(logs))
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())
 
 
 def smallest_set(posterior: Array, coverage: float) -> np.ndarray:
