@@ -17,7 +17,9 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor_tables import Tables, blank
+from optid.faults import monitor_layout as at
+from optid.faults.monitor_layout import Tables
+from optid.faults.monitor_tables import blank
 
 ALARMS = 200
 """False alarms that a simulation must see, so that their rate is known to 7 %."""
@@ -95,7 +97,7 @@ def calibrate(
         StructureError: an ARL0 below the length of the window.
         DataError: a simulation that cannot support so rare an alarm.
     """
-    window = t.H.shape[2]
+    window = int(t.i[0, at.WINDOW])
     if not (np.isfinite(arl0) and arl0 >= window):
         raise StructureError(
             f"arl0={arl0!r}: a mean time between false alarms of at least the window, {window} samples, is needed."
@@ -115,16 +117,16 @@ def calibrate(
 
 def maxima(t: Tables, f: Array, samples: int, seed: int | None) -> Array:
     """Return the largest statistics (B, C) of blocks of W samples of a healthy search."""
-    from optid.faults.monitor_kernels import rehearse
+    from optid.faults.search_kernels import rehearse
 
-    window, l = t.H.shape[2], t.C.shape[0]  # noqa: E741
+    window, l, candidates = (int(t.i[0, d]) for d in (at.WINDOW, at.NY, at.CANDIDATES))  # noqa: E741
     blocks = max(CHUNK // window, 1)
     count = max(1, -(-samples // (blocks * window)))
     streams = np.random.SeedSequence(seed).spawn(count + 1)
-    s, found = blank(t), np.empty((count * blocks, t.size.size))
+    s, found = blank(t), np.empty((count * blocks, candidates))
     inputs = np.resize(f, (blocks * window, f.shape[1])) if f.size else np.zeros((blocks * window, f.shape[1]))
     # the first window fills up
-    rehearse(t, s, inputs, np.random.default_rng(streams[0]).standard_normal((window, l)), np.empty((1, t.size.size)))
+    rehearse(t, s, inputs, np.random.default_rng(streams[0]).standard_normal((window, l)), np.empty((1, candidates)))
     for number, stream in enumerate(streams[1:]):
         r = np.random.default_rng(stream).standard_normal((blocks * window, l))
         shifted = np.roll(inputs, -number * blocks * window % max(len(f), 1), axis=0)

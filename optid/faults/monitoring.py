@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults import monitor_layout as at
 from optid.faults.arl import Calibration, calibrate, held_levels
-from optid.faults.monitor_tables import State, Tables, blank, monitored, tables
+from optid.faults.monitor_layout import State, Tables
+from optid.faults.monitor_tables import blank, monitored, tables, with_thresholds
 from optid.faults.signatures import Dictionary, dictionary
 from optid.models.feedback_tables import tabulated
 from optid.models.state_simulation import state_like
@@ -178,25 +180,26 @@ class Monitor:
             warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
         self.labels = tuple(c.label for c in self._chosen)
         strength = float(np.max(np.sum((found.predictor.root @ found.predictor.C) ** 2, axis=0), initial=1e-300))
-        numbers = np.array([*({**RULES, **rules} | {"wide": WIDE / strength}).values()])
+        numbers = [*({**RULES, **rules} | {"wide": WIDE / strength}).values()]
         t = tables(found, self._chosen, self.window, numbers)
         self._functions = tabulated(model.nonlinearities)
         self.calibration = self._calibrated(t, arl0, thresholds, u, samples, extrapolate)
-        self._start(t._replace(q=np.array(self.calibration.q, dtype=float)), blank(t))
+        self._start(with_thresholds(t, self.calibration.q), blank(t))
         if isinstance(x0, str) and x0 == "unknown":
-            from optid.faults.monitor_kernels import lose_state
+            from optid.faults.carry_kernels import lose_state
 
             lose_state(self._tables, self._state)
         elif not (isinstance(x0, str) and x0 == "zero"):
-            self._state.x[:] = state_like(model, x0)
+            self._state.v[at.X, : model.nx] = state_like(model, x0)
 
     def _start(self, t: Tables, s: State) -> None:
         self._tables, self._state = t, s
         model = self.dictionary.model
+        self._feedback = model.parts.tables
         self._u, self._y = np.empty((1, model.m)), np.empty((1, model.l))
-        self._f = np.empty((1, t.B.shape[1]))
+        self._f = np.empty((1, int(t.i[0, at.NF])))
         self._input_of = np.array(model.input_of, dtype=np.int64)
-        width = 5 + t.size.size + int(t.size.max())
+        width = 5 + len(self.labels) + max(c.dimension for c in self._chosen)
         self._events, self._event = np.zeros((EVENTS, width)), np.zeros((1, width))
 
     def _calibrated(
@@ -206,7 +209,7 @@ class Monitor:
             return self._given(thresholds, arl0)
         f = self._rehearsed(u)
         key = hashlib.sha256(repr((self.labels, float(arl0), samples, self.seed, extrapolate)).encode())
-        for part in (f, t.H, t.N, t.trace, t.course, t.size, t.drive_state, t.drive_output, t.into_state):
+        for part in (f, t.m, t.i, t.w):
             key.update(np.ascontiguousarray(part).tobytes())
         name = key.hexdigest()
         if name not in _KNOWN:
@@ -255,7 +258,7 @@ class Monitor:
     @property
     def samples(self) -> int:
         """Samples seen."""
-        return int(self._state.counts[0])
+        return int(self._state.counts[at.NOW])
 
     def step(self, u: ArrayLike, y: ArrayLike) -> Event | None:
         """Take in one sample; NaN is a missing value.
@@ -274,7 +277,7 @@ class Monitor:
 
         self._u[0], self._y[0] = u, y
         self._expand(self._u, self._f)
-        _, found, refused = march(self._tables, self._state, self._f, self._y, self._event)
+        _, found, refused = march(self._tables, self._state, self._feedback, self._f, self._y, self._event)
         if refused:
             self._refuse()
         return self._told(self._event[0]) if found else None
@@ -291,11 +294,11 @@ class Monitor:
         model = self.dictionary.model
         u, y = (np.ascontiguousarray(np.asarray(part, dtype=float).reshape(-1, width))
                 for part, width in ((u, model.m), (y, model.l)))
-        f = np.empty((len(u), self._tables.B.shape[1]))
+        f = np.empty((len(u), self._f.shape[1]))
         self._expand(u, f)
         events, done = [], 0
         while done < len(y):
-            taken, found, refused = march(self._tables, self._state, f[done:], y[done:], self._events)
+            taken, found, refused = march(self._tables, self._state, self._feedback, f[done:], y[done:], self._events)
             events += [self._told(line) for line in self._events[:found]]
             if refused:
                 self._refuse()
@@ -304,7 +307,7 @@ class Monitor:
 
     def _expand(self, u: Array, f: Array) -> None:
         if self._functions.compiled:
-            from optid.faults.monitor_kernels import expand
+            from optid.faults.carry_kernels import expand
 
             bad = expand(self._functions, self._input_of, u, f)
             if bad >= 0:
@@ -316,17 +319,15 @@ class Monitor:
         raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it.")
 
     def _told(self, line: Array) -> Event:
-        from optid.faults import monitor_kernels as kernels
-
         code, sample, best, onset = (int(value) for value in line[:4])
         kind, count = KINDS[code], len(self.labels)
         label = self.labels[best] if best >= 0 else ""
-        if code in (kernels.UNTESTABLE, kernels.TESTABLE):
-            since = sample - self.window + 1 if code == kernels.UNTESTABLE else None
+        if code in (at.UNTESTABLE, at.TESTABLE):
+            since = sample - self.window + 1 if code == at.UNTESTABLE else None
             return Event(kind, sample, ((label, 1.0),), since, (), float(line[4]))
-        if code == kernels.CLEARED:
+        if code == at.CLEARED:
             return Event(kind, sample, ((label, 1.0),) if label else (), None, (), 0.0)
-        if code == kernels.STRANGE:
+        if code == at.STRANGE:
             return Event(kind, sample, (("unknown", 1.0),), onset, (), float(line[4]), "no candidate explains it")
         gains = line[5 : 5 + count]
         weight = np.exp((gains - gains.max()) / 2)
@@ -342,9 +343,9 @@ class Monitor:
     @property
     def statistics(self) -> dict[str, float]:
         """{label: largest energy explained over the onsets of the window} at the last sample."""
-        return dict(zip(self.labels, self._state.statistic.tolist()))
+        return dict(zip(self.labels, self._state.v[at.STATISTIC].tolist()))
 
     @property
     def onsets(self) -> dict[str, int]:
         """{label: onset at which it explains most}; -1 where it cannot be looked for yet."""
-        return dict(zip(self.labels, self._state.peak.tolist()))
+        return dict(zip(self.labels, self._state.i[at.PEAK].tolist()))

@@ -1,0 +1,547 @@
+"""Compiled steps of the predictor of the monitor, with the faults that it carries.
+
+Faults that were named are carried as unknown constants beside the state (B. Friedland, Treatment of bias in recursive
+filtering, IEEE Trans. Automatic Control 14, 1969): their estimate nu with covariance P corrects the state of the
+predictor by V nu at every sample, as the update of A. S. Willsky and H. L. Jones (A generalized likelihood ratio
+approach to the detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21, 1976) does once.
+The innovations stay white, and the signatures of later faults lose what that estimate would take of them. A state of
+which nothing is known is a jump of wide prior at the first sample.
+"""
+
+import numpy as np
+from numba import njit
+
+from optid.faults.monitor_layout import (
+    ACTIVE,
+    BEFORE,
+    COLUMN,
+    COLUMNS,
+    COURSE,
+    COVARIANCE,
+    DRIFT,
+    DRIVEN,
+    FADED,
+    FIRST,
+    FIRST_OF,
+    FORGIVEN,
+    GAIN,
+    GROWN,
+    HELD,
+    INDEX,
+    INTO_OUTPUT,
+    INTO_STATE,
+    JUMP,
+    LATER,
+    LEARNED,
+    LENGTH,
+    NF,
+    NFED,
+    NOW,
+    NU,
+    NX,
+    NY,
+    OFFSET_X,
+    OFFSET_Y,
+    OUTPUT_OF,
+    OWNER,
+    PEAK,
+    PLACE,
+    POWER,
+    PREDICTED,
+    RAW,
+    ROOM,
+    ROOT,
+    RULE,
+    S0,
+    S_ENERGY,
+    S_OUTPUT,
+    S_SHOWN,
+    S_STATE,
+    S_TAKEN,
+    SIZE,
+    SIZES,
+    SLOPE,
+    SPREAD,
+    START,
+    TAKE,
+    TAKEN,
+    THRESHOLD,
+    TURN,
+    WHICH,
+    WHITENING,
+    WIDE,
+    WINDOW,
+    Z1,
+    A,
+    B,
+    C,
+    D,
+    E,
+    L,
+    M,
+    P,
+    R,
+    T,
+    V,
+    X,
+    Z,
+)
+from optid.faults.search_kernels import factor, load
+from optid.models.state_kernels import value_and_slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def expand(functions, input_of, u, f):
+    """Write the functions (T, r) of the inputs (T, m); return the first sample refused, or -1."""
+    for k in range(u.shape[0]):
+        for j in range(input_of.size):
+            v = u[k, input_of[j]]
+            if np.isnan(v):
+                f[k, j] = np.nan
+                continue
+            value, _, refused = value_and_slope(functions, j, v)
+            if refused:
+                return k
+            f[k, j] = value
+    return -1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def jolt(t, s, j, i, place):
+    """What column j adds to state i at a place of the window, per unit of its course."""
+    if t.i[COURSE, j] != DRIVEN:
+        return t.m[INTO_STATE, i, j]
+    return s.w[t.i[0, S_STATE] + t.i[WHICH, j] * t.i[0, NX] + i, place]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shift(t, s, j, o, place):
+    """What column j adds to output o at a place of the window, per unit of its course."""
+    if t.i[COURSE, j] != DRIVEN:
+        return t.m[INTO_OUTPUT, o, j]
+    return s.w[t.i[0, S_OUTPUT] + t.i[WHICH, j] * t.i[0, NY] + o, place]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def whiten(t, s, place):
+    """Write the whitening of the readings that are there."""
+    l, shown, m, index = t.i[0, NY], t.i[0, S_SHOWN], s.m, s.i[INDEX]  # noqa: E741
+    count = 0
+    for o in range(l):
+        if s.w[shown + o, place] > 0.0:
+            index[count] = o
+            count += 1
+    for o in range(l):
+        for a in range(l):
+            m[WHITENING, o, a] = t.m[ROOT, o, a] if count == l else 0.0
+    if count == l:
+        return
+    for i in range(count):
+        for j in range(i + 1):
+            m[M, i, j] = t.m[COVARIANCE, index[i], index[j]]
+    factor(m[M], count)
+    for column in range(count):  # the inverse of the factor
+        for i in range(column, count):
+            total = 1.0 if i == column else 0.0
+            for j in range(column, i):
+                total -= m[M, i, j] * m[WHITENING, index[j], index[column]]
+            m[WHITENING, index[i], index[column]] = total / m[M, i, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def expect(t, s, f):
+    """Add to the state what the carried faults add at this sample, and predict the readings."""
+    dim, place, active, m, v = t.i[0], s.counts[PLACE], s.counts[ACTIVE], s.m, s.v
+    n, l = dim[NX], dim[NY]  # noqa: E741
+    for q in range(active):
+        j = s.i[COLUMN, q]
+        if j >= 0 and t.i[COURSE, j] != JUMP:
+            if t.i[COURSE, j] == DRIFT:
+                v[GROWN, q] += 1.0
+            for i in range(n):
+                step = jolt(t, s, j, i, place) * v[GROWN, q]
+                m[V, i, q] += step
+                v[X, i] += step * v[NU, q]
+    for j in range(dim[COLUMNS]):
+        v[HELD, j] += v[SLOPE, j]
+        if v[HELD, j] != 0.0:
+            for i in range(n):
+                v[X, i] += jolt(t, s, j, i, place) * v[HELD, j]
+    for o in range(l):
+        total = t.v[OFFSET_Y, o]
+        for i in range(n):
+            total += t.m[C, o, i] * v[X, i]
+        for j in range(dim[NF]):
+            total += t.m[D, o, j] * f[j]
+        for j in range(dim[COLUMNS]):
+            if v[HELD, j] != 0.0:
+                total += shift(t, s, j, o, place) * v[HELD, j]
+        for q in range(active):
+            deviation = 0.0
+            for i in range(n):
+                deviation += t.m[C, o, i] * m[V, i, q]
+            j = s.i[COLUMN, q]
+            if j >= 0 and t.i[COURSE, j] != JUMP:
+                step = shift(t, s, j, o, place) * v[GROWN, q]
+                deviation += step
+                total += step * v[NU, q]
+            m[RAW, o, q] = deviation
+        v[PREDICTED, o] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def correct(t, s):
+    """Correct the estimates of the carried faults and the state by the innovation, and whiten it anew."""
+    dim, active, m, v = t.i[0], s.counts[ACTIVE], s.m, s.v
+    n, l = dim[NX], dim[NY]  # noqa: E741
+    for o in range(l):
+        for q in range(active):
+            m[S0, o, q] = 0.0
+            for a in range(l):
+                m[S0, o, q] += m[WHITENING, o, a] * m[RAW, a, q]
+        for q in range(active):
+            m[Z, o, q] = 0.0
+            for p in range(active):
+                m[Z, o, q] += m[S0, o, p] * m[P, p, q]
+    for o in range(l):
+        for a in range(o + 1):
+            total = 1.0 if a == o else 0.0
+            for q in range(active):
+                total += m[Z, o, q] * m[S0, a, q]
+            m[M, o, a] = total
+    factor(m[M], l)
+    for column in range(l):
+        for o in range(l):
+            m[TURN, o, column] = 0.0
+        for o in range(column, l):
+            total = 1.0 if o == column else 0.0
+            for a in range(column, o):
+                total -= m[M, o, a] * m[TURN, a, column]
+            m[TURN, o, column] = total / m[M, o, o]
+    for q in range(active):  # Z becomes turn S0 P, whose transpose times itself leaves P
+        for o in range(l - 1, -1, -1):
+            total = 0.0
+            for a in range(o + 1):
+                total += m[TURN, o, a] * m[Z, a, q]
+            m[Z, o, q] = total
+    for q in range(active):
+        change, energy = 0.0, 0.0
+        for a in range(l):
+            total = 0.0
+            for o in range(a, l):
+                total += m[Z, o, q] * m[TURN, o, a]
+            m[TAKE, q, a] = total
+            change += total * v[R, a]
+            energy += m[S0, a, q] * m[S0, a, q]
+        v[NU, q] += change
+        v[POWER, q] += (energy - v[POWER, q]) / dim[WINDOW]
+        for i in range(n):
+            v[X, i] += m[V, i, q] * change
+        for o in range(l):
+            v[PREDICTED, o] += m[RAW, o, q] * change
+    for p in range(active):
+        for q in range(active):
+            for o in range(l):
+                m[P, p, q] -= m[Z, o, p] * m[Z, o, q]
+    for o in range(l - 1, -1, -1):
+        total = 0.0
+        for a in range(o + 1):
+            total += m[TURN, o, a] * v[R, a]
+        v[R, o] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def proceed(t, s, functions, f, y):
+    """Take state and carried faults to the next sample; return whether the feedback took the outputs."""
+    dim, place, m, v = t.i[0], s.counts[PLACE], s.m, s.v
+    n, l, later = dim[NX], dim[NY], v[LATER]  # noqa: E741
+    for i in range(n):
+        total = t.v[OFFSET_X, i]
+        for j in range(n):
+            total += t.m[A, i, j] * v[X, j]
+        for j in range(dim[NF]):
+            total += t.m[B, i, j] * f[j]
+        for o in range(l):
+            if s.w[dim[S_SHOWN] + o, place] > 0.0:
+                total += t.m[L, i, o] * y[o] + t.m[GAIN, i, o] * (y[o] - v[PREDICTED, o])
+            else:
+                total += t.m[L, i, o] * v[PREDICTED, o]
+        later[i] = total
+    for j in range(dim[NFED]):
+        o = t.i[OUTPUT_OF, j]
+        there = s.w[dim[S_SHOWN] + o, place] > 0.0
+        fed, _, refused = value_and_slope(functions, j, y[o] if there else v[PREDICTED, o])
+        if refused:
+            return False
+        for i in range(n):
+            later[i] += t.m[E, i, j] * fed
+    for i in range(n):
+        v[X, i] = later[i]
+    for q in range(s.counts[ACTIVE]):
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += t.m[A, i, j] * m[V, j, q]
+            for o in range(l):
+                there = s.w[dim[S_SHOWN] + o, place] > 0.0
+                total += (-t.m[GAIN, i, o] if there else t.m[L, i, o]) * m[RAW, o, q]
+            later[i] = total
+        for i in range(n):
+            m[V, i, q] = later[i]
+    for j in range(dim[NF]):
+        v[BEFORE, j] = f[j]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def innovate(t, s, functions, f, y):
+    """Predict this sample, correct state and carried faults, write the innovation; return whether that went well."""
+    dim, place, v = t.i[0], s.counts[PLACE], s.v
+    l = dim[NY]  # noqa: E741
+    expect(t, s, f)
+    for o in range(l):
+        s.w[dim[S_SHOWN] + o, place] = 0.0 if np.isnan(y[o]) else 1.0
+    whiten(t, s, place)
+    for o in range(l):
+        v[R, o] = 0.0
+        for a in range(l):
+            if s.w[dim[S_SHOWN] + a, place] > 0.0:
+                v[R, o] += s.m[WHITENING, o, a] * (y[a] - v[PREDICTED, a])
+    if s.counts[ACTIVE] > 0:
+        correct(t, s)
+    for o in range(l):
+        s.w[dim[S_ENERGY], place] += v[R, o] * v[R, o]
+    return proceed(t, s, functions, f, y)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def estimate(t, s, k):
+    """Write the magnitudes of a candidate at its peak, and their covariance."""
+    d, own = t.i[SIZE, k], t.i[FIRST_OF, k]
+    place = s.counts[PLACE] - (s.counts[NOW] - s.i[PEAK, k])
+    load(t, s, k, place)
+    m, sizes = s.m, s.v[SIZES]
+    for column in range(d):  # the inverse of the factor
+        for i in range(d):
+            m[T, i, column] = 0.0
+        for i in range(column, d):
+            if m[M, i, i] > 0.0:
+                total = 1.0 if i == column else 0.0
+                for j in range(column, i):
+                    total -= m[M, i, j] * m[T, j, column]
+                m[T, i, column] = total / m[M, i, i]
+    for i in range(d):
+        sizes[i] = 0.0
+        for j in range(d):
+            total = 0.0
+            for a in range(d):
+                total += m[T, a, i] * m[T, a, j]
+            m[SPREAD, i, j] = total
+            sizes[i] += total * s.w[own + j, place]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def forget(t, s, q):
+    """Take a carried direction out; state and the other estimates stay as they are."""
+    dim, last, m, v, w = t.i[0], s.counts[ACTIVE] - 1, s.m, s.v, s.w
+    rows, taken = dim[COLUMNS], dim[S_TAKEN]
+    for p in range(q, last):
+        for i in range(dim[NX]):
+            m[V, i, p] = m[V, i, p + 1]
+        v[NU, p], v[GROWN, p], v[POWER, p] = v[NU, p + 1], v[GROWN, p + 1], v[POWER, p + 1]
+        s.i[COLUMN, p], s.i[OWNER, p] = s.i[COLUMN, p + 1], s.i[OWNER, p + 1]
+        for j in range(rows):
+            for a in range(dim[LENGTH]):
+                w[taken + p * rows + j, a] = w[taken + (p + 1) * rows + j, a]
+        for i in range(last + 1):
+            m[P, p, i] = m[P, p + 1, i]
+    for p in range(q, last):
+        for i in range(last):
+            m[P, i, p] = m[P, i, p + 1]
+    s.counts[ACTIVE] = last
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def settle(t, s, q):
+    """Keep the estimate of a carried direction as it is, and stop estimating it."""
+    j = s.i[COLUMN, q]
+    if j >= 0 and t.i[COURSE, j] != JUMP:
+        s.v[HELD, j] += s.v[NU, q] * s.v[GROWN, q]
+        if t.i[COURSE, j] == DRIFT:
+            s.v[SLOPE, j] += s.v[NU, q]
+    forget(t, s, q)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def take_up(t, s, owner, count):
+    """Add directions of one owner to those carried, settling the oldest where there is no room; return the first."""
+    dim = t.i[0]
+    while s.counts[ACTIVE] + count > dim[ROOM]:
+        settle(t, s, s.counts[ACTIVE] * 0)
+    first = s.counts[ACTIVE]
+    for q in range(first, first + count):
+        s.i[OWNER, q] = owner
+        s.i[COLUMN, q] = -1 if owner == START else t.i[FIRST_OF, owner] + q - first
+        s.v[NU, q], s.v[GROWN, q], s.v[POWER, q] = 0.0, 1.0, 0.0
+        for i in range(dim[NX]):
+            s.m[V, i, q] = 0.0
+        for p in range(first + count):
+            s.m[P, p, q] = 0.0
+            s.m[P, q, p] = 0.0
+        for j in range(dim[COLUMNS]):
+            for a in range(dim[LENGTH]):
+                s.w[dim[S_TAKEN] + q * dim[COLUMNS] + j, a] = 0.0
+    s.counts[ACTIVE] = first + count
+    return first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lose_state(t, s):
+    """From the next sample on the state is unknown."""
+    q, n = 0, t.i[0, NX]
+    while q < s.counts[ACTIVE]:
+        if s.i[OWNER, q] == START:
+            forget(t, s, q)
+        else:
+            q += 1
+    owner = s.counts[ACTIVE] * 0 + START
+    first = take_up(t, s, owner, n)
+    for i in range(n):
+        s.m[V, i, first + i] = 1.0
+        s.m[P, first + i, first + i] = t.v[RULE, WIDE]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def carry(t, s, k):
+    """Correct the state by the estimate of a candidate at its peak and carry it; the search begins anew."""
+    dim, now, m, v = t.i[0], s.counts[NOW], s.m, s.v
+    n, l, d, own = dim[NX], dim[NY], t.i[SIZE, k], t.i[FIRST_OF, k]  # noqa: E741
+    estimate(t, s, k)
+    onset = s.i[PEAK, k]
+    place = s.counts[PLACE] - (now - onset)
+    while s.counts[ACTIVE] + d > dim[ROOM]:
+        settle(t, s, s.counts[ACTIVE] * 0)
+    for p in range(s.counts[ACTIVE]):
+        for i in range(d):
+            m[TAKEN, p, i] = s.w[dim[S_TAKEN] + p * dim[COLUMNS] + own + i, place]
+    first, later = take_up(t, s, k, d), v[LATER]
+    for q in range(first, first + d):  # what the candidate has done to the state from its onset to the next sample
+        j = s.i[COLUMN, q]
+        grown = 0.0
+        for at in range(place, place + now - onset + 1):
+            grown = grown + 1.0 if t.i[COURSE, j] == DRIFT else 0.0 if t.i[COURSE, j] == JUMP and at > place else 1.0
+            for i in range(n):
+                m[V, i, q] += jolt(t, s, j, i, at) * grown
+            for i in range(n):
+                later[i] = 0.0
+                for b in range(n):
+                    later[i] += t.m[A, i, b] * m[V, b, q]
+            for o in range(l):
+                deviation = shift(t, s, j, o, at) * grown
+                for b in range(n):
+                    deviation += t.m[C, o, b] * m[V, b, q]
+                there = s.w[dim[S_SHOWN] + o, at] > 0.0
+                for i in range(n):
+                    later[i] += (-t.m[GAIN, i, o] if there else t.m[L, i, o]) * deviation
+            for i in range(n):
+                m[V, i, q] = later[i]
+        v[GROWN, q] = grown
+    for i in range(d):
+        q = first + i
+        v[NU, q] = v[SIZES, i]
+        for a in range(n):
+            v[X, a] += m[V, a, q] * v[SIZES, i]
+        for p in range(first):
+            change = -m[TAKEN, p, i] * v[SIZES, i]
+            v[NU, p] += change
+            for a in range(n):
+                v[X, a] += m[V, a, p] * change
+        for j in range(d):
+            m[P, q, first + j] = m[SPREAD, i, j]
+    for p in range(first):
+        for i in range(d):
+            total = 0.0
+            for j in range(d):
+                total -= m[TAKEN, p, j] * m[SPREAD, j, i]
+            m[P, p, first + i] = total
+            m[P, first + i, p] = total
+    for p in range(first):
+        for q in range(first):
+            for i in range(d):
+                m[P, p, q] -= m[P, p, first + i] * m[TAKEN, q, i]
+    s.counts[FIRST] = now + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def significance(t, s, k):
+    """Write the whole of what is carried of a candidate and the covariance of what is estimated; return its energy."""
+    d, m, sizes, active = t.i[SIZE, k], s.m, s.v[SIZES], s.counts[ACTIVE]
+    for i in range(d):
+        j = t.i[FIRST_OF, k] + i
+        sizes[i] = s.v[SLOPE, j] if t.i[COURSE, j] == DRIFT else s.v[HELD, j]
+        for a in range(d):
+            m[M, i, a] = 0.0
+    for q in range(active):
+        if s.i[OWNER, q] == k:
+            i = s.i[COLUMN, q] - t.i[FIRST_OF, k]
+            sizes[i] += s.v[NU, q]
+            for p in range(active):
+                if s.i[OWNER, p] == k:
+                    m[M, i, s.i[COLUMN, p] - t.i[FIRST_OF, k]] += m[P, q, p]
+    for i in range(d):
+        for j in range(d):
+            m[SPREAD, i, j] = m[M, i, j]
+    factor(m[M], d)
+    total = 0.0
+    for i in range(d):
+        z = sizes[i]
+        for j in range(i):
+            z -= m[M, i, j] * s.v[Z1, j]
+        s.v[Z1, i] = z / m[M, i, i] if m[M, i, i] > 0.0 else 0.0
+        total += s.v[Z1, i] * s.v[Z1, i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def review(t, s):
+    """Drop carried faults that have died out or gone, stop estimating those known well; return one gone, or -1."""
+    dim, m, v = t.i[0], s.m, s.v
+    n, l = dim[NX], dim[NY]  # noqa: E741
+    strength, first = 0.0, 0
+    for o in range(l):
+        for i in range(n):
+            total = 0.0
+            for a in range(l):
+                total += t.m[ROOT, o, a] * t.m[C, a, i]
+            strength += total * total
+    while first < s.counts[ACTIVE]:
+        k = s.i[OWNER, first]
+        end = first + (n if k == START else t.i[SIZE, k])  # directions stay beside those they were taken up with
+        passing = k == START or t.i[COURSE, t.i[FIRST_OF, k]] == JUMP
+        drifting = not passing and t.i[COURSE, t.i[FIRST_OF, k]] == DRIFT
+        left, power = 0.0, 0.0
+        for q in range(first, end):
+            if passing:
+                for i in range(n):
+                    left += strength * m[V, i, q] * m[V, i, q] * (m[P, q, q] + v[NU, q] * v[NU, q])
+            else:
+                left += dim[WINDOW] * v[POWER, q] * m[P, q, q]
+                power += v[POWER, q]
+        if passing and left < t.v[RULE, FADED]:
+            for q in range(end - 1, first - 1, -1):
+                forget(t, s, q)
+            if k != START:
+                return k
+        elif not passing and not drifting and significance(t, s, k) < t.v[RULE, FORGIVEN] * t.v[THRESHOLD, k]:
+            for q in range(s.counts[ACTIVE] - 1, -1, -1):
+                if s.i[OWNER, q] == k:
+                    forget(t, s, q)
+            for i in range(t.i[SIZE, k]):
+                v[HELD, t.i[FIRST_OF, k] + i] = 0.0
+            return k
+        elif not passing and power > 0.0 and left < t.v[RULE, LEARNED]:
+            for q in range(end - 1, first - 1, -1):
+                settle(t, s, q)
+        else:
+            first = end
+    return -1
