@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from optid import __version__, plots
 from optid.data import Data
 from optid.errors import DataError, DataWarning
-from optid.showing import comparing, estimates, summary, wording
+from optid.showing import checks, comparing, estimates, summary, wording
 from optid.showing.printing import describe
 from optid.showing.svg import inline
 from optid.validation import Validation, validate
@@ -114,7 +114,7 @@ def _compared(found: "Comparison", command: str) -> dict[str, Any]:
             {
                 "title": name,
                 "equation": [_breakable(line) for line in model.equation().splitlines()],
-                "tables": summary.validation_tables(checked),
+                "tables": checks.validation_tables(checked),
                 "notes": checked.notes,
             }
             for name, model, checked in zip(found.names, found.models, found.validations)
@@ -290,5 +290,5 @@ def _validation(fit: "Fit", name: str, test: Data | None, checked: Validation) -
                 "Measured, simulated and one-step predicted output on the test record.",
             ),
         )
-    tables = summary.validation_tables(checked)
+    tables = checks.validation_tables(checked)
     return {"title": TITLES[name], "tables": tables, "notes": checked.notes, "figures": figures}

@@ -15,7 +15,8 @@ from optid.bases import Polynomial
 from optid.data import Data
 from optid.errors import RankError
 from optid.validation import validate
-from optid.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
+from optid.validation.families import Family
+from optid.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
 from optid.validation.structure import FTest, structure_test
 from optid.validation.structure_design import Design
 

@@ -4,7 +4,7 @@ from itertools import zip_longest
 from textwrap import wrap
 from typing import TYPE_CHECKING
 
-from optid.showing import estimates, summary
+from optid.showing import checks, estimates, summary
 from optid.showing.summary import Facts
 from optid.showing.wording import Table
 
@@ -72,7 +72,7 @@ def describe(fit: "Fit") -> str:
 def describe_checks(checked: "Validation") -> str:
     """Return what a validation found as text, at most 80 columns wide."""
     lines = [f"Validation on {checked.data}" if checked.data else "Validation"]
-    for table in summary.validation_tables(checked):
+    for table in checks.validation_tables(checked):
         lines += [*set_table(table), ""]
     return "\n".join([*lines[:-1], *(line for note in checked.notes for line in _wrapped(f"Note: {note}"))])
 

@@ -34,8 +34,8 @@ class HorizonCurve:
     simulation: Array
 
     def __str__(self) -> str:
+        from optid.showing.checks import horizon_table
         from optid.showing.printing import set_table
-        from optid.showing.summary import horizon_table
 
         return "\n".join(set_table(horizon_table(self)))
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.stretches import interpolated
-from optid.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
+from optid.validation.families import Family
+from optid.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
 
 DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
