@@ -52,9 +52,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
             raise DataError(f"output {name!r} is constant ({y[0]:g}): there is nothing to explain; check the column")
         found += _outliers("output", name, y)
         found += _units(name, y)
-    for sentence in found:
-        warnings.warn(sentence, DataWarning, stacklevel=4)
-    return found
+    return _warned(found)
 
 
 def _levels(name: str, u: np.ndarray, basis: Basis) -> list[str]:
@@ -82,6 +80,13 @@ def _told(check: Check) -> list[str]:
     if check.severity == "error":
         raise DataError(check.sentence)
     return [check.sentence] if check.severity == "warning" else []
+
+
+def _warned(found: list[str]) -> list[str]:
+    """Issue every sentence as a warning, too."""
+    for sentence in found:
+        warnings.warn(sentence, DataWarning, stacklevel=5)
+    return found
 
 
 def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
@@ -141,9 +146,7 @@ def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:
         candidates: rows there would be without missing samples.
         condition: estimated condition number of the column-scaled expanded regressor.
     """
-    found = _told(check_condition(condition))
-    for sentence in found:
-        warnings.warn(sentence, DataWarning, stacklevel=4)
+    found = _warned(_told(check_condition(condition)))
     if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
         found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
     return found
@@ -155,7 +158,4 @@ def examine_instruments(condition: float) -> list[str]:
     Args:
         condition: condition number of R11, the regressors projected on the instruments.
     """
-    found = _told(check_instruments(condition))
-    for sentence in found:
-        warnings.warn(sentence, DataWarning, stacklevel=4)
-    return found
+    return _warned(_told(check_instruments(condition)))

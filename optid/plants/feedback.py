@@ -91,7 +91,8 @@ def _identity(u: Array) -> Array:
     return u
 
 
-def _rotation(radius: float, angle: float) -> Array:
+def rotation(radius: float, angle: float) -> Array:
+    """Return the (2, 2) matrix with the poles radius exp(+- i angle)."""
     cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
     return np.array([[cosine, sine], [-sine, cosine]])
 
@@ -108,7 +109,7 @@ EXAMPLE1 = FeedbackSystem(
 """Order 3, f = (u1 + 0.5 u1^3, tanh 2 u2); meant for inputs within 2."""
 
 TWO_MODES = FeedbackSystem(
-    a=np.block([[_rotation(0.9, 0.5), np.zeros((2, 2))], [np.zeros((2, 2)), _rotation(0.75, 1.4)]]),
+    a=np.block([[rotation(0.9, 0.5), np.zeros((2, 2))], [np.zeros((2, 2)), rotation(0.75, 1.4)]]),
     b=np.array([[1.0, 0.2], [0.0, 0.5], [0.3, 1.0], [-0.6, 0.4]]),
     c=np.array([[1.0, 0.0, 0.5, 0.0], [0.0, 0.7, 0.0, 1.0]]),
     d=np.diag([0.1, 0.2]),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.errors import StructureError
+from optid.plants.feedback import TWO_MODES, rotation
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
@@ -28,15 +29,12 @@ def two_mode_plant(coupled: bool = False, process: float = 0.0, measurement: flo
     if not (process >= 0 and measurement > 0 and np.isfinite(process + measurement)):
         raise StructureError(f"process={process}, measurement={measurement}: finite numbers, the first not negative "
                              "and the second positive, are needed.")
-    a = np.zeros((4, 4))
-    for i, (radius, angle) in enumerate([(0.9, 0.5), (0.8, 1.3)]):
-        cosine, sine = np.cos(angle), np.sin(angle)
-        a[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = radius * np.array([[cosine, sine], [-sine, cosine]])
+    nothing = np.zeros((2, 2))
+    a = np.block([[rotation(0.9, 0.5), nothing], [nothing, rotation(0.8, 1.3)]])
     if coupled:
-        b, c = [[1.0, 0.2], [0, 0.5], [0.3, 1], [-0.6, 0.4]], [[1.0, 0, 0.5, 0], [0, 0.7, 0, 1]]
+        b, c = TWO_MODES.b, TWO_MODES.c
     else:
-        b, c = [[1.0, 0], [0.5, 0], [0, 1], [0, -0.6]], [[1.0, 0, 0, 0], [0, 0, 1, 0]]
-    b, c = np.array(b), np.array(c)
+        b, c = np.array([[1.0, 0], [0.5, 0], [0, 1], [0, -0.6]]), np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
     q, r, s = process**2 * np.eye(4), measurement**2 * np.eye(2), np.zeros((4, 2))
     found = kalman_gain(a, c, q, r, s)
     return HammersteinSS(a, b, c, K=found.K, noise=NoiseCovariances(q, r, s, found.innovation))
