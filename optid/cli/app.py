@@ -10,6 +10,7 @@ import typer
 
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.designing import design
+from optid.cli.diagnosing import diagnose
 from optid.cli.isolability import isolability
 from optid.cli.options import (
     MODEL,
@@ -320,5 +321,6 @@ def examples() -> None:
 
 
 app.command(cls=Command)(design)
+app.command(cls=Command)(diagnose)
 app.command(cls=Command)(isolability)
 app.command(cls=Command)(order)

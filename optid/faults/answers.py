@@ -291,7 +291,7 @@ class Diagnosis:
         """Say in three sentences what was found, how sure that is, and what it rests on."""
         from optid.faults.explanation import explained
 
-        return explained(self)
+        return " ".join(explained(self))
 
     def plot(self) -> "Figure":
         """Draw the innovations, the statistic over onset and candidate, and the signature of the best answer.

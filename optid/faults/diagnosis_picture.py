@@ -36,7 +36,7 @@ def draw(found: Diagnosis) -> Figure:
     outputs, count = seen.r.shape[1], max(len(seen.labels), 1)
     heights = [1.9] * outputs + [0.28 * count + 1.0]
     answers = found.candidates[:ROWS]
-    if answers:
+    if len(answers) > 1:
         heights.append(0.32 * len(answers) + 0.9)
     figure = Figure(figsize=(9.6, sum(heights) + 0.5), layout="constrained")
     axes = cast(list[Axes], np.atleast_1d(cast(Any, figure.subplots(len(heights), 1, height_ratios=heights))).tolist())
@@ -44,7 +44,7 @@ def draw(found: Diagnosis) -> Figure:
     for o, ax in enumerate(axes[:outputs]):
         _innovations(ax, found, seen, o, names[o])
     _heat(figure, axes[outputs], found, seen)
-    if answers:
+    if len(answers) > 1:
         _probabilities(axes[outputs + 1], found, answers)
     figure.suptitle(plain(shorten(f"{found.verdict}: {headline(found)}", 90)), color=INK, fontsize=11, weight="bold")
     return figure

@@ -63,7 +63,7 @@ def printed(found: "Diagnosis") -> str:
     """Print a diagnosis in 80 columns."""
     lines = [f"{found.verdict}: {headline(found)}"]
     lines.append(
-        f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {_probability(found.p_value)}, "
+        f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
         f"method {found.method}"
     )
     for answer in found.candidates:
@@ -132,7 +132,7 @@ def remaining_words(found: "Diagnosis") -> str:
     assert rest is not None
     words = (
         f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings, p-value "
-        f"{_probability(rest.p_value)}"
+        f"{probability_words(rest.p_value)}"
     )
     if found.verdict != "unknown":
         return words
@@ -152,39 +152,54 @@ def course_words(found: "Diagnosis") -> str:
     return f"direction {direction}; {speed}, {100 * rest.share:.0f} % of its energy there"
 
 
-def explained(found: "Diagnosis") -> str:
-    """Say in three sentences what was found, how sure that is, and what it rests on."""
+def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
+    """Say in three sentences what was found, how sure that is, and what it rests on.
+
+    Args:
+        found: the diagnosis.
+        notes: add what could not be judged, and the status.
+    """
     if found.verdict == "healthy":
         sentences = [
             f"The record of {found.window} samples is what the healthy {found.model} predicts.",
-            f"Healthy records depart as far from it with probability {_probability(found.p_value)}; below "
+            f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
             f"{found.false_alarm:g} that would be an alarm.",
         ]
     elif found.verdict == "untestable":
-        sentences = [f"Nothing can be said about {_list(list(found.untestable))}: the input does not excite it."]
+        sentences = [_nothing_said(found)]
     elif found.verdict in ("unknown", "not isolable"):
         sentences = [
-            f"The record departs from the healthy {found.model} (p-value {_probability(found.p_value)}), but "
+            f"The record departs from the healthy {found.model} (p-value {probability_words(found.p_value)}), but "
             + ("no fault of the dictionary fits it." if found.verdict == "unknown" else
-               "with one output any fault of an arbitrary course explains it."),
+               "with one output a fault of any course explains it, in any place."),
         ]
         if found.remaining is not None:
             rest = course_words(found)
             sentences.append(rest[0].upper() + rest[1:] + ".")
     else:
         sentences = _faulty(found)
-    if found.untestable and found.verdict != "untestable":
-        sentences.append(f"This record cannot judge {_list(list(found.untestable))}.")
-    if found.status:
-        sentences.append(found.status)
-    return " ".join(sentences)
+    if notes:
+        if found.untestable and found.verdict != "untestable":
+            sentences.append(f"This record cannot judge {_list(list(found.untestable))}.")
+        sentences += [found.status] * bool(found.status)
+    return sentences
+
+
+def _nothing_said(found: "Diagnosis") -> str:
+    names = _list(list(found.untestable))
+    if found.detected:
+        return (
+            f"The record departs from the healthy {found.model} (p-value {probability_words(found.p_value)}), but the "
+            f"input does not excite what is suspected: {names}."
+        )
+    return f"Nothing can be said about {names}: the input does not excite it."
 
 
 def _faulty(found: "Diagnosis") -> list[str]:
     answers = found.candidates
     best, others = answers[0], answers[1:]
     most = "most probably " * bool(others)
-    first = f"The record is not healthy (p-value {_probability(found.p_value)}): {most}{_phrase(best)}."
+    first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{_phrase(best)}."
     if others:
         shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
         second = (
@@ -207,7 +222,8 @@ def _list(words: list[str], joint: str = "and") -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
 
 
-def _probability(value: float) -> str:
+def probability_words(value: float) -> str:
+    """Write a probability, however small."""
     if value < 1e-300:
-        return "below 1e-300"
+        return "< 1e-300"
     return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"

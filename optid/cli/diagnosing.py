@@ -1,0 +1,129 @@
+"""The command `optid diagnose`: what does a record say about the health of a plant?"""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Picture, Report, reads_a_record
+from optid.cli.results import conclude, save_picture
+from optid.cli.terminal import FILES, Waiting, hearing
+
+
+@reads_a_record
+def diagnose(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (.json) of a state-space model.")],
+    data: Annotated[
+        list[Path], typer.Argument(metavar="DATA", help="The record: a CSV, Parquet, MAT, NPZ or npy file.")
+    ],
+    *,
+    how: dict[str, Any],
+    healthy: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--healthy", metavar=FILES, rich_help_panel=RECORD,
+            help="A healthy record: its innovations must be white and of the size that the model says.",
+        ),
+    ] = None,
+    identified: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--identified", metavar=FILES, rich_help_panel=RECORD,
+            help="The record that the model was identified from: the uncertainty of the model counts as noise.",
+        ),
+    ] = None,
+    rescale: Annotated[
+        bool, typer.Option("--rescale", rich_help_panel=RECORD, help="Take the scale of the noise from --healthy.")
+    ] = False,
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--kinds", "-k", metavar="NAME...", rich_help_panel=MODEL,
+            help="bias, loss, stuck, drift, frozen, noise, spike. [dim]bias, loss, spike[/]",
+        ),
+    ] = None,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--load", metavar="NAME=E1,E2,...", rich_help_panel=MODEL,
+            help="Direction of a disturbance in the state equation, one number per state.",
+        ),
+    ] = None,
+    state_jump: Annotated[
+        bool, typer.Option("--state-jump/--no-state-jump", rich_help_panel=MODEL, help="May the state jump?")
+    ] = True,
+    max_faults: Annotated[
+        int, typer.Option("--max-faults", rich_help_panel=MODEL, help="Faults that may be in the record.")
+    ] = 1,
+    false_alarm: Annotated[
+        float,
+        typer.Option("--false-alarm", rich_help_panel=MODEL, help="Probability that a healthy record raises an alarm."),
+    ] = 0.01,
+    coverage: Annotated[
+        float, typer.Option("--coverage", rich_help_panel=MODEL, help="Of the set of answers and of the intervals.")
+    ] = 0.95,
+    robust: Annotated[
+        bool, typer.Option("--robust", rich_help_panel=MODEL, help="Bound the influence of outliers.")
+    ] = False,
+    method: Annotated[
+        str, typer.Option("--method", rich_help_panel=SOLVER, help="exact, sparse, sparse+polish or set.")
+    ] = "exact",
+    solver: Annotated[
+        str, typer.Option("--solver", "-s", metavar="NAME", rich_help_panel=SOLVER, help="See optid solvers.")
+    ] = "auto",
+    seed: Annotated[int, typer.Option("--seed", rich_help_panel=SOLVER, help="Seed of simulated thresholds.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", rich_help_panel=RESULT, help="Write the diagnosis (.json)."),
+    ] = None,
+    report: Report = None,
+    picture: Picture = None,
+) -> None:
+    """Find out whether a record is healthy, and if not, what broke, when, and how much of it.
+
+    Example: optid diagnose model.json faulty.csv --max-faults 2 --out d.json --report d.html
+    """
+    from optid.cli import arguments as words
+    from optid.errors import DataError
+    from optid.faults import diagnose as judge
+    from optid.faults import dictionary, model_uncertainty
+    from optid.faults.diagnosis import KINDS
+
+    words.check_folders(out, report, picture)
+    with hearing() as heard, Waiting() as waiting:
+        waiting.step("reading")
+        plant = words.state_space_model(model)
+        how = how | {"inputs": how["inputs"] or list(plant.inputs), "outputs": how["outputs"] or list(plant.outputs)}
+        how["dt"] = how["dt"] or plant.dt
+        record: Any = words.read_record(data, how)
+        if record.n_experiments > 1:
+            raise DataError(
+                f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and cut it to the "
+                "experiment)."
+            )
+        sound: Any = words.read_record(healthy, how) if healthy else None
+        origin: Any = words.read_record(identified, how) if identified else None
+        waiting.step("signatures")
+        found = dictionary(
+            plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--load"),
+            state_jump=state_jump,
+        )
+        waiting.step("searching")
+        answer = judge(
+            plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
+            model_uncertainty="ignore" if origin is None else model_uncertainty(plant, origin), robust=robust,
+            healthy=sound, rescale=rescale, seed=seed, solver=solver,
+        )
+        if out is not None:
+            answer.save(out)
+        if report is not None:
+            from optid.faults.diagnosis_report import write
+
+            waiting.step("report")
+            write(answer, report, record=record.name or data[0].name, command=shlex.join(["optid", *sys.argv[1:]]))
+        if picture is not None:
+            waiting.step("drawing")
+            save_picture(answer.plot(), picture)
+    conclude(str(answer), heard, diagnosis=out, report=report, picture=picture)
