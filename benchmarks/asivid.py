@@ -10,11 +10,11 @@ Prints, beside the goals,
 * the relative error of the feedback Markov parameters of Example 1 over N = 3k .. 48k under white and under AR(0.9)
   measurement noise, medians over seeds, and the slope of its logarithm over that of N (goal: -1/2, at most -0.4).
 
-Example 1 is that of `tests`: three states, two inputs, two outputs, sd 0.5 of the noise; each seed its own input.
+Example 1 is `optid.plants.EXAMPLE1`: three states, two inputs, two outputs; sd 0.5 of the noise, each seed its own
+input.
 """
 
 import argparse
-import os
 import warnings
 
 import numpy as np
@@ -26,7 +26,6 @@ from optid.plants import EXAMPLE1, pendulum, pendulum_input, van_der_pol
 INPUTS = [UserFunctions((lambda u: u, lambda u: u**3)), UserFunctions((lambda u: np.tanh(2 * u),))]
 FEEDBACK = [UserFunctions((lambda y: -np.sin(y),)), UserFunctions((lambda y: -y * np.abs(y) / (1 + y * y),))]
 KNOWN = {"nx": 3, "block_rows": 5, "basis": INPUTS, "feedback_basis": FEEDBACK}
-POINTS = np.linspace(-2, 2, 9)
 
 
 def example(count: int, seed: int, measurement: float = 0.0, colour: float = 0.0):
@@ -136,6 +135,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    for name in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{name}_NUM_THREADS", "1")
     main()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.stats import binomtest
 
 import optid
 
@@ -44,6 +45,12 @@ def record(values: np.ndarray, n: int, seed: int, sigma: float | None = None) ->
     e = (noise_level(values) if sigma is None else sigma) * rng.standard_normal(n)
     right = lfilter(B, [1.0], np.interp(u, NODES, values)) + e
     return optid.Data(u=u, y=lfilter([1.0], np.r_[1.0, A], right), dt=0.1)
+
+
+def share(count: int, of: int) -> str:
+    """Write a share with its 95 % interval (Clopper and Pearson), in %."""
+    low, high = binomtest(count, of).proportion_ci(0.95, "exact")
+    return f"{100 * count / of:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def mapped(function: Callable[[Any], Any], jobs: Iterable[Any], workers: int) -> list[Any]:

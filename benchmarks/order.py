@@ -12,7 +12,7 @@ import argparse
 import time
 
 import numpy as np
-from scipy.stats import beta
+from montecarlo import share
 
 from optid.bases import Linear, fitted_bases
 from optid.model_order import RankTest, order_test
@@ -30,13 +30,6 @@ def one(case: str, n: int, seed: int, alpha: int = 8) -> RankTest:
     data = TWO_MODES.record(u, seed + 1000, process=process, measurement=measurement, colour=colour)
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     return order_test(records, expand(records, fitted_bases(data, Linear()), [], data.inputs, data.outputs), alpha)
-
-
-def interval(count: int, of: int) -> str:
-    """Share with its 95 % interval, in %."""
-    low = beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return f"{100 * count / of:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def main() -> None:
@@ -57,8 +50,8 @@ def main() -> None:
             ratio = int(np.sum([test.ratio_order == TWO_MODES.order for test in tests]))
             right = int(np.sum(found == TWO_MODES.order))
             goal = 100 if case == "deterministic" else 95 if n >= 1000 else 85
-            print(f"{case:<18}{n:>6}  {interval(right, options.runs):<24}{goal:>7}{np.sum(found < TWO_MODES.order):>7}"
-                  f"{np.sum(found > TWO_MODES.order):>7}  {interval(ratio, options.runs):<24}{spent:>5.0f}", flush=True)
+            print(f"{case:<18}{n:>6}  {share(right, options.runs):<24}{goal:>7}{np.sum(found < TWO_MODES.order):>7}"
+                  f"{np.sum(found > TWO_MODES.order):>7}  {share(ratio, options.runs):<24}{spent:>5.0f}", flush=True)
 
 
 if __name__ == "__main__":

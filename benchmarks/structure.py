@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from montecarlo import share
 from scipy.signal import butter, lfilter
-from scipy.stats import beta
 
 import optid
 from optid.validation.structure import structure_test
@@ -82,13 +82,6 @@ def system(seed: int, wiener: bool, n: int, ratio: float = 20.0) -> tuple[optid.
     return optid.Data(u[SETTLING:], y[SETTLING:]), f"{name}, {kind}, {noise} noise, order {denominator.size - 1}"
 
 
-def interval(count: int, of: int) -> str:
-    """Share with its 95 % interval, in %."""
-    low = beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return f"{100 * count / of:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--systems", type=int, default=100)
@@ -103,7 +96,7 @@ def main() -> None:
             seeds = range(options.seed, options.seed + options.systems)
             rejected[wiener] = [seed for seed in seeds if not structure_test(system(seed, wiener, n)[0]).passed]
         spent = 1e3 * (time.process_time() - start) / (2 * options.systems)
-        counts = [interval(len(rejected[wiener]), options.systems) for wiener in (False, True)]
+        counts = [share(len(rejected[wiener]), options.systems) for wiener in (False, True)]
         print(f"{n:>8}  {counts[0]:<30}{counts[1]:<28}{spent:12.0f}")
         for seed in rejected[False]:
             print(f"{'':10}rejected: {system(seed, False, 10)[1]} (seed {seed})")

@@ -12,9 +12,14 @@ Prints
 Times are medians of CPU time over rounds in which the routes alternate, in one process.
 """
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when numpy is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
+
 import argparse
 import importlib.util
-import os
 import time
 from pathlib import Path
 
@@ -159,6 +164,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    for name in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{name}_NUM_THREADS", "1")
     main()
