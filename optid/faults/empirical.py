@@ -161,7 +161,7 @@ def empirical_thresholds(
         hop: samples from one window to the next.
         draws: simulated windows behind the thresholds of white innovations.
         seed: of the simulation.
-        extrapolate: whether a short record may give the factor of a more frequent alarm.
+        extrapolate: whether a short record may give the factor of a more frequent alarm; its own where that is larger.
 
     Returns:
         Thresholds for `diagnose`, `Scan.gains` and `SlidingScan`.
@@ -193,10 +193,10 @@ def empirical_thresholds(
     white = thresholds(found, window, false_alarm, u=longest, draws=draws, seed=seed)
     scans = [sliding_scan(found, part, window, u=one, hop=hop) for part, one in zip(parts, inputs)]
     ratios = np.concatenate([one.excess(white) for one in scans])
-    factor = float(np.quantile(ratios, 1 - level, method="higher"))
+    factor = float(np.quantile(ratios, 1 - false_alarm, method="higher"))
     if level != false_alarm:
         usual = np.nanmax(simulated(found, window, u=longest, draws=draws, seed=seed) / white.q, axis=1)
-        factor /= float(np.quantile(usual, 1 - level))
+        factor = max(factor, float(np.quantile(ratios, 1 - level) / np.quantile(usual, 1 - level)))
     above = [one.excess(white) > factor for one in scans]
     excursions = sum(_apart(one.stops[alarms], window) for one, alarms in zip(scans, above))
     if level == false_alarm and excursions < SURE:
