@@ -40,8 +40,8 @@ class Tracker:
 
         self.model, self.low, self.high, self.horizon = model, low, high, horizon
         n, m = model.nx, model.m
-        f, g = [_function(one, low[c], high[c]) for one, c in zip(model.nonlinearities, model.input_of)], [
-            _function(one, None, None) for one in model.feedback]
+        f = [_function(one, float(low[c]), float(high[c])) for one, c in zip(model.nonlinearities, model.input_of)]
+        g = [_function(one, None, None) for one in model.feedback]
         u, x = ca.MX.sym("u", m, horizon), ca.MX.sym("x", n, horizon)
         x0, r = ca.MX.sym("x0", n), ca.MX.sym("r", model.l)
         us, xs, before = ca.MX.sym("us", m), ca.MX.sym("xs", n), ca.MX.sym("before", m)
@@ -121,7 +121,7 @@ def resting(model: Any, low: Array, high: Array, weights: Array, reference: Arra
 
     n, m = model.nx, model.m
     u, x, y = ca.MX.sym("u", m), ca.MX.sym("x", n), ca.MX.sym("y", model.l)
-    f = [_function(one, low[c], high[c]) for one, c in zip(model.nonlinearities, model.input_of)]
+    f = [_function(one, float(low[c]), float(high[c])) for one, c in zip(model.nonlinearities, model.input_of)]
     v = ca.vertcat(*(one(u[c]) for one, c in zip(f, model.input_of)))
     following = ca.DM(model.A) @ x + ca.DM(model.B) @ v + ca.DM(model.L) @ y + ca.DM(model.offset_x)
     for j, (one, o) in enumerate(zip(model.feedback, model.output_of)):

@@ -19,6 +19,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.rule import Rule
+from optid.errors import StructureError
 from optid.faults.refitting import Refitting
 from optid.program import Program, Values, View
 from optid.registry import named_constraint
@@ -64,17 +65,17 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
     lost: dict[str, float] = {}
     for _ in range(STEPS):
         program = _step("refit.parameters", problem, theta, r, s, constraints)
-        before = _cost(program, problem, theta, lost, r) if solution is not None else np.inf
+        before = _cost(problem, theta, lost, r) if solution is not None else np.inf
         solution = yield program
         if not solution.has_point:
             break
-        new, lost_new = _vector(problem, solution.values, program)
+        new, lost_new = _vector(problem, solution.values), _lost(problem, solution.values)
         step, length = new - theta, 1.0
         for _ in range(HALVINGS):
             trial = theta + length * step
             at = {name: lost.get(name, 0.0) + length * (g - lost.get(name, 0.0)) for name, g in lost_new.items()}
             r_trial, s_trial = problem.linearised(trial)
-            objective = _cost(program, problem, trial, at, r_trial)
+            objective = _cost(problem, trial, at, r_trial)
             if np.isfinite(objective) and objective <= before:
                 break
             length /= 2
@@ -83,11 +84,17 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
             break
     status = Status.LOCAL if solution.has_point else solution.status
     bound = Bound(-np.inf, False, "none", "innovations are not linear in A and C: a local minimum, no bound is known")
-    return Evidence(_Point(problem, theta, lost), float(objective), bound, status, solution.reason)
+    return Evidence(Refitted(problem, theta, lost), float(objective), bound, status, solution.reason)
 
 
-class _Point:
-    """What a refit ends with: the vector of unknowns, the model, and the share lost of every curve."""
+class Refitted:
+    """What a refit ends with.
+
+    Attributes:
+        theta: the vector of unknowns.
+        lost: share of its gain that each damaged nonlinearity has lost.
+        model: the model.
+    """
 
     def __init__(self, problem: Refitting, theta: Array, lost: dict[str, float]) -> None:
         self.theta, self.lost, self.model = theta, lost, problem.model_at(theta)
@@ -95,76 +102,103 @@ class _Point:
 
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Program:
-    """Pose the programme linearised at theta."""
-    triangle, target, rest = _compressed(s, s @ theta - r)
+    """Pose the programme linearised at theta: one sum of squares, of the record and of what is believed beforehand."""
+    shares = {f"lost[{curve.name}]": curve for curve in problem.curves}
+    width = problem.size + len(shares)
+    rows, target = np.zeros((len(r), width)), s @ theta - r
+    rows[:, : problem.size] = s
+    believed, wanted = _believed(problem)
+    triangle, target, rest = _compressed(np.vstack([rows, believed]), np.concatenate([target, wanted]))
+    variables = {key: cp.Variable(shape, name=key) for key, shape in problem.shapes.items()}
+    variables |= {key: cp.Variable(1, name=key) for key in shares}
+    edges = [(part.start, part.stop) for part in problem.slices.values()]
+    edges += [(problem.size + i, problem.size + i + 1) for i in range(len(shares))]
+    terms = [
+        triangle[:, first:last] @ (v if v.ndim == 1 else cp.vec(v, order="C"))
+        for (first, last), v in zip(edges, variables.values())
+    ]
+    forecast: Any = (cp.sum(cp.vstack(terms), axis=0) if len(terms) > 1 else terms[0]) - target
     residual = cp.Variable(target.size, name="residual")
-    variables: dict[str, cp.Variable] = {"residual": residual}
-    columns = []
-    for key, shape in problem.shapes.items():
-        variables[key] = cp.Variable(shape, name=key)
-        columns.append(cp.vec(variables[key], order="C"))
-    z = cp.hstack(columns)
-    forecast = triangle @ z - target
-    objective: Any = cp.sum_squares(residual) + rest
-    spread = problem.spread()
-    believed = np.isfinite(spread) & (spread > 0)
-    if believed.any():
-        objective = objective + cp.sum_squares((z[believed] - problem.start[believed]) / spread[believed])
     structural: dict[str, tuple[Any, ...]] = {"residuals": (residual == forecast,)}
-    frozen = np.isfinite(spread) & (spread == 0)
-    if frozen.any():
-        structural["zeros stay"] = (z[frozen] == problem.start[frozen],)
+    spread = problem.spread()
+    for key, part in problem.slices.items():
+        zeros = np.flatnonzero(spread[part] == 0)
+        if zeros.size:
+            structural[f"zeros stay[{key}]"] = tuple(
+                _entry(variables[key], int(i)) == problem.start[part][i] for i in zeros
+            )
     expressions: dict[str, Any] = dict(variables)
     rules: list[Any] = []
-    for curve in problem.curves:
-        mu, constant = variables[f"mu[{curve.name}]"], variables[f"constant[{curve.name}]"]
-        lost = variables[f"lost[{curve.name}]"] = cp.Variable(1, name=f"lost[{curve.name}]")
-        structural[f"share lost[{curve.name}]"] = (lost >= 0, lost <= 1)
-        nodes = curve.to_nodes[:, :-1] @ mu + curve.to_nodes[:, -1] * constant[0]
-        expressions[f"mu[{curve.name}]" if len(problem.curves) > 1 else "mu"] = mu
-        expressions[f"nodes[{curve.name}]"] = nodes
-        bend = np.diff(np.eye(curve.nodes.size), n=2, axis=0)
-        half, prior = curve.half_range, problem.prior
-        objective = objective + cp.sum_squares((nodes - curve.healthy) / (prior.damaged * half))
-        if len(bend):
-            left = nodes - curve.healthy + lost[0] * curve.healthy
-            objective = objective + cp.sum_squares(bend @ left / (prior.curvature * half))
-        if isinstance(constraints, str):
-            rules += _not_stronger(curve, nodes)
+    for key, curve in shares.items():
+        mu, lost = variables[f"mu[{curve.name}]"], variables[key]
+        structural[f"share {key}"] = (lost >= 0, lost <= 1)
+        if curve.dead:
+            structural[f"dead[{curve.name}]"] = (mu == 0,)
+        if len(shares) == 1:
+            expressions["mu"] = mu
+        if isinstance(constraints, str) and not curve.dead:
+            rules += _not_stronger(curve, mu)
     if not isinstance(constraints, str):
         rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
+    elif constraints != "default":
+        raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     view = View(expressions, kind="exact", channels=tuple(curve.name for curve in problem.curves), gauge="none",
                 bases={curve.name: curve.basis for curve in problem.curves}, outputs=problem.model.outputs)
 
-    def recover(values: Values) -> _Point:
-        return _Point(problem, problem.pack(values), _lost(problem, values))
+    def recover(values: Values) -> Refitted:
+        return Refitted(problem, _vector(problem, values), _lost(problem, values))
 
-    start = problem.unpack(theta) | {f"lost[{curve.name}]": np.zeros(1) for curve in problem.curves}
-    start["residual"] = triangle @ theta - target
+    start = problem.unpack(theta) | {key: np.zeros(1) for key in shares}
+    begin = np.concatenate([theta, np.zeros(len(shares))])
     program = Program(
-        name, cp.Minimize(objective), structural, variables, start, recover, view, frozenset(structural),
-        derived={"residual": forecast}, scale=float(np.sum((s @ (theta - problem.start) - r) ** 2)) or 1.0,
+        name, cp.Minimize(cp.sum_squares(residual) + rest), structural, {**variables, "residual": residual},
+        {**start, "residual": triangle @ begin - target}, recover, view, frozenset(structural),
+        derived={"residual": forecast},
+        scale=float(np.sum((triangle @ begin - target) ** 2)) + rest or 1.0,
     )
     return program.subject_to(*rules)
 
 
-def _not_stronger(curve: Any, nodes: Any) -> list[Any]:
+def _entry(variable: cp.Variable, flat: int) -> Any:
+    """One entry of a variable, counted row by row."""
+    return variable[np.unravel_index(flat, variable.shape)] if variable.ndim > 1 else variable[flat]
+
+
+def _believed(problem: Refitting) -> tuple[Array, Array]:
+    """What is believed beforehand as rows of a least-squares problem in [z; shares lost]."""
+    width = problem.size + len(problem.curves)
+    spread = problem.spread()
+    finite = np.flatnonzero(np.isfinite(spread) & (spread > 0))
+    rows, wanted = [np.eye(width)[finite] / spread[finite, None]], [problem.start[finite] / spread[finite]]
+    for i, curve in enumerate(problem.curves):
+        first = problem.slices[f"mu[{curve.name}]"].start
+        part, count, half = slice(first, first + curve.nodes.size), curve.nodes.size, curve.half_range
+        near, bend = np.zeros((count, width)), np.zeros((max(count - 2, 0), width))
+        near[:, part] = curve.to_nodes / (problem.prior.damaged * half)
+        second = np.diff(np.eye(count), n=2, axis=0) / (problem.prior.curvature * half)
+        bend[:, part], bend[:, problem.size + i] = second @ curve.to_nodes, second @ curve.healthy
+        rows += [near, bend]
+        wanted += [curve.healthy / (problem.prior.damaged * half), second @ curve.healthy]
+    return np.vstack(rows), np.concatenate(wanted)
+
+
+def _not_stronger(curve: Any, mu: Any) -> list[Any]:
     """Monotone like the healthy nonlinearity and nowhere steeper; nothing for one that is not monotone."""
     steps = np.diff(curve.healthy)
     sign = 1.0 if steps.sum() >= 0 else -1.0
     if np.any(sign * steps < 0):
         return []
-    moved = sign * cp.diff(nodes)
+    rows = sign * np.diff(curve.to_nodes[:, :-1], axis=0)
     return [
-        Rule(f"monotone[{curve.name}]", lambda view: moved >= 0),
-        Rule(f"not steeper[{curve.name}]", lambda view: moved <= sign * steps),
+        Rule(f"monotone[{curve.name}]", lambda view: rows @ mu >= 0),
+        Rule(f"not steeper[{curve.name}]", lambda view: rows @ mu <= sign * steps),
     ]
 
 
 def _compressed(s: Array, target: Array) -> tuple[Array, Array, float]:
     """Triangular factor of [s target]: ‖s z - target‖² = ‖R z - t‖² + rest."""
     q = s.shape[1]
-    factor = np.linalg.qr(np.column_stack([s, target]), mode="r")
+    factor: Any = np.linalg.qr(np.column_stack([s, target]), mode="r")
     rest = float(factor[q, q] ** 2) if len(factor) > q else 0.0
     return factor[:q, :q], factor[:q, q], rest
 
@@ -173,21 +207,17 @@ def _lost(problem: Refitting, values: Values) -> dict[str, float]:
     return {curve.name: float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves}
 
 
-def _vector(problem: Refitting, values: Values, program: Program) -> tuple[Array, dict[str, float]]:
-    return problem.pack(values), _lost(problem, values)
-
-
-def _cost(program: Program, problem: Refitting, theta: Array, lost: dict[str, float], r: Array) -> float:
-    """Value of the objective with the innovations r at theta, linearised in nothing."""
-    value = float(np.sum(r**2))
-    spread = problem.spread()
-    believed = np.isfinite(spread) & (spread > 0)
-    value += float(np.sum(((theta - problem.start)[believed] / spread[believed]) ** 2))
-    unpacked = problem.unpack(theta)
+def _vector(problem: Refitting, values: Values) -> Array:
+    """Return the unknowns; what is held is held exactly."""
+    theta = problem.pack(values)
     for curve in problem.curves:
-        nodes = curve.to_nodes @ np.append(unpacked[f"mu[{curve.name}]"], unpacked[f"constant[{curve.name}]"])
-        change = (nodes - curve.healthy) / curve.half_range
-        value += float(np.sum((change / problem.prior.damaged) ** 2))
-        left = change + lost.get(curve.name, 0.0) * curve.healthy / curve.half_range
-        value += float(np.sum((np.diff(left, n=2) / problem.prior.curvature) ** 2))
-    return value
+        if curve.dead:
+            theta[problem.slices[f"mu[{curve.name}]"]] = 0.0
+    return theta
+
+
+def _cost(problem: Refitting, theta: Array, lost: dict[str, float], r: Array) -> float:
+    """Value of the objective with the innovations r at theta, linearised in nothing."""
+    rows, wanted = _believed(problem)
+    point = np.concatenate([theta, [lost.get(curve.name, 0.0) for curve in problem.curves]])
+    return float(np.sum(r**2) + np.sum((rows @ point - wanted) ** 2))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from optid.bases.basis import Array
 from optid.errors import DataWarning, StructureError
 from optid.faults.allocation_problem import AllocationProblem, Member
-from optid.faults.inverse import Inverse, inverse
+from optid.faults.inversion import Inverse, inverse
 from optid.faults.virtual_sensor import check_stabilisable
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,7 +56,8 @@ class Member:
 
     def rest_state(self, v: Array) -> Array:
         """Return the state (n,) that rests at v, the nearest where a pole is at 1."""
-        return np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B @ v + self.d, rcond=None)[0]
+        rest: Any = np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B @ v + self.d, rcond=None)[0]
+        return rest
 
     def rest_output(self, v: Array) -> Array:
         """Return the outputs (l,) at rest at v."""

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.bases import Linear, Triangular
 from optid.bases.basis import Array
@@ -32,6 +33,9 @@ LONGEST = 20_000
 """Samples after the fault that are used at most."""
 
 MATRICES = ("A", "B", "C", "D")
+
+HELD = 1e12
+"""Inverse variance of what does not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,7 @@ class Curve:
         healthy: (P + 1,) values before the fault.
         visited: (P + 1,) how many samples after the fault lie at each node, shared between neighbours.
         seen: smallest and largest input after the fault.
+        dead: whether it is held flat: the actuator no longer moves.
     """
 
     name: str
@@ -83,6 +88,7 @@ class Curve:
     healthy: Array
     visited: Array
     seen: tuple[float, float]
+    dead: bool = False
 
     @property
     def half_range(self) -> float:
@@ -90,7 +96,7 @@ class Curve:
         return max(float(np.ptp(self.healthy)) / 2, 1e-300)
 
     @property
-    def prior_only(self) -> Array:
+    def prior_only(self) -> NDArray[np.bool_]:
         """(P + 1,) whether the record says nothing of a value: less than half a sample lies there."""
         return self.visited < 0.5
 
@@ -200,7 +206,7 @@ class Refitting:
         """The healthy plant as a vector of unknowns."""
         values: dict[str, Array] = {}
         for curve in self.curves:
-            coefficients = np.linalg.solve(curve.to_nodes, curve.healthy)
+            coefficients: Any = np.linalg.solve(curve.to_nodes, curve.healthy)
             values[f"mu[{curve.name}]"], values[f"constant[{curve.name}]"] = coefficients[:-1], coefficients[-1:]
         values |= {f"size[{c.label}]": np.zeros(c.into_state.shape[1]) for c in self.offsets}
         if self.whole:
@@ -218,6 +224,38 @@ class Refitting:
                 values = self.start[self.slices[name]]
                 spread[self.slices[name]] = self.prior.healthy * np.abs(values).max(initial=0.0)
         return spread
+
+    def held_out(self, samples: int) -> "Refitting":
+        """Return the same without the last samples of the last window."""
+        last = self.windows[-1]
+        kept = len(last.u) - samples
+        cut = last._replace(u=last.u[:kept], y=last.y[:kept], present=last.present[:kept])
+        return replace(self, windows=(*self.windows[:-1], cut))
+
+    def information(self, theta: Array, sensitivities: Array) -> Array:
+        """Return the inverse covariance (q, q) of the unknowns: of the record and of what is believed beforehand.
+
+        Bounds are not part of it. Singular along what neither says anything of.
+        """
+        found = sensitivities.T @ sensitivities
+        spread = self.spread()
+        believed = np.isfinite(spread) & (spread > 0)
+        found[believed, believed] += 1 / spread[believed] ** 2
+        for curve in self.curves:
+            start = self.slices[f"mu[{curve.name}]"].start
+            part = slice(start, start + curve.nodes.size)  # mu, then its constant
+            if curve.dead:
+                shape = np.arange(start, start + curve.basis.size)
+                found[shape, :], found[:, shape] = 0.0, 0.0
+                found[shape, shape] = HELD
+            bend = np.diff(np.eye(curve.nodes.size), n=2, axis=0) / (self.prior.curvature * curve.half_range)
+            gain = bend @ curve.healthy
+            if gain @ gain > 0:  # the share lost is free: curvature along that of the healthy one costs nothing
+                bend = bend - np.outer(gain, gain @ bend) / (gain @ gain)
+            rows = np.vstack([np.eye(curve.nodes.size) / (self.prior.damaged * curve.half_range), bend])
+            rows = rows @ curve.to_nodes
+            found[part, part] += rows.T @ rows
+        return found
 
     def model_at(self, theta: Array) -> "HammersteinSS":
         """Return the model of a vector of unknowns; constants of damaged nonlinearities go to those of the model."""
@@ -264,7 +302,8 @@ class Refitting:
         shown = w.present.copy()
         shown[: int(w.held)] = False  # an innovation that is given does not depend on the parameters
         response = steady.respond(into_state, into_output, shown)
-        r, s = steady.whitened(innovations, shown), steady.whitened(response, shown)
+        r: Any = steady.whitened(innovations, shown)
+        s: Any = steady.whitened(response, shown)
         return r[shown], -s[shown]
 
     def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array, number: int
@@ -308,7 +347,7 @@ class Refitting:
 def refitting(
     model: "HammersteinSS", data: Data, onset: int, *, damaged: Sequence[int] = (),
     offsets: Sequence[Candidate] = (), whole: bool = False, prior: Prior | None = None, nodes: int = NODES,
-    known_start: bool = True,
+    known_start: bool = True, dead: Sequence[int] = (),
 ) -> Refitting:
     """Prepare a refit from the record after a fault.
 
@@ -322,6 +361,7 @@ def refitting(
         prior: what is believed beforehand.
         nodes: values of a damaged nonlinearity, where it has no nodes of its own.
         known_start: whether the plant was healthy before the onset, so that its state there is predicted.
+        dead: those of the damaged that no longer move: one constant each is estimated.
 
     Raises:
         DataError: a missing input after the fault, an onset beyond the record, other channels than the model's.
@@ -341,9 +381,10 @@ def refitting(
             raise DataError(f"The onset {first} lies beyond the record of {len(part.y)} samples.")
         windows.append(_cut(model, steady, part.u, part.y, first, known_start))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
-    curves = tuple(_curve(model, i, inputs, raw, nodes) for i in damaged)
+    curves = tuple(replace(_curve(model, i, inputs, raw, nodes), dead=i in dead) for i in damaged)
     found = Refitting(model, steady, tuple(windows), curves, tuple(offsets), whole, prior)
-    needed = sum(curve.nodes.size for curve in curves) + sum(c.into_state.shape[1] for c in offsets)
+    needed = sum(1 if curve.dead else curve.nodes.size for curve in curves)
+    needed += sum(c.into_state.shape[1] for c in offsets)
     if found.readings < needed:
         least = -(-needed // model.l)
         raise RankError(
@@ -381,7 +422,7 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
     r = held.whitened(innovations, present[part]).ravel()
     if 3 * before < steady.settling or np.linalg.matrix_rank(white) < model.nx:  # 1e-2 of an error is left
         return Window(u[onset:], y[onset:], present[onset:], *nothing, False, True)
-    x0 = np.linalg.lstsq(white, r, rcond=None)[0]
+    x0: Any = np.linalg.lstsq(white, r, rcond=None)[0]
     states, innovations = _observed(model, steady.K, (drive, direct), y[part], x0)
     return Window(u[start:], y[start:], present[start:], states[-1], innovations[-1], True, False)
 
