@@ -1,11 +1,10 @@
 """Order: the distribution of T against windows formed and against Monte Carlo, criteria and lags against dense fits."""
 
-import importlib.util
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
+import scripts
 from scipy.signal import lfilter
 from scipy.stats import kstest
 from typer.testing import CliRunner
@@ -22,9 +21,7 @@ from optid.plants import EXAMPLE1, TWO_MODES
 from optid.subspace.expansion import expand
 from optid.subspace.hankel import hankel_statistics, windows_of
 
-SPEC = importlib.util.spec_from_file_location("order_benchmark", Path(__file__).parent.parent / "benchmarks/order.py")
-benchmark = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(benchmark)
+benchmark = scripts.benchmark("order")
 
 
 def record(n=800, seed=0, noise=0.3, colour=0.0):

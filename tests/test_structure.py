@@ -1,11 +1,11 @@
 """The structure test: its columns by hand, its level and power on simulated systems, real records."""
 
-import importlib.util
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scripts
 from scipy.signal import lfilter
 from scipy.stats import kstest
 from systems import inputs, mimo, siso
@@ -20,11 +20,7 @@ from optid.validation.lag_filters import convolved, delay_of, orthonormal_filter
 from optid.validation.structure import FTest, structure_test
 from optid.validation.structure_design import Design
 
-SPEC = importlib.util.spec_from_file_location(
-    "structure_benchmark", Path(__file__).parent.parent / "benchmarks" / "structure.py"
-)
-benchmark = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(benchmark)
+benchmark = scripts.benchmark("structure")
 
 
 def hammerstein(count=1500, seed=0, wiener=False, delay=0, noise=0.2):
