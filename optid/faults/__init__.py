@@ -36,7 +36,7 @@ _HOME = {
     "EmpiricalThresholds": "empirical",
     "signature_estimate": "programmes",
     "membership": "programmes",
-    "Membership": "membership",
+    "Membership": "bounded_noise",
     "profile": "programmes",
     "Profile": "profiles",
     "noise_covariance": "programmes",

@@ -1,0 +1,120 @@
+"""Losses and stuck actuators between bounds: equal to a quadratic programme, right about what is left."""
+
+import numpy as np
+import pytest
+from fault_plants import levels, standard
+from scipy.optimize import lsq_linear
+from state_systems import with_feedback
+from test_fault_injection import small
+from test_fault_scan import record
+
+from optid import Data
+from optid.errors import StructureError
+from optid.faults import Fault, bounded, dictionary, inject, scan, severity, whiten
+from optid.faults.box_kernels import boxed
+from optid.faults.losses import bounds_of
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_all_faces_find_the_optimum_of_the_box(d):
+    rng = np.random.default_rng(d)
+    G = rng.normal(size=(200, 8, d))
+    y = 2 * rng.normal(size=(200, 8))
+    low, high = -rng.uniform(0, 1, d), rng.uniform(0, 1, d)
+    high[-1] = np.inf
+    sizes, values = np.empty((200, d)), np.empty(200)
+    boxed(np.einsum("tki,tkj->tij", G, G), np.einsum("tki,tk->ti", G, y), low, high, 1e-10, sizes, values)
+    for one, target, nu, value in zip(G, y, sizes, values):
+        expected = lsq_linear(one, target, (low, high), tol=1e-14)
+        np.testing.assert_allclose(nu, expected.x, atol=1e-6)
+        assert abs(value - (target @ target - 2 * expected.cost)) < 1e-7
+    assert np.mean(np.any((sizes == low) | (sizes == high), axis=1)) > 0.3
+
+
+def broken(model, fault, seed=0, count=160):
+    u = levels(count, seed, model.m)
+    data = Data(u, inject(model, u, fault, seed=seed), dt=model.dt, outputs=model.outputs)
+    found = dictionary(model, kinds=["loss", "stuck"], state_jump=False)
+    return scan(found, whiten(model, data, x0="zero"), u)
+
+
+def test_bounds_at_every_onset_are_a_quadratic_programme(real_data):
+    model, _ = standard(real_data)
+    result = broken(model, Fault.stuck("actuator:u1", 100, 1.1))
+    for label in ("actuator:u1 loss", "actuator:u1 stuck", "actuator:u2 stuck"):
+        one = bounded(result, label)
+        for onset in range(0, 150, 10):
+            G = result.signature(label, onset).reshape(320, -1)
+            expected = lsq_linear(G, result.whitened.r.ravel(), one.bounds, tol=1e-14)
+            np.testing.assert_allclose(one.sizes[onset], expected.x, atol=1e-5)
+            energy = np.sum(result.whitened.r**2)
+            assert abs(one.statistic[onset] - (energy - 2 * expected.cost)) < 1e-5
+        free = (one.sizes > one.bounds.low) & (one.sizes < one.bounds.high)
+        there = ~np.isnan(one.sizes)
+        slopes = np.where(there, one.multipliers, 0.0) / (1 + np.nanmax(np.abs(result.correlations)))
+        assert np.abs(slopes[free & there]).max() < 1e-9
+        assert slopes[(one.sizes == one.bounds.low) & there].max(initial=0) <= 1e-12
+        assert slopes[(one.sizes == one.bounds.high) & there].min(initial=0) >= -1e-12
+        both = ~np.isnan(one.statistic)
+        assert np.all(one.statistic[both] <= result.statistic[result.index(label), both] + 1e-7)
+
+
+def test_the_constant_of_a_stuck_actuator_is_in_the_image_of_its_function(real_data):
+    model, _ = standard(real_data)
+    result = broken(model, Fault.stuck("actuator:u1", 100, 1.1))
+    f = model.nonlinearities[0]
+    bounds = bounds_of(result, "actuator:u1 stuck")
+    np.testing.assert_allclose(bounds, [[0, f(-1.2)], [1, f(1.2)]], atol=1e-9)
+    np.testing.assert_allclose(bounds_of(result, "actuator:u1 stuck", (-0.5, 0.5)), [[0, f(-0.5)], [1, f(0.5)]])
+    free = broken(small(), ())
+    assert np.isinf(bounds_of(free, "actuator:u1 stuck").high[1])  # a linear actuator has no interval
+    several = dictionary(with_feedback(feedback=(), E=None, output_of=()), kinds="stuck")
+    u = 0.5 * np.random.default_rng(0).normal(size=(60, 2))
+    data = Data(u, inject(several.model, u, seed=1), dt=0.5, outputs=["p", "q"])
+    wide = scan(several, whiten(several.model, data, x0="zero"), u)
+    assert bounds_of(wide, "actuator:u2 stuck").low.size == 3
+
+
+@pytest.mark.parametrize("fault, hard_over, share", [
+    (Fault.hard_over("actuator:u1", 100), True, 1.0), (Fault.stuck("actuator:u1", 100, 0.4), True, 1.0),
+    (Fault.loss("actuator:u1", 100, 0.4), False, 0.4), (Fault.loss("actuator:u1", 100, 0.8), False, 0.8),
+], ids=str)
+def test_a_complete_loss_is_told_from_a_partial_one(real_data, fault, hard_over, share):
+    model, _ = standard(real_data)
+    label = "actuator:u1 stuck" if fault.kind == "stuck" else "actuator:u1 loss"
+    found = severity(broken(model, fault, 1, 300), label)
+    assert found.hard_over == hard_over and abs(found.onset - 100) <= 2
+    assert abs(found.share - share) < 0.06 and found.share_interval[0] <= share <= found.share_interval[1]
+    if fault.kind == "stuck":
+        assert abs(found.stop[0] - model.nonlinearities[0](0.4)) < 0.1
+    assert max(map(len, str(found).splitlines())) <= 80 and ("complete loss" in str(found))
+
+
+def test_intervals_of_the_share_cover_with_the_onset_searched(real_data):
+    model, _ = standard(real_data)
+    inside = 0
+    for seed in range(100):
+        found = severity(broken(model, Fault.loss("actuator:u2", 80, 0.5), seed), "actuator:u2 loss")
+        inside += found.share_interval[0] <= 0.5 <= found.share_interval[1]
+    assert inside >= 90
+
+
+def test_no_loss_at_all_is_no_hard_over():
+    found = severity(broken(small(), (), 3), "actuator:u1 loss")
+    assert not found.hard_over and found.share_interval[0] == 0
+
+
+def test_bad_input():
+    data = record(small(), 60, 0)
+    found = dictionary(small(), kinds=["bias", "loss", "stuck"])
+    white, u = whiten(small(), data), data.experiments[0].u
+    with pytest.raises(StructureError, match="only a loss and a stuck"):
+        bounded(scan(found, white, u), "sensor:y1")
+    with pytest.raises(StructureError, match="pass the inputs"):
+        bounded(scan(found, white), "actuator:u1 loss")
+    with pytest.raises(StructureError, match="untestable"):
+        bounded(scan(found, white, np.zeros((60, 2))), "actuator:u1 loss")
+    with pytest.raises(StructureError, match="reach="):
+        bounded(scan(found, white, u), "actuator:u1 stuck", reach=(1, 0))
+    with pytest.raises(StructureError, match="coverage="):
+        severity(scan(found, white, u), "actuator:u1 loss", coverage=95)
