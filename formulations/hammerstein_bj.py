@@ -31,11 +31,12 @@ from formulations.noise_models import (
 )
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
-from formulations.output_error_starts import stable_poles, with_poles
+from formulations.output_error_starts import RADIUS, with_poles
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import OptidError
+from optid.models.roots import contained
 from optid.regressors import Layout
 from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns
 from optid.regressors.sensitivities import Unknowns, simulate
@@ -137,4 +138,4 @@ def _armax_plant(criterion: PredictionErrors, plain: OutputError) -> Array | Non
         return None
     x = unknowns.plant.pack(alike.unpack(x).plant)
     at = unknowns.plant.slices["a"]
-    return with_poles(plain, plain.normalised(x), stable_poles(x[at]), "ARMAX").x
+    return with_poles(plain, plain.normalised(x), contained(x[at], RADIUS), "ARMAX").x

@@ -21,11 +21,11 @@ from formulations.output_error import OutputError
 from formulations.output_error_programme import Posing
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import (
+    RADIUS,
     blank,
     equation_error,
     iterated,
     perturbed,
-    stable_poles,
     subspace,
     with_poles,
 )
@@ -34,6 +34,7 @@ from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import RankError
+from optid.models.roots import contained
 from optid.regressors import Layout
 from optid.regressors.sensitivities import Unknowns
 from optid.solving import Procedure
@@ -175,7 +176,7 @@ def _starts(criterion: OutputError, count: int, seed: int) -> Iterator[tuple[str
     at = unknowns.slices["a"]
     first = equation_error(data, unknowns)
     first = blank(unknowns) if first is None else first
-    base = with_poles(criterion, criterion.normalised(first), stable_poles(first[at]), "ARX")
+    base = with_poles(criterion, criterion.normalised(first), contained(first[at], RADIUS), "ARX")
     yield "ARX", base.x
     done = 1
     for name in ("Steiglitz-McBride", "instruments", "subspace"):

@@ -20,7 +20,7 @@ from formulations.prediction_error import Descent, agreement, best_of, descend, 
 from optid.bases import Linear
 from optid.data import Data
 from optid.errors import DataWarning, OptidError, RankError
-from optid.models import HammersteinARX, HammersteinTF, noise_filter
+from optid.models import HammersteinARX, HammersteinTF, roots
 from optid.program import Values
 from optid.rank_one.bilinear import minimise
 from optid.regressors import Layout
@@ -58,9 +58,9 @@ class PredictionErrors(OutputError):
 
     def admissible(self, x: Array) -> bool:
         """Whether the predictor is stable: C invertible and, where the noise has poles of its own, the plant stable."""
-        if not np.all(np.isfinite(x)) or noise_filter.radius(x[self.unknowns.slices["c"]]) >= STABLE:
+        if not np.all(np.isfinite(x)) or roots.radius(x[self.unknowns.slices["c"]]) >= STABLE:
             return False
-        return not self.unknowns.apart or noise_filter.radius(x[self.unknowns.slices["a"]]) < STABLE
+        return not self.unknowns.apart or roots.radius(x[self.unknowns.slices["a"]]) < STABLE
 
     def with_noise(self, plant: HammersteinARX, values: Values) -> HammersteinTF:
         """Give a plant the noise model of the programme's values."""
@@ -172,7 +172,7 @@ def other_zeros(starts: dict[str, Array], unknowns: NoiseUnknowns, count: int, s
         pairs = RADIUS * np.sqrt(rng.random(nc // 2)) * np.exp(1j * np.pi * rng.random(nc // 2))
         zeros = np.concatenate([pairs, pairs.conj(), RADIUS * rng.uniform(-1, 1, nc % 2)])
         moved = first.copy()
-        moved[unknowns.slices["c"]] = noise_filter.with_roots(zeros, nc)
+        moved[unknowns.slices["c"]] = roots.with_roots(zeros, nc)
         found[f"other zeros {i}"] = moved
     return dict(list(found.items())[:count])
 
@@ -189,7 +189,7 @@ def _regressed(criterion: PredictionErrors, e: Sequence[Array] | None) -> Array:
     values = problem.linear_part(point.w)
     c = np.zeros(unknowns.nc)
     if e is not None:
-        c = stable_zeros(point.mus[-1][0] * np.ravel(point.bs[-1]))
+        c = roots.contained(point.mus[-1][0] * np.ravel(point.bs[-1]), RADIUS)
     pairs = [(np.array(mu, dtype=float), np.array(b, dtype=float).ravel()) for mu, b in zip(point.mus, point.bs)]
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
     a = values.get("a", np.zeros(0))
@@ -220,13 +220,6 @@ def _long_innovations(data: Data, unknowns: NoiseUnknowns) -> list[Array] | None
         return None
 
 
-def stable_zeros(c: Array) -> Array:
-    """Return the coefficients with zeros outside the unit circle reflected, and none outside `RADIUS`."""
-    roots = np.roots(np.concatenate([[1.0], noise_filter.reflected(c)]))
-    size = np.abs(roots)
-    return noise_filter.with_roots(np.where(size > RADIUS, roots * RADIUS / np.maximum(size, 1e-300), roots), len(c))
-
-
 def arma(signals: Sequence[Array], nc: int, nd: int) -> tuple[Array, Array]:
     """Estimate C and D of ``v = (C/D) e`` by two regressions (Hannan and Rissanen 1982).
 
@@ -246,7 +239,7 @@ def arma(signals: Sequence[Array], nc: int, nd: int) -> tuple[Array, Array]:
         e = [v + sum(-w * _lagged(v, i) for i, w in enumerate(ar, start=1)) for v in signals]
     lags = [*range(1, nd + 1), *range(1, nc + 1)]
     theta = _regression([([v] * nd + [one] * nc, lags, v) for v, one in zip(signals, e)])
-    return stable_zeros(theta[nd:]), stable_zeros(-theta[:nd])
+    return roots.contained(theta[nd:], RADIUS), roots.contained(-theta[:nd], RADIUS)
 
 
 def _regression(parts: Sequence[tuple[Sequence[Array], Sequence[int], Array]]) -> Array:

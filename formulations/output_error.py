@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from optid.data import Data
-from optid.models import HammersteinARX, noise_filter
+from optid.models import HammersteinARX, roots
 from optid.models.gauges import gauge_factor
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.program import Values
@@ -57,7 +57,7 @@ class OutputError:
     def admissible(self, x: Array) -> bool:
         """Whether all poles lie inside the unit circle."""
         a = x[self.unknowns.slices["a"]]
-        return bool(np.all(np.isfinite(x))) and noise_filter.radius(a) < STABLE
+        return bool(np.all(np.isfinite(x))) and roots.radius(a) < STABLE
 
     def normalised(self, x: Array) -> Array:
         """Return the same model in the gauge."""

@@ -11,12 +11,13 @@ import numpy as np
 from formulations.equation_error import flat, model_meta
 from formulations.gauges import scale_fixed
 from formulations.output_error import OutputError
-from formulations.output_error_starts import stable_poles, with_poles
+from formulations.output_error_starts import with_poles
 from formulations.prediction_error import Descent, Posed
 from optid.judging import measure_violation
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
+from optid.models.roots import contained
 from optid.program import Program, RankOneForm, Values, View
 from optid.regressors import Layout
 from optid.regressors.linearised import Linearised
@@ -209,7 +210,7 @@ class Posing:
             x = self.signed(one.x)
             a = x[self.criterion.unknowns.slices["a"]]
             for radius in PULLS:
-                pulled = a if radius == 1.0 else stable_poles(a, radius)
+                pulled = a if radius == 1.0 else contained(a, radius)
                 if self._poles_obey(x, one.at, pulled):
                     again = one if radius == 1.0 else with_poles(
                         replace(self.criterion, gauge="norm"), x, pulled, one.start)

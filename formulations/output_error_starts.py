@@ -13,6 +13,7 @@ from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
 from optid.data import Data
 from optid.errors import DataWarning, OptidError
+from optid.models.roots import contained, roots_of
 from optid.rank_one.bilinear import minimise
 from optid.regressors.sensitivities import PlantPoint, Unknowns, instruments
 from optid.subspace.expansion import expand
@@ -68,8 +69,8 @@ def subspace(data: Data, unknowns: Unknowns) -> Array | None:
         poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
     except (OptidError, np.linalg.LinAlgError):
         return None
-    a = np.real(np.poly(poles))[1:]
-    return stable_poles(a) if a.size == layout.na and np.all(np.isfinite(a)) else None
+    a = np.asarray(np.real(np.poly(poles))[1:], dtype=float)
+    return contained(a, RADIUS) if a.size == layout.na and np.all(np.isfinite(a)) else None
 
 
 def blank(unknowns: Unknowns) -> Array:
@@ -84,17 +85,6 @@ def blank(unknowns: Unknowns) -> Array:
     x0 = np.zeros((unknowns.experiments, unknowns.memory))
     a = np.asarray(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], dtype=float)
     return unknowns.pack(PlantPoint(a, tuple(mus), bs, 0.0, x0))
-
-
-def stable_poles(a: Array, radius: float = RADIUS) -> Array:
-    """Return the coefficients with poles outside the unit circle reflected, and none outside a radius."""
-    roots = np.roots(np.concatenate([[1.0], a]))
-    if not roots.size:
-        return np.zeros(0)
-    size = np.abs(roots)
-    roots = np.where(size > 1, roots / np.maximum(size, 1e-300) ** 2, roots)
-    size = np.abs(roots)
-    return np.real(np.poly(np.where(size > radius, roots * radius / np.maximum(size, 1e-300), roots)))[1:]
 
 
 def with_poles(criterion: OutputError, x: Array, a: Array, start: str) -> Descent:
@@ -135,7 +125,7 @@ def iterated(criterion: OutputError, x: Array, method: str) -> Descent | None:
         x[:p] += step
         if not np.all(np.isfinite(x)):
             break
-        found = with_poles(criterion, x, stable_poles(x[at], 0.9999), method)
+        found = with_poles(criterion, x, contained(x[at], 0.9999), method)
         settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
         best = found if best is None or found.value < best.value else best
         if settled:
@@ -146,7 +136,7 @@ def iterated(criterion: OutputError, x: Array, method: str) -> Descent | None:
 
 def perturbed(rng: np.random.Generator, a: Array) -> Array:
     """Return coefficients of A with its poles moved: in turn nearby, or anywhere in the disc in conjugate pairs."""
-    roots = np.roots(np.concatenate([[1.0], stable_poles(a)]))
+    roots = roots_of(contained(a, RADIUS))
     if rng.random() < 0.5:
         upper = roots[np.imag(roots) >= 0]
         radius = 1 - np.clip((1 - np.abs(upper)) * np.exp(rng.normal(0, 1.0, upper.size)), 1 - RADIUS, 1.0)

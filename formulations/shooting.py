@@ -30,12 +30,13 @@ from formulations.equation_error import model_meta
 from formulations.gauges import check_gauge, scale_fixed
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
-from formulations.output_error_starts import blank, equation_error, iterated, stable_poles, with_poles
+from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, with_poles
 from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
+from optid.models.roots import contained
 from optid.program import Program, Values, View
 from optid.regressors.sensitivities import Unknowns, simulate
 from optid.solution import Bound
@@ -183,7 +184,7 @@ class _Shooting:
         criterion, unknowns = self.criterion, self.criterion.unknowns
         first = equation_error(self.data, unknowns)
         first = criterion.normalised(blank(unknowns) if first is None else first)
-        found = [with_poles(criterion, first, stable_poles(first[unknowns.slices["a"]]), "ARX")]
+        found = [with_poles(criterion, first, contained(first[unknowns.slices["a"]], RADIUS), "ARX")]
         others = [iterated(criterion, found[0].x, method) for method in ("sm", "iv")]
         best = min([*found, *(one for one in others if one is not None)], key=lambda one: one.value)
         point = unknowns.unpack(criterion.normalised(best.x))

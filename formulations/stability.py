@@ -18,6 +18,8 @@ import numpy as np
 from formulations.pole_regions import disc_side, lmi
 from formulations.rule import Rule
 from optid.errors import StructureError
+from optid.models.roots import pulled, roots_of
+from optid.models.roots import radius as root_radius
 from optid.program import View
 
 FREQUENCIES = 128
@@ -86,7 +88,7 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False) ->
             further than that allows.
     """
     whole = np.asarray(reference, dtype=float)
-    inside = float(np.max(np.abs(np.roots([1.0, *whole])), initial=0.0)) < radius
+    inside = root_radius(whole) < radius
     for limit in LIMITS if keep and inside else LIMITS[:1]:
         rows, levels = _positive_real(central(whole, radius, limit), radius)
         if not (keep and inside) or np.all(rows @ whole >= levels):
@@ -99,7 +101,7 @@ def _positive_real(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
     order = np.arange(1, centre.size + 1)
     powers = radius ** -order.astype(float)
     scaled = centre * powers
-    lags = np.exp(-1j * frequencies(np.roots([1.0, *scaled])))[:, None] ** order
+    lags = np.exp(-1j * frequencies(roots_of(scaled)))[:, None] ** order
     values = 1 + lags @ scaled
     size = np.abs(values) ** 2
     rows = np.real(np.conj(values)[:, None] * lags * powers) / size[:, None]
@@ -121,11 +123,7 @@ def frequencies(roots: np.ndarray) -> np.ndarray:
 
 def central(a: np.ndarray, radius: float, share: float = LIMITS[0]) -> np.ndarray:
     """Return the coefficients of ``A`` with every pole outside ``share * radius`` pulled back onto that circle."""
-    roots = np.roots(np.concatenate([[1.0], a]))
-    limit = share * radius
-    sizes = np.abs(roots)
-    pulled = np.where(sizes > limit, roots * limit / np.maximum(sizes, 1e-300), roots)
-    return np.real(np.poly(pulled))[1:]
+    return pulled(a, share * radius)
 
 
 def _real(a: Any, na: int, radius: float, points: np.ndarray) -> list[Any]:

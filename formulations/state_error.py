@@ -16,6 +16,7 @@ from optid.bases import Linear
 from optid.data import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinSS
+from optid.models.roots import spectral_radius
 from optid.models.state_forms import balancing
 from optid.regressors.linearised import Linearised
 from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
@@ -67,8 +68,7 @@ class StateError:
         if not np.all(np.isfinite(x)):
             return False
         point = self.unknowns.unpack(x)
-        inner = point.A - point.K @ point.C
-        if np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0) >= self.limit:
+        if spectral_radius(point.A - point.K @ point.C) >= self.limit:
             return False
         return not self.checks or not any(check(self.at(point)) for check in self.checks)
 
@@ -176,7 +176,7 @@ def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] 
     candidates = [point]
     if criterion.unknowns.innovations:
         candidates.append(replace(point, K=np.zeros_like(point.K)))
-    largest = float(np.max(np.abs(np.linalg.eigvals(point.A)), initial=0.0))
+    largest = spectral_radius(point.A)
     candidates += [replace(point, A=point.A * (radius / max(largest, radius)), K=np.zeros_like(point.K))
                    for radius in radii]
     for candidate in candidates:

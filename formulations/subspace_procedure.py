@@ -17,6 +17,7 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.experiment.expansion import feedback_bases
 from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.roots import spectral_radius
 from optid.solution import Solution, Status
 from optid.solving import Evidence, Procedure
 from optid.subspace.channels import check_channels
@@ -173,7 +174,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     a, c, gamma = scaled_pair(gamma, scale)
     doubt = ""
     rules = plan.about("poles")
-    unstable = plan.stability == "auto" and float(np.max(np.abs(np.linalg.eigvals(a)))) >= 1
+    unstable = plan.stability == "auto" and spectral_radius(a) >= 1
     if rules or unstable:
         shift = yield from constrained_shift(gamma[: -data.l], gamma[data.l :], rules or (stable(INSIDE),))
         if shift.a is None:
@@ -181,7 +182,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
         if shift.applied:
             figures["suboptimality of A under the pole constraints"] = shift.suboptimality
             if not rules:
-                radius = np.max(np.abs(np.linalg.eigvals(a)))
+                radius = spectral_radius(a)
                 warnings.warn(f"the subspace estimate of A is unstable (largest modulus {radius:.4g}): its poles were "
                               f"brought to modulus {INSIDE}. Use stability='free' for a plant that is unstable without "
                               "its feedback.", DataWarning, stacklevel=2)
@@ -277,7 +278,7 @@ def _order(plan: Plan, projection: Projection, records: list[np.ndarray], expans
 
 def _form(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.ndarray, c: np.ndarray,
           scale: np.ndarray) -> ObserverForm:
-    unstable = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) >= 1
+    unstable = spectral_radius(a) >= 1
     closed = plan.observer == "kalman" or (plan.observer == "auto" and unstable)
     gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
     return ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / scale)
@@ -318,7 +319,7 @@ def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.nd
 
 def _inside(a: np.ndarray) -> np.ndarray:
     """Contract an unstable preliminary A: its simulation only serves as an instrument."""
-    radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
+    radius = spectral_radius(a)
     return a if radius < 1 else a * (INSIDE / radius)
 
 

@@ -12,7 +12,7 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataError, StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, noise_filter
+from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
@@ -248,12 +248,12 @@ def test_refusals():
 
 def test_reflection_keeps_the_spectrum():
     c = np.real(np.poly([1.6, -0.5, 1.2 + 0.5j, 1.2 - 0.5j]))[1:]
-    inside = noise_filter.reflected(c)
-    assert noise_filter.radius(inside) < 1
+    inside = roots.reflected(c)
+    assert roots.radius(inside) < 1
     z = np.exp(1j * np.linspace(0, 3, 7))
     ratio = np.abs(np.polyval(np.r_[1, c], z)) / np.abs(np.polyval(np.r_[1, inside], z))
     assert ratio == pytest.approx(np.full(7, ratio[0]), rel=1e-10)
-    assert noise_filter.reflected(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
+    assert roots.reflected(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
 
 
 def test_unstable_armax_predicts():

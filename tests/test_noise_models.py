@@ -13,11 +13,11 @@ from formulations.hammerstein_armax import exact as armax
 from formulations.hammerstein_armax import linear as linear_armax
 from formulations.hammerstein_bj import exact as bj
 from formulations.hammerstein_bj import linear as linear_bj
-from formulations.noise_models import arma, stable_zeros
+from formulations.noise_models import arma
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, noise_filter
+from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
 from optid.solution import Status
 
 BASIS = Triangular(4).fitted(-1.0, 1.0)
@@ -164,7 +164,7 @@ def test_constraints_hold_and_the_optimum_is_that_of_a_penalty_free_search(kind)
         mu = model.nonlinearities[0].mu + size * rng.normal(size=4)
         values = Nonlinearity(BASIS, mu)(np.linspace(-1, 1, 5))
         c = model.c + size * rng.normal(size=2)
-        if np.any(np.diff(values) < 0) or c[0] < -0.5 or noise_filter.radius(c) >= 1:
+        if np.any(np.diff(values) < 0) or c[0] < -0.5 or roots.radius(c) >= 1:
             continue
         a = model.a + size * rng.normal(size=2)
         plant = HammersteinARX(a, model.b, (Nonlinearity(BASIS, mu),), (1,), model.offset + size * rng.normal())
@@ -292,7 +292,7 @@ def test_arma_of_a_signal():
     assert c == pytest.approx(C, abs=0.1) and d == pytest.approx(D, abs=0.06)
     assert arma(signals, 0, 0)[0].size == 0 and arma(signals, 0, 2)[1].size == 2
     assert np.all(arma([np.zeros(50)], 1, 1)[0] == 0)
-    assert noise_filter.radius(stable_zeros(np.array([-3.0, 0.5, 0.0]))) <= 0.98 + 1e-12
+    assert roots.radius(roots.contained(np.array([-3.0, 0.5, 0.0]), 0.98)) <= 0.98 + 1e-12
 
 
 def test_results_by_name():
@@ -353,7 +353,7 @@ def test_noise_with_a_zero_on_the_unit_circle():
     u = rng.uniform(-1, 1, 500)
     y = system("armax").plant.simulate(u) + lfilter([1, -1.0], np.r_[1, A], 0.2 * rng.standard_normal(500))
     fit = quiet(Data(u, y), armax, na=2, nb=2, nk=1, nc=1, basis=BASIS, raises=False)
-    assert noise_filter.radius(fit.model.c) < 1 and fit.model.c[0] == pytest.approx(-1.0, abs=0.02)
+    assert roots.radius(fit.model.c) < 1 and fit.model.c[0] == pytest.approx(-1.0, abs=0.02)
 
 
 def test_without_poles():

@@ -12,11 +12,10 @@ import optid
 from formulations import hammerstein_oe, shape
 from formulations.output_error import OutputError
 from formulations.output_error_records import plant_layout
-from formulations.output_error_starts import stable_poles
 from formulations.prediction_error import descend
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
-from optid.models import HammersteinARX, Nonlinearity, noise_filter
+from optid.models import HammersteinARX, Nonlinearity, roots
 from optid.regressors.sensitivities import PlantPoint, Unknowns, simulate
 from optid.solution import Status
 
@@ -109,7 +108,7 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     unknowns = Unknowns(layout, 1, (True,))
     criterion = OutputError(data, unknowns, "norm")
     start = criterion.normalised(unknowns.pack(PlantPoint(
-        stable_poles(a + 0.05 * rng.normal(size=3)), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
+        roots.contained(a + 0.05 * rng.normal(size=3), 0.98), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
         (true.b[0] + 0.1 * rng.normal(size=3),), 0.0, np.zeros((1, unknowns.memory)))))
     ours = descend(criterion, start)
 
@@ -266,7 +265,7 @@ def test_every_point_of_a_descent_is_stable():
 
     class Watched(hammerstein_oe.OutputError):
         def linearise(self, x):
-            assert noise_filter.radius(x[self.unknowns.slices["a"]]) < 1
+            assert roots.radius(x[self.unknowns.slices["a"]]) < 1
             return super().linearise(x)
 
     hammerstein_oe.search(Watched(data, unknowns, "norm"), 8, 0)

@@ -13,7 +13,7 @@ from optid.bases.basis import Array
 from optid.channels import Transform, numbered_names
 from optid.data import Data
 from optid.errors import StructureError
-from optid.models import responses, simulation
+from optid.models import responses, roots, simulation
 from optid.models.coefficients import check_shapes, checked_horizon, coefficients, listed
 from optid.models.experiments import in_units_of, one_or_all, records_of, samples_of
 from optid.models.gauges import in_raw_units, regauged
@@ -179,8 +179,7 @@ class HammersteinARX:
         companion = np.eye(n, k=-self.l)
         if n:
             companion[: self.l] = -np.hstack(list(simulation.matrices_of(self)))
-        poles: Any = np.linalg.eigvals(companion).astype(complex)
-        return poles[np.lexsort((poles.imag, -np.abs(poles)))]
+        return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
 
     @property
     def is_stable(self) -> bool:
@@ -224,8 +223,7 @@ class HammersteinARX:
 
     def __str__(self) -> str:
         """Return the equations and the poles."""
-        poles = ", ".join(f"{p.real:.4g}" if abs(p.imag) < 1e-12 else f"{p:.4g}" for p in list(self.poles))
-        return self.equation() + (f"\npoles: {poles}" if poles else "")
+        return self.equation() + (f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else "")
 
     # -- prediction and simulation -------------------------------------------------------------------------------
 

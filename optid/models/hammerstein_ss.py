@@ -14,7 +14,7 @@ from optid.bases.expansions import Linear
 from optid.channels import Transform, numbered_names
 from optid.data import Data
 from optid.errors import DataError, StructureError
-from optid.models import state_forms, state_responses
+from optid.models import roots, state_forms, state_responses
 from optid.models import state_simulation as simulation
 from optid.models.coefficients import checked_horizon, coefficients
 from optid.models.experiments import one_or_all, records_of
@@ -164,8 +164,7 @@ class HammersteinSS:
     @cached_property
     def poles(self) -> Any:
         """Eigenvalues of A, complex (n,), largest first: the poles with the feedback g and L taken as given signals."""
-        poles: Any = np.linalg.eigvals(self.A).astype(complex)
-        return poles[np.lexsort((poles.imag, -np.abs(poles)))]
+        return roots.largest_first(np.linalg.eigvals(self.A).astype(complex))
 
     @property
     def is_stable(self) -> bool:
@@ -222,8 +221,7 @@ class HammersteinSS:
 
     def __str__(self) -> str:
         """Return the equations and the poles."""
-        poles = ", ".join(f"{p.real:.4g}" if abs(p.imag) < 1e-12 else f"{p:.4g}" for p in list(self.poles))
-        return self.equation() + (f"\npoles: {poles}" if poles else "")
+        return self.equation() + (f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else "")
 
     def expanded(self, u: Array) -> Array:
         """Return the values of the r nonlinearities at the inputs u (N, m), (N, r)."""

@@ -14,7 +14,7 @@ from optid.bases.expansions import Linear
 from optid.channels import Transform
 from optid.data import Data
 from optid.errors import StructureError
-from optid.models import noise_filter
+from optid.models import noise_filter, roots
 from optid.models.coefficients import checked_horizon, coefficients, listed
 from optid.models.equations import polynomial, written_with_noise
 from optid.models.experiments import in_units_of, one_or_all
@@ -54,11 +54,11 @@ class HammersteinTF:
             if values.ndim != 1:
                 raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
             object.__setattr__(self, name, values)
-        largest = noise_filter.radius(self.c)
+        largest = roots.radius(self.c)
         if largest >= 1:
             raise StructureError(
                 f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
-                "(optid.models.noise_filter.reflected): the spectrum of the noise stays what it is."
+                "(optid.models.roots.reflected): the spectrum of the noise stays what it is."
             )
 
     # -- what it is ----------------------------------------------------------------------------------------------
@@ -188,12 +188,12 @@ class HammersteinTF:
     @cached_property
     def noise_poles(self) -> Any:
         """Roots of D, complex (nd,), largest first."""
-        return _roots(self.d)
+        return roots.largest_first(roots.roots_of(self.d))
 
     @cached_property
     def noise_zeros(self) -> Any:
         """Roots of C, complex (nc,), largest first; all inside the unit circle."""
-        return _roots(self.c)
+        return roots.largest_first(roots.roots_of(self.c))
 
     @property
     def noise(self) -> str:
@@ -263,9 +263,9 @@ class HammersteinTF:
         parts = {"poles": self.poles, "zeros of the noise": self.noise_zeros}
         if not self.shares_poles:
             parts["poles of the noise"] = self.noise_poles
-        for name, roots in parts.items():
-            if roots.size:
-                text += f"\n{name}: " + ", ".join(f"{r.real:.4g}" if abs(r.imag) < 1e-12 else f"{r:.4g}" for r in roots)
+        for name, found in parts.items():
+            if found.size:
+                text += f"\n{name}: {roots.in_words(found)}"
         return text
 
     @property
@@ -373,7 +373,6 @@ class HammersteinTF:
         return self.plant.to_casadi()
 
 
-
 def _states(x0: Any, count: int) -> Sequence[Any]:
     if isinstance(x0, str):
         if x0 not in ("fit", "zero"):
@@ -383,8 +382,3 @@ def _states(x0: Any, count: int) -> Sequence[Any]:
     if len(states) != count:
         raise StructureError(f"{len(states)} initial states for {count} experiments: give one each.")
     return states
-
-
-def _roots(values: Array) -> Any:
-    roots: Any = np.roots(np.concatenate([[1.0], values])).astype(complex)
-    return roots[np.lexsort((roots.imag, -np.abs(roots)))]

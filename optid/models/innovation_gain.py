@@ -11,6 +11,7 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
+from optid.models.roots import spectral_radius
 
 STEPS, TOLERANCE, LARGEST = 50, 1e-10, 1e8
 """Steps at most; gain of the logarithm below which they have arrived; damping beyond which none descends."""
@@ -84,7 +85,7 @@ def log_determinant(covariance: Array) -> float:
 
 def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
     """Return the gain of the same spectrum that makes A - K C stable."""
-    if _radius(A - gain @ C) < 1:
+    if spectral_radius(A - gain @ C) < 1:
         return gain
     try:
         level = covariance + 1e-12 * np.trace(covariance) * np.eye(len(C))
@@ -109,7 +110,7 @@ def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array]) -> list[Arr
 
 def _settling(F: Array, count: int) -> int:
     """Samples after which the initial state is forgotten."""
-    radius = _radius(F)
+    radius = spectral_radius(F)
     return count if radius > 0.99 else min(count, len(F) + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1))))
 
 
@@ -139,7 +140,3 @@ def _solved(matrix: Array, right: Array) -> Array:
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     inverse = np.where(values > 1e-12 * max(values[-1], 1e-300), 1 / np.where(values == 0, 1.0, values), 0.0)
     return (vectors * inverse) @ (vectors.T @ (right.T / scale).T) / (scale if right.ndim == 1 else scale[:, None])
-
-
-def _radius(A: Array) -> float:
-    return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))

@@ -79,29 +79,6 @@ def impulse_response(c: Array, d: Array, n: int) -> Array:
     return np.asarray(lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), impulse))
 
 
-def radius(coefficients: Array) -> float:
-    """Largest modulus of the roots of 1 + c_1 q^-1 + ..; zero without coefficients."""
-    return float(np.max(np.abs(np.roots(np.concatenate([[1.0], coefficients]))), initial=0.0))
-
-
-def reflected(coefficients: Array, limit: float = 1.0) -> Array:
-    """Return the coefficients with every root outside the circle of radius ``limit`` reflected into it.
-
-    For ``limit`` 1 the spectrum of C e keeps its shape (spectral factorisation).
-    """
-    roots = np.roots(np.concatenate([[1.0], coefficients])).astype(complex)
-    outside = np.abs(roots) > limit
-    roots[outside] = limit**2 / np.conj(roots[outside])
-    return with_roots(roots, len(coefficients))
-
-
-def with_roots(roots: Array, size: int) -> Array:
-    """Return the coefficients (size,) of the polynomial 1 + c_1 q^-1 + .. with these roots, and others at zero."""
-    found = np.zeros(size)
-    found[: len(roots)] = np.real(np.atleast_1d(np.poly(roots)))[1:]
-    return found
-
-
 def _march(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) -> tuple[Array, Array, Array, Any]:
     count = s.shape[0]
     e, filled, predicted = np.zeros(count), np.empty(count), np.empty(count)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.models import noise_filter, simulation
+from optid.models import noise_filter, roots, simulation
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_tf import HammersteinTF
@@ -68,7 +68,7 @@ def fitted_state(model: "HammersteinTF", u: Array, y: Array, label: str = "") ->
     plant, n = model.plant, model.plant.memory
     if n == 0:
         return np.zeros((0, 1))
-    count = min(len(y), simulation.horizon_of(max(noise_filter.radius(plant.a), noise_filter.radius(model.c)), n))
+    count = min(len(y), simulation.horizon_of(max(roots.radius(plant.a), roots.radius(model.c)), n))
     rest = (y - simulation.simulate_record(plant, u, np.zeros((n, 1)), label))[:count, 0]
     present = np.isfinite(rest)
     free = simulation.impulse_of_inverse(plant, count)[:, 0, 0]

@@ -15,6 +15,7 @@ from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
+from optid.models.roots import spectral_radius
 from optid.regressors.factors import add_to_root
 from optid.stretches import runs_of
 from optid.subspace.observer import observer_gain
@@ -97,7 +98,7 @@ def prediction_errors(a: Array, c: Array, gain: Array, drive: Array, direct: Arr
 
 def _settling(inner: Array) -> int:
     """Samples after which the initial state of an observer is forgotten, at most 2000."""
-    radius = float(np.max(np.abs(np.linalg.eigvals(inner)), initial=0.0))
+    radius = spectral_radius(inner)
     return 2000 if radius >= 0.99 else int(min(2000, 10 + len(inner) + np.log(1e-8) / np.log(max(radius, 0.1))))
 
 

@@ -1,0 +1,65 @@
+"""Poles and zeros: roots of 1 + c_1 q^-1 + .. and eigenvalues; their sizes, their order and words, and moved ones."""
+
+from typing import Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+
+
+def roots_of(coefficients: Array) -> Any:
+    """Roots of 1 + c_1 q^-1 + .., complex."""
+    return np.roots(np.concatenate([[1.0], coefficients])).astype(complex)
+
+
+def radius(coefficients: Array) -> float:
+    """Largest modulus of the roots of 1 + c_1 q^-1 + ..; zero without coefficients."""
+    return float(np.max(np.abs(roots_of(coefficients)), initial=0.0))
+
+
+def spectral_radius(matrix: Array) -> float:
+    """Largest modulus of the eigenvalues of a matrix; zero without rows."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def largest_first(roots: Any) -> Any:
+    """Order roots by their moduli, the largest first; of a pair the one with negative imaginary part first."""
+    return roots[np.lexsort((roots.imag, -np.abs(roots)))]
+
+
+def in_words(roots: Any) -> str:
+    """Write roots to four digits."""
+    return ", ".join(f"{r.real:.4g}" if abs(r.imag) < 1e-12 else f"{r:.4g}" for r in list(roots))
+
+
+def with_roots(roots: Any, size: int) -> Array:
+    """Return the coefficients (size,) of the polynomial 1 + c_1 q^-1 + .. with these roots, and others at zero."""
+    found = np.zeros(size)
+    found[: len(roots)] = np.real(np.atleast_1d(np.poly(roots)))[1:]
+    return found
+
+
+def reflected(coefficients: Array, limit: float = 1.0) -> Array:
+    """Return the coefficients with every root outside the circle of radius ``limit`` reflected into it.
+
+    For ``limit`` 1 the spectrum of C e keeps its shape (spectral factorisation).
+    """
+    return with_roots(_reflected(roots_of(coefficients), limit), len(coefficients))
+
+
+def pulled(coefficients: Array, limit: float) -> Array:
+    """Return the coefficients with every root outside the circle of radius ``limit`` pulled back onto it."""
+    return with_roots(_pulled(roots_of(coefficients), limit), len(coefficients))
+
+
+def contained(coefficients: Array, limit: float) -> Array:
+    """Return the coefficients with roots outside the unit circle reflected, and none outside a radius ``limit``."""
+    return with_roots(_pulled(_reflected(roots_of(coefficients), 1.0), limit), len(coefficients))
+
+
+def _reflected(roots: Any, limit: float) -> Any:
+    return roots * (limit / np.maximum(np.abs(roots), limit)) ** 2
+
+
+def _pulled(roots: Any, limit: float) -> Any:
+    return roots * (limit / np.maximum(np.abs(roots), max(limit, 1e-300)))
