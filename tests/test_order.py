@@ -7,17 +7,20 @@ import pytest
 import scripts
 from scipy.signal import lfilter
 from scipy.stats import kstest
+from systems import by_hand, inputs, mimo, siso
 from typer.testing import CliRunner
 
 import optid
-from optid.bases import Linear, Polynomial, fitted_bases
+from optid.bases import Linear, Polynomial, Triangular, fitted_bases
 from optid.cli.app import app
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.model_order import choose_order, order_test, rank_test, scan_lags
+from optid.model_order.several_outputs import weighted_problem
 from optid.model_order.signals import block_rows_for, with_simulated_outputs
 from optid.model_order.states import state_criteria
 from optid.plants import EXAMPLE1, TWO_MODES
+from optid.regressors import collect
 from optid.subspace.expansion import expand
 from optid.subspace.hankel import hankel_statistics, windows_of
 
@@ -236,6 +239,26 @@ def test_lags_equal_dense_least_squares():
         error = y[reach:] - phi @ np.linalg.lstsq(phi, y[reach:])[0]
         assert one.aic == pytest.approx(len(error) * np.log(np.mean(error**2)) + 2 * phi.shape[1], rel=1e-9)
     assert scan.rows == 196
+
+
+@pytest.mark.parametrize("model", [siso(Triangular(5)), mimo()])
+def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
+    u = inputs(model, 400)
+    data = Data(u, by_hand(model, u, noise=0.1 * np.random.default_rng(5).normal(size=(400, model.l))), dt=model.dt)
+    problem = weighted_problem(collect(data, model.layout))
+    n = model.memory
+    columns = [-data.y[n - i : -i] for i in range(1, model.na + 1)]
+    for c, f in enumerate(model.nonlinearities):
+        eta = f.basis.values(data.u[:, c])
+        columns += [eta[n - model.nk[c] - j : len(eta) - model.nk[c] - j] for j in range(model.nb[c])]
+    phi = np.column_stack([*columns, np.ones(len(data.y) - n)])
+    theta = np.linalg.lstsq(phi, data.y[n:])[0]
+    residual = data.y[n:] - phi @ theta
+    free = np.linalg.solve(problem.root, problem.target)
+    linear = model.na * model.l + 1
+    past = np.vstack([theta[: model.na * model.l], theta[-1:]])
+    assert free[: linear * model.l].reshape(model.l, linear).T == pytest.approx(past, abs=1e-8)
+    assert problem.remainder == pytest.approx(np.sum(residual**2 / (1.0 if model.l == 1 else np.mean(residual**2, 0))))
 
 
 @pytest.mark.parametrize("nonlinear", [False, True])
