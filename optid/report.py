@@ -1,28 +1,21 @@
 """The report: one HTML page that carries its figures and its style with it."""
 
-import platform
 import re
 import warnings
-from collections.abc import Callable
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from optid import __version__, plots
 from optid.data import Data
 from optid.errors import DataError, DataWarning
 from optid.showing import checks, comparing, estimates, summary, wording
+from optid.showing.page import figure, template, versions
 from optid.showing.printing import describe
-from optid.showing.svg import inline
 from optid.validation import Validation, validate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from optid.fitting import Fit
     from optid.validation.comparison import Comparison
 
@@ -52,7 +45,7 @@ def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
     """Return the page that `write` writes."""
     if fit.model is None:
         raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
-    return _template("report.html.j2").render(_content(fit, test, command))
+    return template("report.html.j2").render(_content(fit, test, command))
 
 
 def write_comparison(found: "Comparison", path: str | Path, *, command: str = "") -> Path:
@@ -70,38 +63,18 @@ def write_comparison(found: "Comparison", path: str | Path, *, command: str = ""
         OSError: the file cannot be written.
     """
     path = Path(path)
-    path.write_text(_template("comparison.html.j2").render(_compared(found, command)), encoding="utf-8")
+    path.write_text(template("comparison.html.j2").render(_compared(found, command)), encoding="utf-8")
     return path
-
-
-def _template(name: str) -> Any:
-    return Environment(
-        loader=PackageLoader("optid"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    ).get_template(name)
-
-
-def _versions() -> list[tuple[str, str]]:
-    return [
-        ("optid", __version__),
-        *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
-        ("Python", platform.python_version()),
-        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-    ]
 
 
 def _compared(found: "Comparison", command: str) -> dict[str, Any]:
     figures = []
     if any(found.simulated):
         caption = "Measured and simulated outputs; every simulation starts from the initial state that fits best."
-        figures.append(_figure("simulations", lambda: comparing.simulations(found), caption))
+        figures.append(figure("simulations", lambda: comparing.simulations(found), caption))
     caption = "Fit against how many samples ahead is predicted; dotted: the simulation, which knows no output."
-    figures.append(_figure("horizons", lambda: comparing.horizons(found), caption))
-    figures.append(_figure("poles", lambda: comparing.poles(found), "Poles of the linear parts."))
+    figures.append(figure("horizons", lambda: comparing.horizons(found), caption))
+    figures.append(figure("poles", lambda: comparing.poles(found), "Poles of the linear parts."))
     several = len(found.names) > 1
     return {
         "version": __version__,
@@ -120,7 +93,7 @@ def _compared(found: "Comparison", command: str) -> dict[str, Any]:
             for name, model, checked in zip(found.names, found.models, found.validations)
         ],
         "call": command or f"optid.compare_models(models, data, horizon={found.horizon})",
-        "versions": _versions(),
+        "versions": versions(),
         "text": str(found),
         "sections": [("fits", "Fits"), ("figures", "Figures"), ("validation", "Models"), ("reproduce", "Reproduce")],
     }
@@ -148,7 +121,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "figures": _figures(fit),
         "constraints": summary.constraint_table(fit) if fit.prices else None,
         "certificate": summary.certificate_facts(fit),
-        "certificate_figure": _figure(
+        "certificate_figure": figure(
             "certificate",
             lambda: plots.certificate(fit),
             "How far the proof of global optimality went, and the gap that is left.",
@@ -158,7 +131,7 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "channels": summary.channel_table(fit),
         "solver": summary.solver_facts(fit),
         "call": "\n".join(part for part in (command, summary.call(fit)) if part),
-        "versions": _versions(),
+        "versions": versions(),
         "text": describe(fit),
         "sections": [
             (id, name)
@@ -214,7 +187,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
     found = []
     if isinstance(fit.data, Data):
         found.append(
-            _figure(
+            figure(
                 "time",
                 lambda: plots.fit_over_time(fit),
                 "Measured, simulated and one-step predicted output on "
@@ -222,7 +195,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
             )
         )
     found.append(
-        _figure(
+        figure(
             "nonlinearity",
             lambda: plots.nonlinearity(fit),
             "Static nonlinearity, with its 95 % band where there is one. The bars show where the samples lie.",
@@ -230,7 +203,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
     )
     if plots.theta_singular_values(fit):
         found.append(
-            _figure(
+            figure(
                 "theta",
                 lambda: plots.singular_values(fit),
                 "Singular values of the coefficient matrix before "
@@ -239,14 +212,14 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
         )
     if summary.spectra(fit):
         found.append(
-            _figure(
+            figure(
                 "spectra",
                 lambda: plots.spectra(fit),
                 "Singular values from which the order is read, relative to the first; those kept in colour.",
             )
         )
     found.append(
-        _figure(
+        figure(
             "dynamics",
             lambda: plots.poles_and_response(fit),
             "Poles, frequency response (with 95 % bands where there are standard errors, up to the Nyquist frequency) "
@@ -255,7 +228,7 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
     )
     if summary.has_noise(fit.model):
         found.append(
-            _figure(
+            figure(
                 "noise",
                 lambda: plots.noise(fit),
                 "Spectral density of the noise at the outputs, process and measurement noise together. A flat line is "
@@ -265,17 +238,13 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
     return found
 
 
-def _figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, Any]:
-    return {"svg": inline(draw(), name, caption), "caption": caption}
-
-
 TITLES = {"est": "Estimation record", "test": "Test record, not seen by the fit"}
 
 
 def _validation(fit: "Fit", name: str, test: Data | None, checked: Validation) -> dict[str, Any]:
     record = test if name == "test" else None
     figures = [
-        _figure(
+        figure(
             f"{name}-residuals",
             lambda: plots.residual_tests(fit, record, checked),
             "Autocorrelation of the residuals and their cross-correlation with the inputs; shaded: 99 % bands.",
@@ -284,7 +253,7 @@ def _validation(fit: "Fit", name: str, test: Data | None, checked: Validation) -
     if record is not None:
         figures.insert(
             0,
-            _figure(
+            figure(
                 f"{name}-time",
                 lambda: plots.fit_over_time(fit, record),
                 "Measured, simulated and one-step predicted output on the test record.",

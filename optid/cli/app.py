@@ -1,7 +1,5 @@
 """The command line: fit, validate, and what there is to choose from."""
 
-import shlex
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +22,7 @@ from optid.cli.options import (
     reads_a_record,
 )
 from optid.cli.ordering import order
-from optid.cli.results import conclude
+from optid.cli.results import command_line, conclude
 from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
 
 app = typer.Typer(
@@ -223,7 +221,7 @@ def fit(
             from optid.report import write
 
             waiting.step("writing the report")
-            write(found, report, held_out, command=shlex.join(["optid", *sys.argv[1:]]))
+            write(found, report, held_out, command=command_line())
     conclude(text, heard, model=model, report=report)
 
 
@@ -258,15 +256,7 @@ def validate(
         paths, data = words.models_and_data(files)
         models = dict(zip(words.distinct_names(paths), map(load, paths)))
         first = next(iter(models.values()))
-        record: Any = words.read_record(
-            data,
-            how
-            | {
-                "inputs": how["inputs"] or list(first.inputs),
-                "outputs": how["outputs"] or list(first.outputs),
-                "dt": first.dt if how["dt"] is None else how["dt"],
-            },
-        )
+        record: Any = words.read_record(data, words.as_modelled(how, first))
         waiting.step("validating")
         compared = len(models) > 1 or report is not None
         found: Any = compare_models(models, record, horizon) if compared else None
@@ -278,7 +268,7 @@ def validate(
             from optid.report import write_comparison
 
             waiting.step("writing the report")
-            write_comparison(found, report, command=shlex.join(["optid", *sys.argv[1:]]))
+            write_comparison(found, report, command=command_line())
     conclude(text, heard, report=report)
 
 

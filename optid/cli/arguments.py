@@ -85,6 +85,16 @@ def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     return arguments
 
 
+def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
+    """Return how to read a record for a model: its channels and sampling time where none are given."""
+    return {
+        **how,
+        "inputs": how["inputs"] or list(model.inputs),
+        "outputs": how["outputs"] or list(model.outputs),
+        "dt": model.dt if how["dt"] is None else how["dt"],
+    }
+
+
 def state_space_model(path: Path) -> Any:
     """Read the model that questions about faults are asked of.
 

@@ -1,14 +1,12 @@
 """The command `optid diagnose`: what does a record say about the health of a plant?"""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Picture, Report, reads_a_record
-from optid.cli.results import conclude, save_picture
+from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Load, Picture, Report, StateJump, reads_a_record
+from optid.cli.results import command_line, conclude, save_picture
 from optid.cli.terminal import FILES, Waiting, hearing
 
 
@@ -44,16 +42,8 @@ def diagnose(
             help="bias, loss, stuck, drift, frozen, noise, spike. [dim]bias, loss, spike[/]",
         ),
     ] = None,
-    load: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--load", metavar="NAME=E1,E2,...", rich_help_panel=MODEL,
-            help="Direction of a disturbance in the state equation, one number per state.",
-        ),
-    ] = None,
-    state_jump: Annotated[
-        bool, typer.Option("--state-jump/--no-state-jump", rich_help_panel=MODEL, help="May the state jump?")
-    ] = True,
+    load: Load = None,
+    state_jump: StateJump = True,
     max_faults: Annotated[
         int, typer.Option("--max-faults", rich_help_panel=MODEL, help="Faults that may be in the record.")
     ] = 1,
@@ -95,8 +85,7 @@ def diagnose(
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
         plant = words.state_space_model(model)
-        how = how | {"inputs": how["inputs"] or list(plant.inputs), "outputs": how["outputs"] or list(plant.outputs)}
-        how["dt"] = how["dt"] or plant.dt
+        how = words.as_modelled(how, plant)
         record: Any = words.read_record(data, how)
         if record.n_experiments > 1:
             raise DataError(
@@ -122,7 +111,7 @@ def diagnose(
             from optid.faults.diagnosis_report import write
 
             waiting.step("report")
-            write(answer, report, record=record.name or data[0].name, command=shlex.join(["optid", *sys.argv[1:]]))
+            write(answer, report, record=record.name or data[0].name, command=command_line())
         if picture is not None:
             waiting.step("drawing")
             save_picture(answer.plot(), picture)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from optid.cli.options import MODEL, Picture
+from optid.cli.options import MODEL, Load, Picture, StateJump
 from optid.cli.results import conclude, save_picture
 from optid.cli.terminal import Waiting, hearing
 
@@ -29,16 +29,8 @@ def isolability(
         list[str] | None,
         typer.Option("--kinds", "-k", metavar="NAME...", rich_help_panel=MODEL, help="bias, drift. [dim]bias[/]"),
     ] = None,
-    load: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--load", metavar="NAME=E1,E2,...", rich_help_panel=MODEL,
-            help="Direction of a disturbance in the state equation, one number per state.",
-        ),
-    ] = None,
-    state_jump: Annotated[
-        bool, typer.Option("--state-jump/--no-state-jump", rich_help_panel=MODEL, help="May the state jump?")
-    ] = True,
+    load: Load = None,
+    state_jump: StateJump = True,
     draws: Annotated[
         int, typer.Option("--draws", rich_help_panel=MODEL, help="Simulated windows per fault.")
     ] = 1000,

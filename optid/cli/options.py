@@ -88,6 +88,19 @@ FeedbackBasis = Annotated[
     ),
 ]
 
+Load = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--load",
+        metavar="NAME=E1,E2,...",
+        rich_help_panel=MODEL,
+        help="Direction of a disturbance in the state equation, one number per state.",
+    ),
+]
+StateJump = Annotated[
+    bool, typer.Option("--state-jump/--no-state-jump", rich_help_panel=MODEL, help="May the state jump?")
+]
+
 READING: dict[str, tuple[Any, Any]] = {
     "inputs": (Inputs, None),
     "outputs": (Outputs, None),

@@ -1,11 +1,18 @@
 """What a command leaves behind: pictures, the printed result, its notes, and what was written where."""
 
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from optid.cli.terminal import coloured, note, say
 from optid.errors import DataError
+
+
+def command_line() -> str:
+    """Return the words of this run, as a page says them."""
+    return shlex.join(["optid", *sys.argv[1:]])
 
 
 def save_picture(figure: Any, path: Path) -> None:
