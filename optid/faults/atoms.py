@@ -78,7 +78,7 @@ def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = No
         bank = signatures(found, candidate.label, where)
         flat = bank.reshape(where.size, found.whitened.r.size, -1)
         products = np.einsum("tkp,tkq->tpq", flat, flat)
-        largest = np.linalg.eigvalsh(products)[:, -1]
+        largest = np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float)
         back = np.swapaxes(inverse_roots(products, largest), 1, 2)
         made.append(Atoms(candidate.label, where, flat @ back, back, float(threshold)))
     return tuple(made)
@@ -98,6 +98,6 @@ def signatures(found: "Scan", label: str, onsets: np.ndarray) -> Array:
     count = len(white.r)  # a later onset shifts the trace
     trace = response(white.predictor, candidate, count)
     bank = np.zeros((onsets.size, *trace.shape))
-    for place, onset in zip(bank, onsets):
-        place[onset:] = trace[: count - onset]
+    for t, onset in enumerate(onsets):
+        bank[t, onset:] = trace[: count - onset]
     return bank

@@ -1,8 +1,8 @@
 """Has the noise grown, and where? The exact likelihood of more white noise at one place, for every place (F8).
 
 White noise of variance rho at a place adds rho H H' to the covariance of the whitened innovations, H being the
-responses to impulses there at all samples of the window. With the eigenvalues s of H H' and the coordinates z of the window along
-its eigenvectors the log-likelihood is a function of one number,
+responses to impulses there at all samples of the window. With the eigenvalues s of H H' and the coordinates z of the
+window along its eigenvectors the log-likelihood is a function of one number,
 
     l(rho) = -1/2 sum( log(1 + rho s_i) + z_i² / (1 + rho s_i) ),
 
@@ -50,7 +50,15 @@ class NoisePlace:
     present: float
 
     def likelihood(self, rho: Array, z2: Array) -> Array:
-        """Return l(rho) - l(0) for squared coordinates z2 (M, q): (M, K) for variances (K,), (M,) for one each (M, 1)."""
+        """Return l(rho) - l(0) for squared coordinates z2 (M, q).
+
+        Args:
+            rho: (K,) variances, tried in all windows, or (M, 1), one for each.
+            z2: (M, q).
+
+        Returns:
+            (M, K), or (M,).
+        """
         grown = 1 + rho[..., None] * self.s if rho.ndim == 1 else 1 + rho * self.s
         spread = np.sum(np.log(grown), axis=-1)
         if rho.ndim == 1:
@@ -75,18 +83,18 @@ class NoisePlace:
 
     def interval(self, window: Array, rho: float, gain: float) -> tuple[float, float]:
         """Return the 95 % profile interval of the variance, given the estimate and its gain."""
-        from scipy.optimize import brentq
+        from scipy.optimize import root_scalar
 
         z2 = (window[None] @ self.axes) ** 2
 
         def above(value: float) -> float:
             return float(self.likelihood(np.array([[value]]), z2)[0]) - gain + WIDE
 
-        low = 0.0 if rho == 0 or above(0.0) >= 0 else float(brentq(above, 0.0, rho))
+        low = 0.0 if rho == 0 or above(0.0) >= 0 else float(root_scalar(above, bracket=(0.0, rho)).root)
         high = max(rho, 1e-3 / float(np.mean(self.s)))
         while above(high) > 0:
             high *= 2
-        return low, float(brentq(above, rho, high)) if above(rho) > 0 else high
+        return low, float(root_scalar(above, bracket=(rho, high)).root) if above(rho) > 0 else high
 
 
 @dataclass(frozen=True, eq=False)

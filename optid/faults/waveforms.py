@@ -170,7 +170,8 @@ def waveform_test(
     return WaveformTest(tuple(places), probability, healthy, onset, untested, flat)
 
 
-def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened, onset: int = 0) -> Array:
+def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened, onset: int = 0,
+                    u: ArrayLike | None = None) -> Array:
     """Return what unit impulses at every sample from the onset on leave in the window, (N l, (N - onset) d).
 
     Args:
@@ -178,14 +179,18 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
         candidate: whose place it is; the impulses are in units of a bias there, whatever its kind.
         whitened: the window.
         onset: first sample.
+        u: (N, m) inputs; with them the impulses of a loss are in units of the share lost.
     """
-    count, d = len(whitened.r), candidate.into_state.shape[1]
-    impulses = np.zeros((count, count - onset, d, d))
-    at = np.arange(count - onset)
-    impulses[at + onset, at] = np.eye(d)
-    into_state = np.einsum("ktjd,nj->kntd", impulses, candidate.into_state).reshape(count, found.model.nx, -1)
-    into_output = np.einsum("ktjd,lj->kltd", impulses, candidate.into_output).reshape(count, found.model.l, -1)
-    response = whitened.predictor.respond(into_state, into_output, whitened.present)
+    count = len(whitened.r)
+    state, output = (np.broadcast_to(part, (count, *part.shape)) for part in
+                     (candidate.into_state, candidate.into_output))
+    if u is not None and candidate.kind == "loss":
+        state, output = found.additions(candidate, count, 0, u)
+    d, at = state.shape[2], np.arange(count - onset)
+    into_state, into_output = (np.zeros((count, part.shape[1], count - onset, d)) for part in (state, output))
+    into_state[at + onset, :, at], into_output[at + onset, :, at] = state[onset:], output[onset:]
+    response = whitened.predictor.respond(
+        into_state.reshape(count, found.model.nx, -1), into_output.reshape(count, found.model.l, -1), whitened.present)
     return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
 
 

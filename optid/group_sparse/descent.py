@@ -97,7 +97,7 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
 
     if not active.size:
         return a
-    columns = np.concatenate([np.arange(problem.edges[g], problem.edges[g + 1]) for g in active])
+    columns = np.concatenate([np.arange(int(problem.edges[g]), int(problem.edges[g + 1])) for g in active])
     edges = np.concatenate([[0], np.cumsum(np.diff(problem.edges)[active])])
     part = problem.design[:, columns]
     gram, pull = part.T @ part, part.T @ problem.target
