@@ -170,6 +170,11 @@ def flat(expression: cp.Expression) -> cp.Expression:
     return expression if expression.ndim == 1 else cp.vec(expression, order="F")
 
 
+def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np.ndarray) -> cp.Expression:
+    """Return ``mu bᵀ`` to first order about (mu0, b0)."""
+    return cp.outer(mu, b0) + cp.outer(mu0, b) - np.outer(mu0, b0)
+
+
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
              weights: Sequence[np.ndarray] | None = None) -> EquationError:

@@ -8,7 +8,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import flat, model_meta
+from formulations.equation_error import flat, model_meta, tangent_product
 from formulations.gauges import scale_fixed
 from formulations.output_error import OutputError
 from formulations.output_error_starts import with_poles
@@ -174,8 +174,7 @@ class Posing:
             if not free:
                 expressions[theta] = cp.reshape(variables[b], (1, variables[b].size), order="F")
                 continue
-            expressions[theta] = (cp.outer(variables[mu], values[b]) + cp.outer(values[mu], variables[b])
-                                  - np.outer(values[mu], values[b]))
+            expressions[theta] = tangent_product(variables[mu], variables[b], values[mu], values[b])
             gauges.append(scale_fixed(self.criterion.gauge, variables[b], variables.get("a"), values[b]))
         energy = np.array([self.criterion.energy])
         compressed = Simulated(at, tuple(self.places), x, energy, unknowns.layout, self.criterion.data.n_samples)

@@ -21,7 +21,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import residual_programme
+from formulations.equation_error import flat, residual_programme
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.program import Program, RankOneForm, Values, View
@@ -203,8 +203,7 @@ def _linear_start(step: ObserverProblem, w: np.ndarray) -> dict[str, np.ndarray]
 
 def _residual(step: ObserverProblem, linear: Mapping[str, cp.Variable], thetas: Sequence[cp.Expression]
               ) -> cp.Expression:
-    parts = [v if v.ndim == 1 else cp.vec(v, order="F") for v in linear.values()]
-    parts += [cp.vec(theta, order="F") for theta in thetas]
+    parts = [flat(part) for part in (*linear.values(), *thetas)]
     return step.problem.root @ cp.hstack(parts) - step.problem.target
 
 
