@@ -26,6 +26,7 @@ from optid.faults.monitor_layout import (
     FORGIVEN,
     GAIN,
     GROWN,
+    GROWTH,
     HELD,
     INDEX,
     INTO_OUTPUT,
@@ -155,9 +156,8 @@ def expect(t, s, f):
     n, l = dim[NX], dim[NY]  # noqa: E741
     for q in range(active):
         j = s.i[COLUMN, q]
-        if j >= 0 and t.i[COURSE, j] != JUMP:
-            if t.i[COURSE, j] == DRIFT:
-                v[GROWN, q] += 1.0
+        if j >= 0:
+            v[GROWN, q] += v[GROWTH, q]
             for i in range(n):
                 step = jolt(t, s, j, i, place) * v[GROWN, q]
                 m[V, i, q] += step
@@ -181,7 +181,7 @@ def expect(t, s, f):
             for i in range(n):
                 deviation += t.m[C, o, i] * m[V, i, q]
             j = s.i[COLUMN, q]
-            if j >= 0 and t.i[COURSE, j] != JUMP:
+            if j >= 0:
                 step = shift(t, s, j, o, place) * v[GROWN, q]
                 deviation += step
                 total += step * v[NU, q]
@@ -348,7 +348,8 @@ def forget(t, s, q):
     for p in range(q, last):
         for i in range(dim[NX]):
             m[V, i, p] = m[V, i, p + 1]
-        v[NU, p], v[GROWN, p], v[POWER, p] = v[NU, p + 1], v[GROWN, p + 1], v[POWER, p + 1]
+        for number in (NU, GROWN, GROWTH, POWER):
+            v[number, p] = v[number, p + 1]
         s.i[COLUMN, p], s.i[OWNER, p] = s.i[COLUMN, p + 1], s.i[OWNER, p + 1]
         for j in range(rows):
             for a in range(dim[LENGTH]):
@@ -365,10 +366,9 @@ def forget(t, s, q):
 def settle(t, s, q):
     """Keep the estimate of a carried direction as it is, and stop estimating it."""
     j = s.i[COLUMN, q]
-    if j >= 0 and t.i[COURSE, j] != JUMP:
+    if j >= 0:
         s.v[HELD, j] += s.v[NU, q] * s.v[GROWN, q]
-        if t.i[COURSE, j] == DRIFT:
-            s.v[SLOPE, j] += s.v[NU, q]
+        s.v[SLOPE, j] += s.v[NU, q] * s.v[GROWTH, q]
     forget(t, s, q)
 
 
@@ -381,8 +381,8 @@ def take_up(t, s, owner, count):
     first = s.counts[ACTIVE]
     for q in range(first, first + count):
         s.i[OWNER, q] = owner
-        s.i[COLUMN, q] = -1 if owner == START else t.i[FIRST_OF, owner] + q - first
-        s.v[NU, q], s.v[GROWN, q], s.v[POWER, q] = 0.0, 1.0, 0.0
+        s.i[COLUMN, q] = -1 if owner == START else t.i[FIRST_OF, owner] + (q - first) % t.i[SIZE, owner]
+        s.v[NU, q], s.v[GROWN, q], s.v[GROWTH, q], s.v[POWER, q] = 0.0, 0.0, 0.0, 0.0
         for i in range(dim[NX]):
             s.m[V, i, q] = 0.0
         for p in range(first + count):
@@ -413,23 +413,31 @@ def lose_state(t, s):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def carry(t, s, k):
-    """Correct the state by the estimate of a candidate at its peak and carry it; the search begins anew."""
+    """Correct the state by the estimate of a candidate at its peak and carry it; the search begins anew.
+
+    What an onset that is a little off leaves of a drift is a constant: it is carried, too, its variance being guessed.
+    """
     dim, now, m, v = t.i[0], s.counts[NOW], s.m, s.v
     n, l, d, own = dim[NX], dim[NY], t.i[SIZE, k], t.i[FIRST_OF, k]  # noqa: E741
     estimate(t, s, k)
     onset = s.i[PEAK, k]
     place = s.counts[PLACE] - (now - onset)
-    while s.counts[ACTIVE] + d > dim[ROOM]:
+    drifting = t.i[COURSE, own] == DRIFT
+    count = 2 * d if drifting else d
+    while s.counts[ACTIVE] + count > dim[ROOM]:
         settle(t, s, s.counts[ACTIVE] * 0)
     for p in range(s.counts[ACTIVE]):
         for i in range(d):
             m[TAKEN, p, i] = s.w[dim[S_TAKEN] + p * dim[COLUMNS] + own + i, place]
-    first, later = take_up(t, s, k, d), v[LATER]
-    for q in range(first, first + d):  # what the candidate has done to the state from its onset to the next sample
+    first, later = take_up(t, s, k, count), v[LATER]
+    for q in range(first, first + count):  # what the candidate has done to the state from its onset to the next sample
         j = s.i[COLUMN, q]
-        grown = 0.0
+        growth = 1.0 if drifting and q < first + d else 0.0
+        grown = 1.0 - growth
         for at in range(place, place + now - onset + 1):
-            grown = grown + 1.0 if t.i[COURSE, j] == DRIFT else 0.0 if t.i[COURSE, j] == JUMP and at > place else 1.0
+            grown += growth
+            if t.i[COURSE, j] == JUMP and at > place:
+                grown = 0.0
             for i in range(n):
                 m[V, i, q] += jolt(t, s, j, i, at) * grown
             for i in range(n):
@@ -445,7 +453,7 @@ def carry(t, s, k):
                     later[i] += (-t.m[GAIN, i, o] if there else t.m[L, i, o]) * deviation
             for i in range(n):
                 m[V, i, q] = later[i]
-        v[GROWN, q] = grown
+        v[GROWN, q], v[GROWTH, q] = grown, growth
     for i in range(d):
         q = first + i
         v[NU, q] = v[SIZES, i]
@@ -469,6 +477,10 @@ def carry(t, s, k):
         for q in range(first):
             for i in range(d):
                 m[P, p, q] -= m[P, p, first + i] * m[TAKEN, q, i]
+    if drifting:
+        for i in range(d):
+            m[P, first + i, first + i] *= 4.0
+            m[P, first + d + i, first + d + i] = m[SPREAD, i, i] * (2.0 * (now - onset + 1)) ** 2
     s.counts[FIRST] = now + 1
 
 
@@ -516,9 +528,10 @@ def review(t, s):
             strength += total * total
     while first < s.counts[ACTIVE]:
         k = s.i[OWNER, first]
-        end = first + (n if k == START else t.i[SIZE, k])  # directions stay beside those they were taken up with
         passing = k == START or t.i[COURSE, t.i[FIRST_OF, k]] == JUMP
         drifting = not passing and t.i[COURSE, t.i[FIRST_OF, k]] == DRIFT
+        # directions stay beside those they were taken up with
+        end = first + (n if k == START else 2 * t.i[SIZE, k] if drifting else t.i[SIZE, k])
         left, power = 0.0, 0.0
         for q in range(first, end):
             if passing:

@@ -121,10 +121,11 @@ def name(t, s, best, gain):
         if s.i[PEAK, k] >= 0:
             rivals += np.exp((s.v[STATISTIC, k] - t.v[THRESHOLD, k] - gain) / 2.0)
     sure = 1.0 / rivals >= rule[CERTAINTY]
-    chosen = best
+    chosen, old = best, now - s.i[PEAK, best] + 2  # an onset must not leave the window before it is named
     if counts[PHASE] == NAMING:
         odd, free = left_over(t, s, best)
-        late = now - counts[ALARM] >= rule[PATIENCE]
+        waited = now - counts[ALARM]
+        late = waited >= rule[PATIENCE] or (waited >= rule[SETTLE] and old + rule[SETTLE] >= dim[WINDOW])
         testable = t.i[ADDITIVE, best] == 1 or s.i[TESTED, best] == 1
         if counts[QUIET] >= rule[STILL] or (late and gain <= 0.0):
             counts[PHASE], counts[NAMED] = WATCHING, NOTHING
@@ -132,7 +133,7 @@ def name(t, s, best, gain):
         if not late and not (sure and gain > 0.0 and free >= 4 and testable):
             return -1, best
     else:
-        if now - counts[NAMED_AT] < rule[SETTLE]:
+        if now - counts[NAMED_AT] < rule[SETTLE] and old < dim[WINDOW]:
             return -1, best
         chosen = best if sure else counts[NAMED]
         if s.i[PEAK, chosen] < 0:

@@ -75,7 +75,8 @@ in the arrays, first sample after the last missing input, whether products of al
 # State.m
 V, P, S0, Z, RAW, TAKE, TURN, WHITENING, M, T, SPREAD, TAKEN = range(12)
 # State.v
-(X, NU, GROWN, POWER, HELD, SLOPE, BEFORE, STATISTIC, R, PREDICTED, Z1, SIZES, LATER, MOVED, INPUT, READING) = range(16)
+(X, NU, GROWN, GROWTH, POWER, HELD, SLOPE, BEFORE, STATISTIC, R, PREDICTED, Z1, SIZES, LATER, MOVED, INPUT,
+ READING) = range(17)
 # State.i
 COLUMN, OWNER, TESTED, PEAK, INDEX = range(5)
 

@@ -19,8 +19,8 @@ COURSES = {"bias": at.LASTING, "drift": at.DRIFT, "jump": at.JUMP, "loss": at.DR
 LONG = 8
 """The arrays over onsets are so many windows long, so that they are seldom moved."""
 
-SPARE = 6
-"""Directions of faults that are estimated at a time, beside the state and the widest candidate."""
+SPARE = 8
+"""Directions of faults that are estimated at a time, beside the state and twice the widest candidate."""
 
 
 def monitored(candidate: Candidate) -> bool:
@@ -70,7 +70,7 @@ def tables(found: Dictionary, chosen: tuple[Candidate, ...], window: int, rules:
     jolts = _jolts(steady, window)
     whole = np.vstack([*jolts, trace.reshape(-1, window), gram, roots])
     tabled = np.cumsum([len(part) for part in (*jolts, trace.reshape(-1, window), gram)])
-    m, length, room = len(driven), LONG * window, n + SPARE + int(sizes.max())
+    m, length, room = len(driven), LONG * window, n + SPARE + 2 * int(sizes.max())
     kept = np.cumsum([columns, len(gram), m * n, m * l, l, 1])
     scratch = np.cumsum([columns * l, l * n, l * l, 1])
     dim = [n, l, r, len(model.output_of), columns, len(chosen), m, window, length, room, *tabled, *kept, *scratch]
@@ -101,7 +101,7 @@ def blank(t: Tables) -> State:
     whole = np.full((5, wide), -1, dtype=np.int64)
     whole[at.TESTED] = 1
     return State(
-        counts, np.zeros((12, square, square)), np.zeros((16, wide)), whole,
+        counts, np.zeros((12, square, square)), np.zeros((17, wide)), whole,
         np.zeros((int(t.i[0, at.S_TAKEN]) + room * columns, length)), np.zeros((int(t.i[0, at.C_OTHER]) + 1, window)),
     )
 

@@ -349,3 +349,32 @@ class Monitor:
     def onsets(self) -> dict[str, int]:
         """{label: onset at which it explains most}; -1 where it cannot be looked for yet."""
         return dict(zip(self.labels, self._state.i[at.PEAK].tolist()))
+
+    @property
+    def carried(self) -> tuple[Carried, ...]:
+        """The faults that were named and are accounted for."""
+        s, first = self._state, 0
+        owners = s.i[at.OWNER, : s.counts[at.ACTIVE]]
+        found = []
+        for number, (label, c) in enumerate(zip(self.labels, self._chosen)):
+            own = slice(first, first + c.dimension)
+            first += c.dimension
+            size = np.array(s.v[at.SLOPE if c.kind == "drift" else at.HELD, own])
+            variance, mine = np.zeros(c.dimension), np.flatnonzero(owners == number)
+            for q in mine:
+                if c.kind != "drift" or s.v[at.GROWTH, q] > 0:
+                    size[s.i[at.COLUMN, q] - own.start] += s.v[at.NU, q]
+                    variance[s.i[at.COLUMN, q] - own.start] += s.m[at.P, q, q]
+            if mine.size or size.any():
+                found.append(Carried(label, tuple(size.tolist()), tuple(np.sqrt(variance).tolist())))
+        return tuple(found)
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether there is an alarm that has not been cleared or answered by carrying the fault."""
+        return bool(self._state.counts[at.PHASE] != at.WATCHING)
+
+    @property
+    def state(self) -> Array:
+        """(n,) expected state before the next sample, carried faults included."""
+        return np.array(self._state.v[at.X, : self.dictionary.model.nx])
