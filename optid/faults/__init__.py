@@ -40,6 +40,8 @@ _HOME = {
     "profile": "programmes",
     "Profile": "profiles",
     "noise_covariance": "programmes",
+    "state_jumps": "jump_search",
+    "StateJumps": "jump_search",
     "SparseResult": "sparse",
     "polish": "subsets",
     "SubsetSearch": "subsets",
