@@ -15,7 +15,7 @@ from optid.bases import Linear, Polynomial, Triangular, fitted_bases
 from optid.cli.app import app
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.model_order import choose_order, order_test, rank_test, scan_lags
+from optid.model_order import order_test, rank_test, scan_lags
 from optid.model_order.several_outputs import weighted_problem
 from optid.model_order.signals import block_rows_for, with_simulated_outputs
 from optid.model_order.states import state_criteria
@@ -158,15 +158,14 @@ def test_simulated_outputs_follow_the_inputs_alone():
 # -- the rule behind nx="auto" -----------------------------------------------------------------------------------------
 
 
-def test_choose_order_gives_a_reason():
+def test_the_choice_has_a_reason():
     data = record()
     statistics = hankel_statistics(records(data), 15)
     z, phi, y = positions(statistics, 5, 1, 2)
-    n, reason = choose_order(statistics, z, phi, y, rows=10)
+    n, reason = rank_test(statistics, z, phi, y, rows=10).choice
     assert n == 2 and "order 1 is rejected" in reason
-    assert choose_order(statistics, z, phi, y, rows=10, largest=1) == (1, "1: every smaller order is rejected and the "
-                                                                       "block rows show no larger one; use more block "
-                                                                       "rows")
+    assert rank_test(statistics, z, phi, y, rows=10, largest=1).choice == (
+        1, "1: every smaller order is rejected and the block rows show no larger one; use more block rows")
 
 
 def test_refusals_of_the_test():

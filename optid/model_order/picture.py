@@ -62,16 +62,11 @@ def _draw_lags(study: "OrderStudy", axes: Any) -> None:
         axes.text(0.5, 0.5, "no scan of lags", ha="center", va="center", transform=axes.transAxes)
         axes.set_axis_off()
         return
-    best = study.lags.best("bic")
-    least = best.bic
-    largest = max(c.na for c in study.lags.candidates)
-    found = [min((c.bic for c in study.lags.candidates if c.na == na), default=np.nan) for na in range(largest + 1)]
-    axes.plot(range(largest + 1), (np.array(found) - least) / study.lags.rows, "o-", label="over na")
-    counts = sorted({c.nb[0] for c in study.lags.candidates})
-    found = [min(c.bic for c in study.lags.candidates if c.nb[0] == nb) for nb in counts]
-    axes.plot(counts, (np.array(found) - least) / study.lags.rows, "s-", label="over nb")
-    delays = sorted({c.nk[0] for c in study.lags.candidates})
-    found = [min(c.bic for c in study.lags.candidates if c.nk[0] == nk) for nk in delays]
-    axes.plot(delays, (np.array(found) - least) / study.lags.rows, "^-", label="over nk")
+    candidates, least = study.lags.candidates, study.lags.best("bic").bic
+    scanned = {"na": [c.na for c in candidates], "nb": [c.nb[0] for c in candidates], "nk": [c.nk[0] for c in candidates]}
+    for (word, values), mark in zip(scanned.items(), ("o-", "s-", "^-")):
+        counts = sorted(set(values))
+        found = [min(c.bic for c, value in zip(candidates, values) if value == count) for count in counts]
+        axes.plot(counts, (np.array(found) - least) / study.lags.rows, mark, label=f"over {word}")
     axes.set(title="lags: least BIC per row, above the best", xlabel="na, nb, nk")
     axes.legend()

@@ -67,6 +67,13 @@ class RankTest:
         return chosen if self.largest is None else min(chosen, self.largest)
 
     @property
+    def choice(self) -> tuple[int, str]:
+        """The order, at least 1, and the reason: the rule behind nx="auto"."""
+        if self.order == 0:
+            return 1, "1: no singular value is more than noise; the outputs may not depend on the inputs at all"
+        return self.order, self.reason
+
+    @property
     def exact(self) -> bool:
         """Whether the singular values after the order are rounding: a record without noise."""
         return self.order < self.singular_values.size and bool(self.singular_values[self.order] <= self.floor)
@@ -176,24 +183,6 @@ def rank_test(
         thresholds[n0] = g / j * chdtri(h, level)
         p_values[n0] = chdtrc(h, tails[n0] * j / g)
     return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
-
-
-def choose_order(
-    statistics: HankelStatistics,
-    instruments: Positions,
-    regressors: Positions,
-    outputs: Positions,
-    *,
-    rows: int,
-    level: float | None = None,
-    largest: int | None = None,
-    scale: Array | None = None,
-) -> tuple[int, str]:
-    """Return the order of `rank_test`, at least 1, and the reason: the rule behind nx="auto". Arguments as there."""
-    test = rank_test(statistics, instruments, regressors, outputs, rows=rows, level=level, largest=largest, scale=scale)
-    if test.order == 0:
-        return 1, "1: no singular value is more than noise; the outputs may not depend on the inputs at all"
-    return test.order, test.reason
 
 
 def _projections(

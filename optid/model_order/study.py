@@ -163,7 +163,7 @@ def order(
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
     best = lags.best("bic") if lags is not None else None
-    return OrderStudy(data.name, alpha, ranks, states, lags, max(ranks.order, 1), *(
+    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], *(
         (best.na, best.nb, best.nk) if best is not None else (None, None, None)),
         _reasons(ranks, states, lags), tuple(notes))
 
@@ -203,7 +203,7 @@ def _lags(
 
 
 def _reasons(ranks: RankTest, states: StateCriteria, lags: LagScan | None) -> tuple[str, ...]:
-    n = max(ranks.order, 1)
+    n = ranks.choice[0]
     found = [f"singular values: {ranks.reason}" if ranks.order else
              "no singular value is more than noise: the outputs may not depend on the inputs; nx = 1 is the least"]
     voices = {"the largest ratio of singular values": ranks.ratio_order}

@@ -145,12 +145,12 @@ def tested_order(
     Raises:
         RankError: records shorter than three times the block rows, or regressors that the instruments do not reach.
     """
-    from optid.model_order import choose_order
+    from optid.model_order import rank_test
 
     statistics = hankel_statistics(records, 3 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
-    return choose_order(statistics, z, phi, y, rows=2 * block_rows, largest=(block_rows - 1) * expansion.l)
+    return rank_test(statistics, z, phi, y, rows=2 * block_rows, largest=(block_rows - 1) * expansion.l).choice
 
 
 def _spread(statistics: HankelStatistics, expansion: Expansion, offset: bool) -> Array:
