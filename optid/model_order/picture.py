@@ -63,8 +63,8 @@ def _draw_lags(study: "OrderStudy", axes: Any) -> None:
         axes.set_axis_off()
         return
     candidates, least = study.lags.candidates, study.lags.best("bic").bic
-    scanned = {"na": [c.na for c in candidates], "nb": [c.nb[0] for c in candidates], "nk": [c.nk[0] for c in candidates]}
-    for (word, values), mark in zip(scanned.items(), ("o-", "s-", "^-")):
+    for word, mark in (("na", "o-"), ("nb", "s-"), ("nk", "^-")):
+        values = [int(np.ravel(getattr(c, word))[0]) for c in candidates]
         counts = sorted(set(values))
         found = [min(c.bic for c, value in zip(candidates, values) if value == count) for count in counts]
         axes.plot(counts, (np.array(found) - least) / study.lags.rows, mark, label=f"over {word}")
