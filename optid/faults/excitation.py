@@ -1,5 +1,6 @@
 """Whether the input of a record moves what is suspected: without that there is no verdict on a loss."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,12 +22,12 @@ def untestable(found: "Scan") -> dict[str, str]:
     Args:
         found: the search of the record.
     """
-    from dataclasses import replace
-
     result = {}
     for c, candidate in enumerate(found.dictionary.candidates):
         if candidate.columns and found.u is not None:
-            trace = found.signature(replace(candidate, kind="stuck", members=(), places=()), 0)
+            as_stuck, white = replace(candidate, kind="stuck"), found.whitened
+            into_state, into_output = found.dictionary.additions(as_stuck, len(white.r), 0, found.u)
+            trace = white.seen(white.predictor.respond(into_state, into_output, white.present))
             flat = trace.reshape(-1, trace.shape[2])
             beside = flat[:, 1:]
             rest = flat[:, 0] - beside @ np.linalg.lstsq(beside, flat[:, 0], rcond=1e-9)[0]

@@ -10,7 +10,7 @@ from optid.faults.answers import Remaining
 from optid.faults.leftover import UNFIT, further_fault, left_over
 from optid.faults.looking import Seen
 from optid.faults.pair_search import pairs
-from optid.faults.posterior import Explanation, probabilities, several, single, smallest_set
+from optid.faults.posterior import Explained, Explanation, probabilities, several, single, smallest_set
 from optid.faults.scanning import scan
 
 REACH = 10
@@ -62,9 +62,8 @@ class Ranking(NamedTuple):
 
 def singles(seen: Seen) -> list[Explanation]:
     """Return every candidate that is tested, over its onsets."""
-    assert seen.search is not None
-    found = [single(seen.search, candidate) for candidate in seen.tested]
-    return [explanation for explanation in found if explanation is not None]
+    found = [] if seen.search is None else [single(seen.search, candidate) for candidate in seen.tested]
+    return [explanation for explanation in found if explanation is not None] + seen.courses
 
 
 def doubles(seen: Seen) -> tuple[list[Explanation], bool]:
@@ -109,15 +108,25 @@ def ranked(seen: Seen, explanations: Sequence[Explanation], rare: float, coverag
 
 
 def _fit(seen: Seen, explanation: Explanation, probability: float) -> Fit:
-    search, limits = seen.search, seen.limits
-    assert search is not None and limits is not None
     best = explanation.best
-    traces = [search.signature(c, int(k)) for c, k in zip(explanation.candidates, explanation.onsets[best])]
+    made = _made(seen, explanation)
+    further, penalty = 1.0, 0.0
+    if seen.search is not None and seen.limits is not None:
+        search, limits = seen.search, seen.limits
+        gains = search.sweep.statistic(search.sweep.correlations(made.rest)) - limits.q[:, None]
+        gains[np.isnan(seen.gains)] = np.nan
+        further = further_fault(gains, limits.false_alarm)
+        penalty = float(np.nansum([limits.q[search.index(c)] for c in explanation.candidates]))
+    left = left_over(seen.whitened, made.rest, seen.nx + made.magnitudes, further)
+    return Fit(explanation, probability, float(explanation.energies[best] - penalty), made.fitted, left)
+
+
+def _made(seen: Seen, explanation: Explanation) -> Explained:
+    best = explanation.best
+    if explanation.course is not None:
+        return explanation.course(int(explanation.onsets[best, 0]))
+    assert seen.search is not None
+    pairs_of = zip(explanation.candidates, explanation.onsets[best])
+    traces = [seen.search.signature(candidate, int(onset)) for candidate, onset in pairs_of]
     fitted = np.concatenate(traces, axis=2) @ explanation.sizes[best]
-    rest = seen.whitened.r - fitted
-    gains = search.sweep.statistic(search.sweep.correlations(rest)) - limits.q[:, None]
-    gains[np.isnan(seen.gains)] = np.nan
-    estimated = search.dictionary.model.nx + explanation.sizes.shape[1]
-    left = left_over(seen.whitened, rest, estimated, further_fault(gains, limits.false_alarm))
-    penalty = sum(limits.q[search.index(c)] for c in explanation.candidates)
-    return Fit(explanation, probability, float(explanation.energies[best] - penalty), fitted, left)
+    return Explained(fitted, seen.whitened.r - fitted, explanation.sizes.shape[1])

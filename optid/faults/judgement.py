@@ -84,7 +84,7 @@ class Job:
         """
         asked = self.asked
         ranking = self.ranking(seen, asked.max_faults)
-        if _explains(ranking) or not seen.tested or not self.found.unknown:
+        if _explains(ranking) or seen.search is None or not self.found.unknown:
             return seen, ranking, _grid(ranking)
         wide = look(self.record, part, with_spikes(self.found), replace(asked, thresholds=None), self.noise)
         for count in dict.fromkeys((asked.max_faults, 2)):
@@ -96,10 +96,8 @@ class Job:
 
     def ranking(self, seen: Seen, count: int) -> Ranking:
         """Return the set of explanations by so many faults at most."""
-        if not seen.tested:
-            return Ranking((), np.inf, True)
         explanations, exhaustive = singles(seen), True
-        if count > 1:
+        if count > 1 and seen.tested:
             together, exhaustive = doubles(seen)
             explanations += together
         return ranked(seen, explanations, self.asked.false_alarm, self.asked.coverage, exhaustive)
@@ -109,7 +107,7 @@ class Job:
         if stuck or fits:
             return "faulty"
         if not alarm:
-            return "untestable" if not seen.tested and seen.lost else "healthy"
+            return "untestable" if seen.lost and not seen.tested else "healthy"
         if self.found.model.l == 1 and any(c.kind == "frozen" for c in self.found.candidates):
             return "not isolable"
         return "untestable" if not seen.tested and seen.lost else "unknown"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,9 +11,11 @@ from optid.bases.basis import Array
 from optid.data import Data, Experiment
 from optid.errors import StructureError
 from optid.faults.calibration import EXCEEDING, Thresholds, thresholds
+from optid.faults.courses import courses, without_signature
 from optid.faults.excitation import untestable
 from optid.faults.leftover import alarm_probability, left_over
 from optid.faults.outliers import cleaned
+from optid.faults.posterior import Explanation
 from optid.faults.records import enough, one_record
 from optid.faults.scanning import Scan, scan
 from optid.faults.signatures import Candidate, Dictionary
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
 
 UNKNOWN_SHARE = 0.1
 """Share of the false alarms that goes to departures from health that no candidate describes."""
+
+COURSE_SHARE = 0.1
+"""Share that goes to candidates without a signature, where there are some."""
 
 SIMULATED = 2_000_000
 """Samples of all simulated windows together, above which fewer windows are simulated."""
@@ -37,6 +43,7 @@ class Seen:
     """One experiment as the search sees it.
 
     Attributes:
+        dictionary: the candidates.
         part: the record, without readings that were taken out.
         whitened: its innovations, bounded where outliers are.
         search: of the innovations; None where no candidate has a signature.
@@ -47,6 +54,7 @@ class Seen:
         outliers: (sample, output) of readings that were taken out.
     """
 
+    dictionary: Dictionary
     part: Experiment
     whitened: Whitened
     search: Scan | None
@@ -61,8 +69,12 @@ class Seen:
         """The candidates that may be the answer."""
         if self.search is None:
             return []
-        candidates = self.search.dictionary.candidates
-        return [c for c, gains in zip(candidates, self.gains) if not np.isnan(gains).all()]
+        return [c for c, gains in zip(self.dictionary.candidates, self.gains) if not np.isnan(gains).all()]
+
+    @property
+    def nx(self) -> int:
+        """Number of states of the model."""
+        return self.dictionary.model.nx
 
     def p_value(self, asked: "Question", unknown: bool) -> float:
         """Return the probability of so strong a departure from health; an alarm is at or below the false-alarm rate.
@@ -77,7 +89,16 @@ class Seen:
             values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * asked.false_alarm / rate)
         if unknown:
             values.append(self.healthy.p_value / UNKNOWN_SHARE)
+        if self.courses:
+            # a likelihood averaged over what may be exceeds 1 / p in healthy records with probability p at most
+            log = np.logaddexp.reduce([c.log_evidence for c in self.courses]) - np.log(len(self.courses))
+            values.append(float(np.exp(-log)) / COURSE_SHARE)
         return min(values)
+
+    @cached_property
+    def courses(self) -> list[Explanation]:
+        """Sensors that may be frozen and noises that may have grown."""
+        return courses(self, self.dictionary)
 
 
 def look(
@@ -117,7 +138,7 @@ def look(
         gains = search.gains(limits)
         gains[[label in lost for label in found.labels]] = np.nan
     healthy = left_over(white, white.r, found.model.nx)
-    return Seen(part, white, search, limits, gains, lost, healthy, outliers)
+    return Seen(found, part, white, search, limits, gains, lost, healthy, outliers)
 
 
 def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> Thresholds:
@@ -129,7 +150,7 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> 
                 f"with thresholds(faults, {count}, ...), or leave them out."
             )
         return given
-    rate = asked.false_alarm * (1 - UNKNOWN_SHARE) if found.unknown else asked.false_alarm
+    rate = asked.false_alarm * (1 - UNKNOWN_SHARE * found.unknown - COURSE_SHARE * any(without_signature(found)))
     needed = int(np.ceil(EXCEEDING / rate))
     draws = max(needed, min(DRAWS, SIMULATED // count))
     inputs = u if any(c.columns for c in found.candidates) else None

@@ -7,7 +7,7 @@ beforehand, so that it is averaged over several g. More magnitudes are paid for 
 stuck actuator that explains as much.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,6 +28,20 @@ MODEL_ERROR = 0.02
 """Probability that a share lost outside [0, 1] is an error of the model, and not a reason against the loss."""
 
 
+class Explained(NamedTuple):
+    """What an explanation makes of a window.
+
+    Attributes:
+        fitted: (N, l) what it leaves in the innovations.
+        rest: (N, l) what is then left: white noise, where it is right.
+        magnitudes: numbers that were estimated for it.
+    """
+
+    fitted: Array
+    rest: Array
+    magnitudes: int
+
+
 class Explanation(NamedTuple):
     """One set of candidates over the onsets that may be.
 
@@ -37,7 +51,8 @@ class Explanation(NamedTuple):
         logs: (K,) logarithms of the marginal likelihoods, the prior of the onsets included.
         sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
         covariances: (K, d, d) for the onsets of the row.
-        energies: (K,) energy explained.
+        energies: (K,) energy explained, or twice the gain in log-likelihood.
+        course: of candidates without a signature, what they make of the window for an onset.
     """
 
     candidates: tuple[Candidate, ...]
@@ -46,6 +61,7 @@ class Explanation(NamedTuple):
     sizes: Array
     covariances: Array
     energies: Array
+    course: Callable[[int], Explained] | None = None
 
     @property
     def log_evidence(self) -> float:
