@@ -28,6 +28,9 @@ from optid.solving import Evidence, Procedure
 
 FORMS = ("places", "full")
 
+NOTHING = 1e-4
+"""Covariances of this many standard deviations are what interior-point methods leave of a zero."""
+
 
 def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", lags: int | None = None, onset: int = 0,
                constraints: Sequence[Any] = ()) -> Procedure:
@@ -102,7 +105,8 @@ def matched(problem: CovarianceProblem, solution: Solution, certified: bool) -> 
     rho, gains, Q, R = np.full(len(problem.labels), np.nan), np.full(len(problem.labels), np.nan), None, None
     if solution.has_point and "scaled" in solution.values:
         sizes = np.linalg.norm(problem.signatures, axis=0)
-        scaled = np.maximum(np.asarray(solution.values["scaled"]), 0.0)
+        scaled = np.asarray(solution.values["scaled"])
+        scaled = np.where(scaled > NOTHING, scaled, 0.0)
         rho, gains = scaled / sizes, scaled
     elif solution.has_point:
         Q = np.asarray(solution.values["Q"]) * np.sqrt(np.outer(problem.state_units, problem.state_units))

@@ -21,6 +21,9 @@ from optid.faults.whitening import Whitened
 RANK = 1e-10
 """Singular values below this share of the largest are none."""
 
+FULL = 1e-7
+"""Ratio of the diagonal of a triangular factor above which no singular value is anywhere near `RANK`."""
+
 LONGEST = 6000
 """Readings of a window at most: the cost grows with their cube."""
 
@@ -213,11 +216,9 @@ def _fitted(name: str, labels: tuple[str, ...], r: Array, matrix: Array, start: 
     course = np.full(matrix.shape[1], np.nan)
     rank, rest = 0, r
     if seen.any():
-        left, values, right = np.linalg.svd(whole[:, seen] / sizes[seen], full_matrices=False)
-        kept = values > RANK * values[0]
-        rank, along = int(kept.sum()), left[:, kept].T @ r
-        rest = r - left[:, kept] @ along
-        solved = (right[kept].T @ (along / values[kept])) / sizes[seen]
+        axes, solved = _projected(whole[:, seen] / sizes[seen], r)
+        rank, rest = axes.shape[1], r - axes @ (axes.T @ r)
+        solved = solved / sizes[seen]
         own = seen[: matrix.shape[1]]
         course[own] = solved[: int(own.sum())]
     freedom = readings - rank
@@ -227,6 +228,21 @@ def _fitted(name: str, labels: tuple[str, ...], r: Array, matrix: Array, start: 
     energy = float(rest @ rest)
     return Consistency(name, labels, energy, freedom, float(chdtri(freedom, 1 - probability)),
                        float(chdtrc(freedom, energy)), course.reshape(-1, max(d, 1)))
+
+
+def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
+    """Return orthonormal axes of the span of columns and the coefficients of least squares."""
+    from scipy.linalg import solve_triangular
+
+    if columns.shape[1] <= columns.shape[0]:
+        axes, triangle = np.linalg.qr(columns)
+        diagonal = np.abs(np.diag(triangle))
+        if diagonal.min() > FULL * diagonal.max():
+            return axes, np.asarray(solve_triangular(triangle, axes.T @ r))
+    left, values, right = np.linalg.svd(columns, full_matrices=False)
+    kept = values > RANK * values[0]
+    axes = left[:, kept]
+    return axes, right[kept].T @ ((axes.T @ r) / values[kept])
 
 
 def same_place(first: Candidate, second: Candidate) -> bool:
