@@ -13,7 +13,9 @@ from optid.faults.signatures import Candidate, Dictionary, response
 from optid.faults.sweeps import inverse_roots
 from optid.faults.whitening import Predictor
 
-COURSES = {"bias": at.LASTING, "drift": at.DRIFT, "jump": at.JUMP, "loss": at.DRIVEN, "stuck": at.DRIVEN}
+COURSES = {
+    "bias": at.LASTING, "drift": at.DRIFT, "jump": at.JUMP, "spike": at.JUMP, "loss": at.DRIVEN, "stuck": at.DRIVEN,
+}
 """The course of the (first) column of a kind."""
 
 LONG = 8

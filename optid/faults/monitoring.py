@@ -3,21 +3,26 @@
 import hashlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
+from optid.bases.expansions import UserFunctions
+from optid.data import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import monitor_layout as at
 from optid.faults.arl import Calibration, calibrate, held_levels
 from optid.faults.monitor_layout import State, Tables
 from optid.faults.monitor_tables import blank, monitored, tables, with_thresholds
 from optid.faults.signatures import Dictionary, dictionary
+from optid.faults.whitening import health, whiten
 from optid.models.feedback_tables import tabulated
 from optid.models.state_simulation import state_like
+from optid.recursion.intake import as_block
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -40,6 +45,8 @@ WIDE = 1e8
 """Energy that a state of which nothing is known may have in one innovation."""
 
 KINDS = ("alarm", "isolated", "cleared", "untestable", "testable", "isolated")
+KINDS_BY_DEFAULT = ("bias", "loss", "spike")
+
 EVENTS = 64
 """Events taken out of the compiled loop at a time."""
 
@@ -119,6 +126,8 @@ class Monitor:
         skipped: {label: why} of the others.
         calibration: the thresholds and what they rest on.
         window: samples of the window.
+        seed: of the simulation.
+        source: JSON types that are kept with the state: where the stream came from.
     """
 
     def __init__(
@@ -131,6 +140,8 @@ class Monitor:
         thresholds: Any = None,
         *,
         x0: Any = "unknown",
+        healthy: Data | None = None,
+        rescale: bool = False,
         u: ArrayLike | None = None,
         samples: int | None = None,
         extrapolate: bool = False,
@@ -140,12 +151,14 @@ class Monitor:
 
         Args:
             model: the healthy model, with noise covariances.
-            faults: what is thought possible; biases of all parts and a jump of the state by default.
+            faults: what is thought possible; by default biases, losses, spikes and a jump of the state.
             arl0: mean number of samples between false alarms.
             window: samples that an onset is looked for in.
             seed: of the simulation.
             thresholds: a `Calibration` of an earlier monitor, {label: threshold} or (C,), instead of a simulation.
             x0: the state before the first sample: "unknown", "zero" or (n,).
+            healthy: a healthy record, whose innovations must be white and of the size that the model says.
+            rescale: take the scale of the noise from the healthy record.
             u: (N, m) inputs typical of the healthy plant, for the thresholds of losses and stuck actuators; levels over
                 the intervals of the nonlinearities by default.
             samples: length of the simulation.
@@ -154,12 +167,13 @@ class Monitor:
 
         Raises:
             StructureError: a dictionary of another model, a window that is too short, an unknown rule, no candidate.
-            DataError: a simulation too short for the ARL0.
+            DataError: a simulation too short for the ARL0; a healthy record whose innovations are not white or of
+                another size.
 
         Warns:
             DataWarning: candidates that a monitor cannot look for.
         """
-        found = dictionary(model) if faults is None else faults
+        found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
         if found.model is not model:
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
@@ -168,21 +182,15 @@ class Monitor:
         unknown = set(rules) - (set(RULES) - {"wide"})
         if unknown:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
-        self.dictionary, self.window, self.seed = found, int(window), seed
-        self._chosen = tuple(c for c in found.candidates if monitored(c))
-        self.skipped = {
-            c.label: "its course may be anything, which only a record can be tested for"
-            for c in found.candidates if not monitored(c)
-        }
-        if not self._chosen:
-            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
+        if healthy is not None:
+            judged = health(whiten(model, healthy))
+            found = replace(found, predictor=judged.predictor(found.predictor, rescale=rescale))
+        self._of(found, int(window), seed)
         for label, why in self.skipped.items():
             warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
-        self.labels = tuple(c.label for c in self._chosen)
         strength = float(np.max(np.sum((found.predictor.root @ found.predictor.C) ** 2, axis=0), initial=1e-300))
         numbers = [*({**RULES, **rules} | {"wide": WIDE / strength}).values()]
         t = tables(found, self._chosen, self.window, numbers)
-        self._functions = tabulated(model.nonlinearities)
         self.calibration = self._calibrated(t, arl0, thresholds, u, samples, extrapolate)
         self._start(with_thresholds(t, self.calibration.q), blank(t))
         if isinstance(x0, str) and x0 == "unknown":
@@ -192,10 +200,26 @@ class Monitor:
         elif not (isinstance(x0, str) and x0 == "zero"):
             self._state.v[at.X, : model.nx] = state_like(model, x0)
 
+    def _of(self, found: Dictionary, window: int, seed: int | None) -> None:
+        self.dictionary, self.window, self.seed, self.source = found, window, seed, None
+        self._chosen = tuple(c for c in found.candidates if monitored(c))
+        if not self._chosen:
+            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
+        self.labels = tuple(c.label for c in self._chosen)
+        self.skipped = {
+            c.label: "its course may be anything, which only a record can be tested for"
+            for c in found.candidates if not monitored(c)
+        }
+
     def _start(self, t: Tables, s: State) -> None:
         self._tables, self._state = t, s
         model = self.dictionary.model
-        self._feedback = model.parts.tables
+        self._feedback, self._functions = model.parts.tables, tabulated(model.nonlinearities)
+        self._plain = all(
+            isinstance(g.basis, UserFunctions) and g.basis.size == len(g.basis.functions)
+            and (g.basis.interval is None or g.basis.outside != "error") for g in model.nonlinearities
+        )
+        self._one = np.empty(1)
         self._u, self._y = np.empty((1, model.m)), np.empty((1, model.l))
         self._f = np.empty((1, int(t.i[0, at.NF])))
         self._input_of = np.array(model.input_of, dtype=np.int64)
@@ -276,6 +300,8 @@ class Monitor:
         from optid.faults.monitor_kernels import march
 
         self._u[0], self._y[0] = u, y
+        if np.isinf(self._u).any() or np.isinf(self._y).any():
+            raise DataError(f"sample {self.samples}: an infinite value; use NaN for one that is missing.")
         self._expand(self._u, self._f)
         _, found, refused = march(self._tables, self._state, self._feedback, self._f, self._y, self._event)
         if refused:
@@ -288,12 +314,17 @@ class Monitor:
         Args:
             u: (N, m) inputs.
             y: (N, l) readings.
+
+        Raises:
+            DataError: other channels than the model's, unequal lengths, or an infinite value.
         """
         from optid.faults.monitor_kernels import march
 
         model = self.dictionary.model
-        u, y = (np.ascontiguousarray(np.asarray(part, dtype=float).reshape(-1, width))
-                for part, width in ((u, model.m), (y, model.l)))
+        u, y = (np.ascontiguousarray(as_block(part, names, what, self.samples))
+                for part, names, what in ((u, model.inputs, "u"), (y, model.outputs, "y")))
+        if len(u) != len(y):
+            raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
         f = np.empty((len(u), self._f.shape[1]))
         self._expand(u, f)
         events, done = [], 0
@@ -312,8 +343,18 @@ class Monitor:
             bad = expand(self._functions, self._input_of, u, f)
             if bad >= 0:
                 raise DataError(f"sample {self.samples + bad}: an input is outside the interval of its basis.")
-        else:
+        elif len(u) > 1 or not self._plain:
             f[:] = self.dictionary.model.expanded(u)
+        else:  # as the bases do it, without their tables
+            for j, (nonlinearity, c) in enumerate(zip(self.dictionary.model.nonlinearities, self._input_of)):
+                basis = nonlinearity.basis
+                self._one[0] = u[0, c]
+                if basis.outside == "clamp" and basis.interval is not None:
+                    np.clip(self._one, *basis.interval, out=self._one)
+                total = nonlinearity.offset or 0.0
+                for function, weight in zip(basis.functions, nonlinearity.mu):
+                    total += weight * function(self._one)[0]
+                f[0, j] = total
 
     def _refuse(self) -> None:
         raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it.")
@@ -378,3 +419,28 @@ class Monitor:
     def state(self) -> Array:
         """(n,) expected state before the next sample, carried faults included."""
         return np.array(self._state.v[at.X, : self.dictionary.model.nx])
+
+    # -- files -----------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> Path:
+        """Write the whole state to an npz file, from which `load` continues bit for bit; thresholds included."""
+        from optid.faults.monitor_file import save
+
+        return save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "Monitor":
+        """Restore a monitor.
+
+        Args:
+            path: file written by `save`.
+            functions: the functions of UserFunctions bases by name, which a file does not hold.
+
+        Raises:
+            ModelFileError: truncated, of another version, or not the state of a monitor.
+        """
+        from optid.faults.monitor_file import load
+
+        monitor = cls.__new__(cls)
+        load(monitor, path, functions)
+        return monitor

@@ -1,0 +1,340 @@
+"""The monitor against dense least squares, against the search of a whole record, and against what it was told."""
+
+import warnings
+
+import numpy as np
+import pytest
+from fault_plants import levels, noisy
+
+from optid.bases import Linear, Polynomial, UserFunctions
+from optid.data import Data
+from optid.errors import DataError, DataWarning, ModelFileError, StructureError
+from optid.faults import Fault, Monitor, dictionary, inject, scan, whiten
+from optid.models import Nonlinearity
+
+HIGH = 1e9
+"""A threshold that nothing exceeds."""
+
+
+def plant(feedback=False):
+    """Three states, two inputs (one with a cubic nonlinearity and two functions), two outputs, a feedthrough."""
+    A = np.array([[0.8, 0.2, 0.0], [-0.3, 0.7, 0.1], [0.0, 0.0, 0.5]])
+    B = np.array([[1.0, 0.3, 0.2], [0.5, -0.4, 0.1], [0.2, 1.0, -0.3]])
+    C = np.array([[1.0, 0.0, 0.5], [0.3, 1.0, -0.4]])
+    D = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.1]])
+    cubic = Nonlinearity(Polynomial(3, (-1.5, 1.5), outside="extrapolate"), np.array([1.0, 0.2, 0.3]))
+    line = Nonlinearity(Linear(), np.ones(1))
+    square = Nonlinearity(Polynomial(2, (-1.5, 1.5), outside="extrapolate"), np.array([0.3, 0.5]))
+    more = {"L": np.array([[0.1, 0.0], [0.0, -0.1], [0.05, 0.1]])} if feedback else {}
+    return noisy(A, B, C, 0.02 * np.eye(3), np.diag([0.03, 0.05]), D=D, nonlinearities=(cubic, line, square),
+                 input_of=(0, 1, 1), offset_x=np.array([0.1, -0.2, 0.0]), offset_y=np.array([1.0, -1.0]), **more)
+
+
+def everything(model):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return dictionary(model, kinds=["bias", "drift", "loss", "stuck"], process={"load": [0.3, -0.2, 0.5]})
+
+
+def silent(model, found, window=40, **how):
+    return Monitor(model, found, window=window, thresholds=np.full(len(found.labels), HIGH), **how)
+
+
+def explained(r, signature):
+    """Energy of r that the columns of a signature explain."""
+    axes, sizes, _ = np.linalg.svd(signature, full_matrices=False)
+    return float(np.sum((axes[:, sizes**2 > 1e-9 * sizes[0] ** 2].T @ r) ** 2))
+
+
+def dense(found, window, r, u, present, nuisance=None, first=0):
+    """{label: (statistic, onset)} by least squares over every onset of the window that ends with the record."""
+    count = len(r)
+    flat, basis = r.ravel(), None if nuisance is None else nuisance.reshape(r.size, -1)
+    best = {}
+    for c in found.candidates:
+        found_here = (0.0, -1)
+        for onset in range(max(first, count - window), count - (-(-c.dimension // found.model.l)) + 1):
+            if c.columns and onset == 0:  # what drove the state before the first sample is not known
+                continue
+            signature = found.signature(c, count, onset, u=u, present=present).reshape(r.size, -1)
+            if basis is None:
+                energy = explained(flat, signature)
+            else:
+                left = signature - basis @ np.linalg.lstsq(basis, signature, rcond=None)[0]
+                energy = explained(flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0], left)
+            if energy > found_here[0]:
+                found_here = (energy, onset)
+        best[c.label] = found_here
+    return best
+
+
+def agrees(monitor, best, accuracy=1e-9):
+    for label, (energy, onset) in best.items():
+        assert monitor.statistics[label] == pytest.approx(energy, rel=accuracy), label
+        assert monitor.onsets[label] == onset, label
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize("count", [3, 25, 90])
+def test_statistics_are_those_of_dense_least_squares(count, feedback):
+    model = plant(feedback)
+    found, u = everything(model), levels(count, 3)
+    y = inject(model, u, Fault.step("sensor:y1", count // 2, 0.2), seed=4)
+    monitor = silent(model, found, x0="zero")
+    assert {e.kind for e in monitor.run(u, y)} <= {"untestable"}  # nothing can reach this threshold
+    white = whiten(model, Data(u, y), x0="zero")
+    agrees(monitor, dense(found, 40, white.r, u, white.present))
+
+
+def test_statistics_with_missing_readings_are_those_of_dense_least_squares():
+    model, count = plant(True), 70
+    found, u = everything(model), levels(count, 5)
+    y = inject(model, u, seed=6)
+    y[np.random.default_rng(0).random(y.shape) < 0.15] = np.nan
+    y[33:36] = np.nan
+    white = whiten(model, Data(u, y), x0="zero")
+    monitor = silent(model, found, x0="zero")
+    monitor.run(u, y)
+    agrees(monitor, dense(found, 40, white.r, u, white.present))
+
+
+def test_one_missing_reading_inside_a_window_that_was_complete_before():
+    model = plant()
+    found, u = everything(model), levels(130, 5)
+    y = inject(model, u, seed=6)
+    y[70, 1] = np.nan
+    for count in (71, 90, 109, 110, 111, 130):  # the products come from the tables, are summed, and are tables again
+        white = whiten(model, Data(u[:count], y[:count]), x0="zero")
+        monitor = silent(model, found, x0="zero")
+        monitor.run(u[:count], y[:count])
+        agrees(monitor, dense(found, 40, white.r, u[:count], white.present))
+
+
+def test_statistics_are_those_of_the_search_of_a_record():
+    model, count = plant(), 60
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=["bias", "drift"])
+    u = levels(count, 3)
+    y = inject(model, u, Fault.step("actuator:u1", 30, 0.2), seed=4)
+    batch = scan(found, whiten(model, Data(u, y), x0="zero"), u)
+    monitor = silent(model, found, window=count, x0="zero")
+    monitor.run(u, y)
+    for label, line in zip(batch.labels, batch.statistic):
+        assert monitor.statistics[label] == pytest.approx(np.nanmax(line), rel=1e-9)
+        assert monitor.onsets[label] == int(np.nanargmax(line)) == batch.peak(label)
+
+
+def test_an_unknown_state_counts_for_nothing():
+    model, count = plant(), 50
+    found, u = everything(model), levels(count, 7)
+    start = np.array([40.0, -30.0, 20.0])
+    y = inject(model, u, seed=8, x0=start)
+    white = whiten(model, Data(u, y), x0="zero")
+    nuisance = found.signature("state", count, 0)
+    best = dense(found, 40, white.r, u, white.present, nuisance)
+    monitor = silent(model, found)
+    monitor.run(u, y)
+    agrees(monitor, best, 1e-5)  # the prior of the state is wide, not without end
+    zero = silent(model, found, x0="zero")
+    zero.run(u[:6], y[:6])
+    unknown = silent(model, found)
+    unknown.run(u[:6], y[:6])
+    assert max(zero.statistics.values()) > 100 > max(unknown.statistics.values())
+
+
+def test_a_missing_input_makes_the_state_unknown():
+    model, count = plant(), 120
+    found, u = everything(model), levels(count, 9)
+    y = inject(model, u, seed=10)
+    gap = u.copy()
+    u[60:63] += 5.0  # what the plant gets while nobody sees it
+    y = inject(model, u, seed=10)
+    gap[60:63] = np.nan
+    monitor = Monitor(model, found, window=40, thresholds=np.full(len(found.labels), 40.0))
+    assert monitor.run(gap, y) == []
+
+
+def test_a_carried_fault_counts_for_nothing_and_its_size_is_that_of_least_squares():
+    model, count = plant(), 140
+    found, u = everything(model), levels(count, 11)
+    y = inject(model, u, Fault.step("sensor:y2", 50, 6.0), seed=12)
+    thresholds = np.full(len(found.labels), 35.0)
+    monitor = Monitor(model, found, window=40, thresholds=thresholds, x0="zero", learned=0.0)
+    events = monitor.run(u, y)
+    assert [e.kind for e in events] == ["alarm", "isolated"]
+    assert events[1].candidates == (("sensor:y2", pytest.approx(1.0, abs=1e-6)),) and events[1].onset == 50
+    white = whiten(model, Data(u, y), x0="zero")
+    nuisance = found.signature("sensor:y2", count, 50)
+    flat = nuisance.ravel()
+    (carried,) = monitor.carried
+    assert carried.size[0] == pytest.approx(flat @ white.r.ravel() / (flat @ flat), rel=1e-9)
+    assert carried.deviation[0] == pytest.approx(1 / np.sqrt(flat @ flat), rel=1e-9)
+    agrees(monitor, dense(found, 40, white.r, u, white.present, nuisance), 1e-7)
+
+
+@pytest.mark.parametrize(
+    "fault, label",
+    [
+        (Fault.loss("actuator:u1", 50, 0.8), "actuator:u1 loss"),
+        (Fault.step("process:load", 50, 3.0, direction=[0.3, -0.2, 0.5]), "process:load"),
+        (Fault.ramp("sensor:y1", 50, 0.3), "sensor:y1 drift"),
+        (Fault.jump("state", 50, [3.0, -2.0, 4.0]), "state"),
+    ],
+)
+def test_after_a_fault_is_named_innovations_are_white_again(fault, label):
+    model, count = plant(), 400
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=["bias", "drift", "loss"], process={"load": [0.3, -0.2, 0.5]})
+    u = levels(count, 13)
+    y = inject(model, u, fault, seed=14)
+    monitor = Monitor(model, found, window=80, thresholds=np.full(len(found.labels), 35.0), x0="zero")
+    events = monitor.run(u, y)
+    assert [e.kind for e in events[:2]] == ["alarm", "isolated"]
+    assert [e.kind for e in events[2:]] == (["cleared"] if label == "state" else [])
+    assert events[1].candidates[0][0] == label and abs(events[1].onset - 50) <= 1
+    assert max(monitor.statistics.values()) < 30
+
+
+def same(first, second):
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, second, strict=True))
+
+
+def stream(model, count=500, seed=1):
+    u = levels(count, seed)
+    y = inject(model, u, [Fault.step("sensor:y1", 150, 1.0), Fault.loss("actuator:u2", 330, 0.9)], seed=seed)
+    y[40:43] = np.nan
+    y[200, 0] = np.nan
+    u[100] = np.nan
+    return u, y
+
+
+@pytest.mark.parametrize("cut", [1, 39, 152, 158, 165, 240, 333, 499])
+def test_a_saved_state_continues_bit_for_bit(tmp_path, cut):
+    model = plant(True)
+    found, (u, y) = everything(model), stream(model)
+    whole = Monitor(model, found, window=40, thresholds=np.full(len(found.labels), 35.0))
+    before = whole.run(u[:cut], y[:cut])
+    restored = Monitor.load(whole.save(tmp_path / "monitor.npz"))
+    assert restored.labels == whole.labels and restored.samples == cut
+    after, again = whole.run(u[cut:], y[cut:]), restored.run(u[cut:], y[cut:])
+    assert after == again and {e.kind for e in before + after} >= {"alarm", "isolated"}
+    assert whole.statistics == restored.statistics and whole.carried == restored.carried
+    assert same((whole.state,), (restored.state,))
+
+
+@pytest.mark.parametrize("outside", [None, "clamp", "extrapolate"])
+def test_steps_and_blocks_give_the_same_numbers(outside):
+    model = plant()
+    if outside is not None:  # functions that cannot be compiled
+        shapes = [lambda u: u + 0.25 * u**3, np.sin, lambda u: np.tanh(1.5 * u) + 0.15 * u]
+        functions = [UserFunctions((f, np.square), interval=(-1.0, 1.0), outside=outside, names=("f", "square"))
+                     for f in shapes]
+        model = replace(model, nonlinearities=tuple(Nonlinearity(f, np.array([1.0, 0.1])) for f in functions))
+    found, (u, y) = everything(model), stream(model)
+    blocks, steps = (Monitor(model, found, window=40, thresholds=np.full(len(found.labels), 35.0)) for _ in range(2))
+    events = blocks.run(u[:7], y[:7]) + blocks.run(u[7:300], y[7:300]) + blocks.run(u[300:], y[300:])
+    single = [event for a, b in zip(u, y) if (event := steps.step(a, b)) is not None]
+    assert events == single and len(events) >= 4
+    assert blocks.statistics == steps.statistics and same((blocks.state,), (steps.state,))
+
+
+def test_the_next_fault_is_found_after_the_first():
+    model = plant()
+    found, (u, y) = everything(model), stream(model, 600)
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 35.0))
+    events = monitor.run(u, y)
+    named = [(e.candidates[0][0], e.onset) for e in events if e.kind == "isolated"]
+    assert named[0][0] == "sensor:y1" and abs(named[0][1] - 150) <= 2
+    assert named[-1][0].startswith("actuator:u2") and abs(named[-1][1] - 330) <= 3
+
+
+def test_a_repaired_fault_is_cleared():
+    model, count = plant(), 500
+    found, u = everything(model), levels(count, 2)
+    y = inject(model, u, Fault.step("sensor:y2", 150, 3.0, end=300), seed=3)
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 35.0))
+    events = monitor.run(u, y)
+    assert [e.kind for e in events] == ["alarm", "isolated", "alarm", "isolated", "cleared"]
+    assert events[-1].candidates == (("sensor:y2", 1.0),) and monitor.carried == () and not monitor.alarmed
+
+
+def test_an_actuator_at_rest_is_untestable_and_does_not_alarm():
+    model, count = plant(), 500
+    found, u = everything(model), levels(count, 4)
+    u[150:350, 0] = 0.0
+    y = inject(model, u, seed=5)
+    monitor = Monitor(model, found, window=50, thresholds=np.full(len(found.labels), 30.0))
+    events = monitor.run(u, y)
+    assert {e.kind for e in events} == {"untestable", "testable"}
+    silent_since = {e.candidates[0][0]: e.onset for e in events if e.kind == "untestable"}
+    assert set(silent_since) == {"actuator:u1 loss", "actuator:u1 stuck"}
+    assert all(120 < since <= 200 for since in silent_since.values())
+    assert all(350 <= e.sample < 365 for e in events if e.kind == "testable")
+
+
+def test_what_no_candidate_explains_is_unknown():
+    model, count = plant(), 300
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds="bias")
+    u = levels(count, 6)
+    y = inject(model, u, seed=7)
+    y[150:220] += 2.0 * np.random.default_rng(0).standard_normal((70, 2))
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 30.0))
+    events = monitor.run(u, y)
+    assert events[0].kind == "alarm"
+    assert events[1].kind == "isolated" and events[1].candidates == (("unknown", 1.0),)
+    assert events[-1].kind == "cleared" and not monitor.alarmed
+
+
+def test_a_spike_is_a_spike():
+    model, count = plant(), 300
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=["bias", "spike"])
+    u = levels(count, 6)
+    y = inject(model, u, Fault.jump("sensor:y1", 150, 8.0), seed=7)
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 30.0))
+    events = monitor.run(u, y)
+    assert [e.kind for e in events] == ["alarm", "isolated", "cleared"]
+    assert events[1].candidates[0][0] == "sensor:y1 spike" and monitor.carried == ()
+
+
+def test_refusals_name_what_is_wrong(tmp_path):
+    model = plant()
+    found = everything(model)
+    with pytest.raises(StructureError, match="window=3"):
+        silent(model, found, window=3)
+    with pytest.raises(StructureError, match="patiance"):
+        silent(model, found, patiance=3)
+    with pytest.raises(StructureError, match="another model"):
+        silent(plant(), found)
+    with pytest.raises(StructureError, match="one positive number for each"):
+        Monitor(model, found, thresholds=[1.0])
+    with pytest.raises(StructureError, match="none for sensor:y1"):
+        Monitor(model, found, thresholds={label: 30.0 for label in found.labels if label != "sensor:y1"})
+    monitor = silent(model, found)
+    with pytest.raises(DataError, match="channel 'y2': sample 1 is inf"):
+        monitor.run(np.zeros((3, 2)), [[0, 0], [0, np.inf], [0, 0]])
+    with pytest.raises(DataError, match="2 samples and y has 3"):
+        monitor.run(np.zeros((2, 2)), np.zeros((3, 2)))
+    with pytest.raises(DataError, match="infinite"):
+        monitor.step([0, 0], [np.inf, 0])
+    with pytest.warns(DataWarning, match="sensor:y1 frozen is not monitored"):
+        with_frozen = dictionary(model, kinds=["bias", "frozen"], sensors=["y1"], actuators=[])
+        Monitor(model, with_frozen, thresholds=np.full(len(with_frozen.labels) - 1, 30.0))
+    (tmp_path / "half.npz").write_bytes(monitor.save(tmp_path / "m.npz").read_bytes()[:2000])
+    with pytest.raises(ModelFileError, match="not the complete state of a monitor"):
+        Monitor.load(tmp_path / "half.npz")
+
+
+def test_a_healthy_record_that_contradicts_the_noise_is_refused():
+    model = plant()
+    u = levels(1000, 8)
+    loud = inject(model, u, Fault.sensor_noise("sensor", 0, scale=2.0), seed=9)
+    with pytest.raises(DataError, match="times as large"):
+        silent(model, everything(model), healthy=Data(u, loud))
+    monitor = silent(model, everything(model), healthy=Data(u, loud), rescale=True)
+    assert np.trace(monitor.dictionary.predictor.covariance) > 1.5 * np.trace(everything(model).predictor.covariance)
