@@ -11,7 +11,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.rule import Rule
-from formulations.shape import output_index, through_matrices
+from formulations.static_curve import output_index, through_matrices
 from optid.errors import StructureError
 from optid.program import View
 

@@ -12,7 +12,7 @@ Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kind
 
 For state-space models they act in the step that chooses B and D ("realisation"), where the static characteristic
 ``C (I - A)^-1 B f(u) + D f(u) + d`` is linear in the unknowns; an output that is fed back through a nonlinearity or an
-observer gain is held at its mean there. `step_response`, `impulse_response` and `no_effect` belong to that step alone.
+observer gain is held at its mean there. The rules of `formulations.responses` belong to that step alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,6 +23,7 @@ import numpy as np
 
 from formulations.rule import Rule
 from formulations.stability import stable
+from formulations.static_curve import basis_of, denominator, offset_of, settles, static_theta
 from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.program import View
@@ -31,7 +32,6 @@ __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "g
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
 FACTORED = ("exact", "tangent", "realisation")  # kinds whose variables are mu and b
-SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -138,9 +138,9 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
         raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
 
     def build(view: View) -> Any:
-        basis, theta = _basis(view, channel), _static_theta(view, channel, output)
-        curve = basis.values(us) @ theta + _offset(view, output)
-        return [curve == cp.multiply(ys, _denominator(view)), *_settles(view)]
+        basis, theta = basis_of(view, channel), static_theta(view, channel, output)
+        curve = basis.values(us) @ theta + offset_of(view, output)
+        return [curve == cp.multiply(ys, denominator(view)), *settles(view)]
 
     return Rule(_label("through", channel, output), build)
 
@@ -258,23 +258,13 @@ def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list
     return [member for part in parts for member in (part if isinstance(part, list) else [part])]
 
 
-def _basis(view: View, channel: str | None) -> Any:
-    if channel is None:
-        if len(view.channels) != 1:
-            raise StructureError(f"this constraint needs channel=, one of {', '.join(view.channels)}")
-        channel = view.channels[0]
-    if channel not in view.bases:
-        raise StructureError(f"there is no input {channel!r}; the inputs are {', '.join(view.channels)}")
-    return view.bases[channel]
-
-
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
-        matrix = rows(_basis(view, one))
+        matrix = rows(basis_of(view, one))
         if view.kind in FACTORED and view.key("mu", one) in view:
             return matrix @ view[view.key("mu", one)] >= 0
         outputs = view.outputs if view.kind == "realisation" else (None,)
-        return [matrix @ _static_theta(view, one, output) >= 0 for output in outputs or (None,)]
+        return [matrix @ static_theta(view, one, output) >= 0 for output in outputs or (None,)]
 
     return Rule(_label(f"{word}:{direction}" if direction else word, channel),
                 lambda view: _every(view, channel, lambda one: build(view, one)))
@@ -282,7 +272,7 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
-        matrix = _independent(rows(_basis(view, one)))
+        matrix = _independent(rows(basis_of(view, one)))
         factored = view.kind in FACTORED and view.key("mu", one) in view
         return matrix @ view[view.key("mu" if factored else "Theta", one)] == 0
 
@@ -297,87 +287,21 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
         raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
 
     def build(view: View) -> Any:
-        curve = rows(_basis(view, channel)) @ _static_theta(view, channel, output)
+        curve = rows(basis_of(view, channel)) @ static_theta(view, channel, output)
         if offset:
-            curve = curve + _offset(view, output)
-        size = _denominator(view)
+            curve = curve + offset_of(view, output)
+        size = denominator(view)
         if low == high:
-            return [curve - low * size == 0, *_settles(view)]
+            return [curve - low * size == 0, *settles(view)]
         return ([curve - low * size >= 0] if low is not None else []) + (
-            [curve - high * size <= 0] if high is not None else []) + _settles(view)
+            [curve - high * size <= 0] if high is not None else []) + settles(view)
 
     return Rule(_label(word, channel), build)
-
-
-def _static_theta(view: View, channel: str | None, output: str | None = None) -> Any:
-    """Coefficients of the static curve, times ``1 + sum(a)``: Theta summed over the lags, or through A, B, C and D."""
-    _basis(view, channel)
-    if view.kind == "realisation":
-        a, c = view.reference["A"], view.reference["C"]
-        try:
-            row = np.linalg.solve((np.eye(len(a)) - a).T, c[output_index(view, output)])
-        except np.linalg.LinAlgError:
-            raise StructureError("the model has a pole at 1, hence no static characteristic; add 'stable'") from None
-        return view[view.key("Theta", channel)] @ through_matrices(view, channel, row, output)
-    if view.kind == "tangent" and "C" in view.reference:  # states: to first order in A, B, C and D
-        if view.key("static", channel) not in view:
-            raise StructureError("nonlinear feedback: the static characteristic does not follow from the inputs alone")
-        return view[view.key("static", channel)][:, output_index(view, output)]
-    if view["offset"].size > 1:
-        raise StructureError("constraints on the static characteristic are defined for one output")
-    if view.key("Theta", channel) not in view:  # a linear model has b alone
-        return cp.hstack([cp.sum(view[view.key("b", channel)])])
-    return cp.sum(view[view.key("Theta", channel)], axis=1)
-
-
-def through_matrices(view: View, channel: str | None, row: np.ndarray, output: str | None, direct: float = 1.0
-                     ) -> np.ndarray:
-    """Return the weights w of one output with ``Theta w = (row B + direct D_output) of every function``.
-
-    Args:
-        view: of a realisation step; Theta is (functions, n) where the input has no direct feedthrough.
-        channel: name of the input.
-        row: (n,) weights of the states.
-        output: name of the output.
-        direct: weight of its feedthrough.
-    """
-    a, c = view.reference["A"], view.reference["C"]
-    weights = np.concatenate([row, np.zeros(len(c))])
-    weights[len(a) + output_index(view, output)] = direct
-    return weights[: view[view.key("Theta", channel)].shape[1]]
-
-
-def output_index(view: View, output: str | None) -> int:
-    """Position of an output; the only one where none is named.
-
-    Raises:
-        StructureError: several outputs and none named, or no such output.
-    """
-    if output is None and len(view.reference["C"]) == 1:
-        return 0
-    if output not in view.outputs:
-        wrong = "needs output=" if output is None else f"names no output {output!r}"
-        raise StructureError(f"this constraint {wrong}; the outputs are {', '.join(view.outputs)}")
-    return view.outputs.index(output)
-
-
-def _offset(view: View, output: str | None) -> Any:
-    if "C" in view.reference:
-        return view["offset"][output_index(view, output)] if "offset" in view else 0.0
-    return view["offset"][0]
-
-
-def _denominator(view: View) -> Any:
-    return 1 + cp.sum(view["a"]) if "a" in view else 1.0
 
 
 def _everywhere(basis: Any) -> np.ndarray:
     """Values of f at the nodes of a piecewise linear basis, which are enough, or on a dense grid."""
     return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
-
-
-def _settles(view: View) -> list[Any]:
-    return [_denominator(view) >= SETTLES] if "a" in view else []
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
