@@ -76,6 +76,16 @@ def test_all_pairs_are_dense_least_squares(shape, gaps):
     compare(scan(found, whiten(model, data, x0="zero"), data.experiments[0].u), penalties(found))
 
 
+def test_all_pairs_with_scheduled_changes():
+    model = random_model(4, 3, 2, 2)
+    changed = {"a": Fault.schedule(A=0.9 * model.A), "b": Fault.schedule(B=lambda k: model.B * (1 - k / 32))}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=["bias", "drift", "loss"], schedules=changed, state_jump=False)
+    data = record(model, 16, 3, 0.1)
+    compare(scan(found, whiten(model, data, x0="zero"), data.experiments[0].u), penalties(found))
+
+
 def test_all_pairs_with_an_uncertain_model():
     model = small()
     found = dictionary(model, kinds=["bias", "drift", "loss"], process={"load": LOAD})

@@ -40,9 +40,7 @@ def dense(found, white, u, label):
     count, l = white.r.shape  # noqa: E741
     energies, sizes, spreads = [], [], []
     for onset in range(count):
-        G = found.signature(label, count, onset, u=u, present=white.present)
-        if white.nuisance is not None:
-            G = white.nuisance(G)
+        G = white.seen(white.predictor.respond(*found.additions(label, count, onset, u), white.present))
         G = G.reshape(count * l, -1)
         nu = np.linalg.lstsq(G, white.r.ravel(), rcond=1e-6)[0]
         energies.append(float(np.sum((G @ nu) ** 2)))
@@ -101,6 +99,97 @@ def test_an_uncertain_model(x0):
     white = whiten(model, data, x0=x0, uncertainty=identified)
     assert white.nuisance is not None
     compare(found, white, data.experiments[0].u)
+
+
+def scheduled(N=60):
+    rng = np.random.default_rng(5)
+    model = random_model(4, 3, 2, 2)
+    A = np.array([model.A + 0.15 * np.sin(0.2 * k) * rng.normal(size=(3, 3)) for k in range(N)])
+    B = np.array([model.B * (1 - 0.5 * k / N) for k in range(N)])
+    return model, A, B
+
+
+@pytest.mark.parametrize("gaps", [0.0, 0.15])
+def test_a_scheduled_change_is_the_difference_of_two_predictors(gaps):
+    """By hand: one predictor with the healthy matrices, one that follows A(k) and B(k) from the onset on."""
+    model, A, B = scheduled()
+    found = dictionary(model, schedules={"wear": Fault.schedule(A=A, B=B), "B": Fault.schedule(B=lambda k: B[k])},
+                       state_jump=False)
+    data = record(model, 60, 3, gaps, Fault.schedule(30, A=A, B=B))
+    u, y = data.experiments[0].u, data.experiments[0].y
+    white = whiten(model, data, x0="zero")
+    result, K = scan(found, white, u), white.predictor.K
+
+    def innovations(onset, change_A, change_B):
+        x, errors = np.zeros(3), []
+        for k in range(60):
+            predicted = model.C @ x + model.D @ u[k]
+            there = ~np.isnan(y[k])
+            errors.append(np.where(there, y[k] - predicted, 0.0))
+            on = k >= onset - 1
+            x = (A[k] if on and change_A else model.A) @ x + (B[k] if on and change_B else model.B) @ u[k] + \
+                K @ errors[-1] + model.L @ np.where(there, y[k], predicted)
+        return np.array(errors)
+
+    healthy = innovations(99, False, False)
+    np.testing.assert_allclose(white.predictor.whitened(healthy, white.present), white.r, atol=1e-9)
+    for label, both in (("process:wear schedule", True), ("process:B schedule", False)):
+        energies = []
+        for onset in range(1, 60):
+            G = white.predictor.whitened(healthy - innovations(onset, both, True), white.present)
+            np.testing.assert_allclose(result.signature(label, onset)[:, :, 0], G, atol=1e-9)
+            energies.append(np.sum(G * white.r) ** 2 / np.sum(G**2))
+        row = result.statistic[result.index(label), 1:]
+        there = ~np.isnan(row)
+        assert there[:55].all()
+        np.testing.assert_allclose(row[there], np.array(energies)[there], rtol=1e-7)
+    limits = thresholds(found, white, u=u, draws=5000)
+    gains = result.gains(limits)
+    c, onset = np.unravel_index(np.nanargmax(gains), gains.shape)
+    assert found.labels[c] == "process:wear schedule" and abs(onset - 30) <= 12  # the change sets in slowly
+    nu, covariance = result.estimate(found.labels[c], 30)
+    assert abs(nu[0] - 1) < 4 * np.sqrt(covariance[0, 0]) < 2
+
+
+def test_a_share_of_a_scheduled_change_of_B_is_estimated():
+    model = small()
+    half = Fault.schedule(80, B=0.5 * model.B)
+    found = dictionary(model, schedules={"lost": Fault.schedule(B=0 * model.B)}, kinds=["bias", "loss"])
+    data = record(model, 200, 3, 0.0, half)
+    u = data.experiments[0].u
+    result = scan(found, whiten(model, data, x0="zero"), u)
+    nu, covariance = result.estimate("process:lost schedule", 80)
+    assert abs(nu[0] - 0.5) < 4 * np.sqrt(covariance[0, 0]) < 0.1
+
+
+def test_scheduled_changes_need_states_and_matrices_that_fit():
+    model, A, B = scheduled()
+    data = record(model, 60, 3)
+    white, u = whiten(model, data, x0="zero"), data.experiments[0].u
+    found = dictionary(model, schedules={"wear": Fault.schedule(A=A)})
+    c = found.labels.index("process:wear schedule")
+    for one in (scan(found, white), scan(found, replace(white, states=None), u)):
+        assert np.isnan(one.statistic[c]).all()
+    with pytest.raises(StructureError, match="depends on the states"):
+        found.signature("process:wear schedule", 60)
+    with pytest.raises(DataError, match="states have 30 samples; the window has 60"):
+        scan(found, replace(white, states=white.states[:30]), u)
+    with pytest.raises(StructureError, match="A has shape"):
+        scan(dictionary(model, schedules={"wear": Fault.schedule(A=A[:7])}), white, u)
+    with pytest.raises(StructureError, match="not finite"):
+        scan(dictionary(model, schedules={"wear": Fault.schedule(B=np.nan * B)}), white, u)
+    with pytest.raises(StructureError, match="Fault.schedule"):
+        dictionary(model, schedules={"wear": Fault.step("state", 0, [1.0, 1.0, 1.0])})
+
+
+def test_states_of_the_predictor_with_feedback_and_gaps():
+    model = with_feedback()
+    u = 0.3 * np.random.default_rng(0).normal(size=(40, 2))
+    y = inject(model, u, seed=1)
+    y[7, 0] = y[20] = np.nan
+    white = whiten(model, Data(u, y, dt=0.5, outputs=["p", "q"]), x0=[0.1, 0.0, -0.1])
+    predicted = white.states @ model.C.T + model.expanded(u) @ model.D.T + model.offset_y
+    np.testing.assert_allclose((y - predicted)[white.present], white.innovations[white.present], atol=1e-9)
 
 
 def test_the_convolution_of_the_forecast_agrees():

@@ -12,6 +12,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
+from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.kalman import kalman_gain
 
 
@@ -153,7 +154,8 @@ def test_model_errors_count_as_noise(real_data):
             warnings.simplefilter("ignore", DataWarning)
             naive.append(np.sum(whiten_with(wrong, data, identified).r ** 2))
             aware.append(np.sum(whiten_with(wrong, data, identified, own).r ** 2))
-    freedom = 400 - 4  # the initial state takes four
+    root = identified.predictor.root  # in units of the size that this short record shows
+    freedom = (400 - 4) * np.trace(root @ model.noise.innovation @ root.T) / 2  # the initial state takes four
     assert np.mean(naive) > 1.05 * freedom
     assert abs(np.mean(aware) / freedom - 1) < 4 * np.sqrt(2 / freedom / 60)
 
@@ -162,6 +164,39 @@ def whiten_with(model, data, identified, uncertainty=None):
     """Whiten by the gain that the model carries, which is as uncertain as its matrices."""
     steady = replace(identified.predictor, A=model.A, C=model.C, K=model.K)
     return whiten(model, data, scale=steady, uncertainty=uncertainty)
+
+
+def test_a_fitted_record_is_scaled_by_its_degrees_of_freedom():
+    """Innovations of the record a model was fitted to are too small; those of other records are of unit size."""
+    model, ratios = small(), []
+    for seed in range(40):
+        u = levels(60, seed)
+        data = Data(u, inject(model, u, seed=seed))
+        found = model_uncertainty(model, data)  # of the true model, which is fitted to nothing
+        own = whiten(model, data, scale=found.predictor).r
+        freedom = found.readings - found.root.shape[1]
+        assert abs(np.sum(own**2) / freedom - 1) < 0.02  # the initial state is fitted in another norm
+        ratios.append(np.linalg.det(found.predictor.covariance) / np.linalg.det(model.noise.innovation))
+    expected = (120 - 3) / freedom
+    assert abs(np.mean(np.sqrt(ratios)) / expected - 1) < 0.1
+
+
+def test_a_noise_without_power_at_some_frequency_still_has_a_predictor():
+    """A gain that puts an eigenvalue of A - K C on the unit circle: deviations would be remembered for ever."""
+    A, C, K = np.diag([0.9, 0.5]), np.eye(2), np.diag([-0.1, 0.2])
+    noise = NoiseCovariances(K @ K.T, np.eye(2), K, np.eye(2))
+    model = HammersteinSS(A, np.ones((2, 1)), C, K=K, noise=noise)
+    with pytest.warns(DataWarning, match="no power at some frequency"):
+        assert np.max(np.abs(np.linalg.eigvals(predictor(model).F))) < 0.999
+    u = levels(400, 0, 1)
+    data = Data(u, inject(model, u, seed=1))
+    found = model_uncertainty(model, data).predictor
+    assert np.max(np.abs(np.linalg.eigvals(found.F))) < 0.995
+    unseen = replace(model, A=np.diag([1.0, 0.5]), C=np.array([[0.0, 1.0]]), K=None, D=None, offset_y=None, L=None,
+                     outputs=("y",), output_units=("",),
+                     noise=NoiseCovariances(np.eye(2), np.eye(1), np.zeros((2, 1)), np.eye(1)))
+    with pytest.raises(StructureError, match="Riccati"):
+        predictor(unseen)
 
 
 def test_a_known_initial_state_keeps_its_information(real_data):
@@ -174,5 +209,5 @@ def test_a_known_initial_state_keeps_its_information(real_data):
     # the explicit inverse root of I + M M'
     U, s = known.nuisance.U, known.nuisance.s
     values, axes = np.linalg.eigh(np.eye(600) + (U * s**2) @ U.T)
-    plain = whiten(model, data, x0="zero").r
+    plain = whiten(model, data, x0="zero", scale=found.predictor).r
     np.testing.assert_allclose(known.r.ravel(), axes @ ((axes.T @ plain.ravel()) / np.sqrt(values)), atol=1e-8)

@@ -65,7 +65,8 @@ def cut(whitened: Whitened, first: int, last: int | None = None) -> Whitened:
     """Return the samples from first on (to before last)."""
     here = slice(first, last)
     return replace(whitened, r=whitened.r[here], innovations=whitened.innovations[here],
-                   present=whitened.present[here])
+                   present=whitened.present[here],
+                   states=None if whitened.states is None else whitened.states[here])
 
 
 def windows(model: HammersteinSS, faults: Sequence[Any], window: int = 200, *, load: np.ndarray | None = None,

@@ -121,7 +121,8 @@ def _searches(
 ) -> Iterator[tuple[Sweep, int]]:
     """Yield prepared searches and how many windows each is calibrated on."""
     how = {} if isinstance(window, int) else {
-        "steady": window.predictor, "present": window.present, "nuisance": window.nuisance}
+        "steady": window.predictor, "present": window.present, "nuisance": window.nuisance,
+        "states": window.states}
     inputs = None if u is None else samples_of(u, "u", found.model.m)
     if inputs is None or len(inputs) == count:
         yield sweep(found, count, u=inputs, **how), draws

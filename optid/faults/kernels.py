@@ -98,3 +98,23 @@ def respond(A, C, K, L, present, into_state, into_output, response):
                     later[i, p] += (-K[i, o] if present[k, o] else L[i, o]) * response[k, o, p]
             for i in range(n):
                 x[i, p] = later[i, p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def propagate(A, drive, start, states):
+    """States of x(k+1) = A x + drive(k).
+
+    Args:
+        A: (n, n).
+        drive: (N, n).
+        start: (n,).
+        states: (N, n) written.
+    """
+    n = start.size
+    for i in range(n):
+        states[0, i] = start[i]
+    for k in range(1, states.shape[0]):
+        for i in range(n):
+            states[k, i] = drive[k - 1, i]
+            for j in range(n):
+                states[k, i] += A[i, j] * states[k - 1, j]

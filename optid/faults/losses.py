@@ -1,8 +1,8 @@
 """How much of an actuator is lost: shares between none and all, stops within its reach, at every onset (F5).
 
-The contribution of a broken actuator is v = (1 - gamma) f(u) + c. A share gamma lies between 0 and 1, and the constant c
-of a stuck one in the image of f, since the actuator stands somewhere. Both enter the innovations linearly, so that the
-best ones at a given onset are a quadratic programme with a box, solved exactly, and all onsets are tried.
+What a broken actuator contributes is v = (1 - gamma) f(u) + c. A share gamma lies between 0 and 1, and the constant
+c of a stuck one in the image of f, since the actuator stands somewhere. Both enter the innovations linearly, so that
+the best ones at a given onset are a quadratic programme with a box, solved exactly, and all onsets are tried.
 """
 
 from dataclasses import dataclass

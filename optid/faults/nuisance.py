@@ -5,6 +5,12 @@ itself in the whitened innovations, Psi being the sensitivity of the predictor. 
 have the covariance I + Psi P Psi', by which they are whitened once more. P is the inverse of the information in the
 record the model was identified from. Turning the states, or moving a factor between f and B, changes no prediction:
 the information says nothing of such directions, Psi is zero along them, and the pseudo-inverse leaves them out.
+
+Two more things that a short record leaves open are counted. Its innovations are too small, because the parameters were
+fitted to them: their covariance is taken from their energy over the degrees of freedom that are left. And an estimated
+noise may have no power at some frequency (often at zero, where a constant and an initial state were fitted, too): a
+predictor that believes it never forgets a deviation. So measurement noise is added, the share of the innovations that
+the gain has parameters for every sample of the record.
 """
 
 from collections.abc import Callable
@@ -59,8 +65,8 @@ class ModelUncertainty:
     """The covariance of the parameters of an identified model.
 
     Attributes:
-        model: the model, with the gain of its steady predictor.
-        predictor: that predictor.
+        model: the model, with the gain of the predictor.
+        predictor: of the noise with what the record leaves open; windows are judged by it.
         root: (parameters, q) with covariance root root'.
         readings: number of readings behind it, less one for each initial state estimated.
     """
@@ -102,13 +108,13 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
         DataError: fewer than two readings for each direction of the parameters that changes the predictions.
         StructureError: no noise covariances.
     """
-    steady = predictor(model)
-    gained = replace(model, K=steady.K)
     raw = in_units_of(model, data)
+    steady = _forgetting(model, sum(len(part.y) for part in raw.experiments))
+    gained = replace(model, K=steady.K)
     given = gained.initial_state(raw, "predict")
     starts = given if isinstance(given, tuple) else (given,)
     count = len(_parameters(gained)[0])
-    information, readings = np.zeros((count, count)), 0
+    information, readings, energy = np.zeros((count, count)), 0, 0.0
     for part, x0 in zip(raw.experiments, starts):
         present = ~np.isnan(part.y)
         by_parameter, by_start = _sensitivities(gained, steady, part, x0, present, np.eye(count))
@@ -117,6 +123,9 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
         rest = by_parameter - basis @ (basis.T @ by_parameter)
         information += rest.T @ rest
         readings += int(present.sum()) - basis.shape[1]
+        errors = np.where(present, part.y - simulation.run(_job(gained, part), x0), 0.0)
+        white = steady.whitened(errors, present).ravel()
+        energy += float(np.sum((white - basis @ (basis.T @ white)) ** 2))
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
     values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
@@ -126,8 +135,22 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
             f"{readings} readings (beside the initial states) do not determine the parameters well enough for a "
             f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
         )
-    root = axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
+    scale = np.sqrt(energy / (readings - int(known.sum())))
+    root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
+    steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
     return ModelUncertainty(gained, steady, root, readings)
+
+
+def _forgetting(model: "HammersteinSS", samples: int) -> Predictor:
+    """The predictor of the noise with a little more measurement noise."""
+    if model.noise is None:
+        return predictor(model)  # which refuses
+    more = model.noise.R + model.nx / samples * model.noise.innovation
+    return predictor(replace(model, noise=replace(model.noise, R=more)))
+
+
+def _job(model: "HammersteinSS", part: Experiment) -> simulation.Run:
+    return simulation.prepared(model, "predict", part.u, part.y, None, "")
 
 
 def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
@@ -171,8 +194,7 @@ def _sensitivities(
     largest[largest == 0] = 1.0
 
     def white(changed: "HammersteinSS") -> Array:
-        job = simulation.prepared(changed, "predict", part.u, part.y, None, "")
-        errors = np.where(present, part.y - simulation.run(job, x0), 0.0)
+        errors = np.where(present, part.y - simulation.run(_job(changed, part), x0), 0.0)
         return steady.whitened(errors, present).ravel()
 
     columns = np.empty((present.size, root.shape[1]))

@@ -100,9 +100,13 @@ class Scan:
         Raises:
             StructureError: a candidate without a signature.
         """
-        count = len(self.whitened.r)
-        into_state, into_output = self.dictionary.additions(candidate, count, onset, self.u)
-        return self.whitened.seen(self.whitened.predictor.respond(into_state, into_output, self.whitened.present))
+        c, count = self.index(candidate), len(self.whitened.r)
+        if not self.sweep.blocks.sizes[c]:
+            self.dictionary.additions(self.dictionary.candidates[c], count, 0, self.u)  # which says why there is none
+            raise StructureError(f"{self.labels[c]} has no signature in this window.")
+        if not 0 <= onset < count:
+            raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
+        return self.sweep.signature(c, onset)
 
     def gains(self, thresholds: "Thresholds") -> Array:
         """Return the statistics less their thresholds, (C, N): the fault at the largest is the exact optimum.
@@ -141,7 +145,7 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
     Args:
         found: the candidates.
         whitened: the window; one experiment.
-        u: (N, m) inputs of the window in raw units, for losses and stuck actuators.
+        u: (N, m) inputs of the window in raw units, for losses, stuck actuators and scheduled changes.
         onsets: the onsets that are searched, whole numbers from 0; all by default.
 
     Raises:
@@ -160,7 +164,8 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         k, o = np.argwhere(~np.isfinite(whitened.r))[0]
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
     prepared = sweep(
-        found, len(whitened.r), steady=whitened.predictor, present=whitened.present, u=u, nuisance=whitened.nuisance
+        found, len(whitened.r), steady=whitened.predictor, present=whitened.present, u=u, nuisance=whitened.nuisance,
+        states=whitened.states,
     )
     correlations = prepared.correlations(whitened.r)
     statistic = prepared.statistic(correlations)

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
-from optid.faults.faults import channel_of, place_of
+from optid.faults.faults import Fault, channel_of, place_of
+from optid.faults.scheduled import with_schedules
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class Candidate:
         members: labels of all faults that leave the same trace, its own first.
         places: names of the parts that these faults are in.
         bounded_deflection: whether the trace dies out: waiting does not help.
+        schedule: the matrices A(k) and B(k) of a scheduled change.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Candidate:
     members: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
     bounded_deflection: bool = False
+    schedule: Fault | None = None
 
     @property
     def own_label(self) -> str:
@@ -192,6 +195,8 @@ class Dictionary:
         if c.additive:
             course = COURSES[c.kind](since).astype(float)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
+        if c.kind == "schedule":
+            raise StructureError(f"{c.label}: its signature depends on the states: ask scan(...) for it.")
         if not c.columns:
             raise StructureError(
                 f"{c.label}: its course may be anything, so that there is no signature: test it as an arbitrary "
@@ -237,7 +242,7 @@ class Dictionary:
 def dictionary(
     model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
     kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
-    unknown: bool = True,
+    schedules: Mapping[str, Fault] | None = None, unknown: bool = True,
 ) -> Dictionary:
     """List the faults that are thought possible, merge those that look the same, leave out those nobody sees.
 
@@ -248,6 +253,7 @@ def dictionary(
         kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each where it can be.
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
+        schedules: known changes of A and B by name, see `optid.faults.scheduled`.
         unknown: whether "none of these" is an answer.
 
     Raises:
@@ -277,7 +283,8 @@ def dictionary(
     if not found:
         raise StructureError("No output sees any of the faults: there is nothing to look for.")
     merged, sines = _merged(steady, found)
-    return Dictionary(model, steady, merged, excluded, sines, unknown)
+    listed = Dictionary(model, steady, merged, excluded, sines, unknown)
+    return with_schedules(listed, schedules) if schedules else listed
 
 
 def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:

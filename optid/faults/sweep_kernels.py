@@ -204,3 +204,39 @@ def many(tables, windows, first, sizes, roots, places, tested, largest):
                 if tested[c, k] and not statistic[c, k] <= best:
                     best = statistic[c, k]
             largest[m, c] = best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def course(tables, first, order, onset, signature):
+    """The whitened signature of neighbouring columns with an onset.
+
+    Args:
+        tables: `optid.faults.sweeps.Tables`.
+        first: first of the d columns.
+        order: 0 for columns that last, 1 for drifts, 2 for jumps.
+        onset: first sample.
+        signature: (N, l, d) written from the onset on.
+    """
+    count, l, d = signature.shape  # noqa: E741
+    n = tables.F.shape[1]
+    x, later, now = np.zeros((n, d)), np.zeros((n, d)), np.zeros(l)
+    for k in range(onset, count):
+        t = tables.of[k]
+        age = k - onset
+        share = 1.0 if order == 0 else age + 1.0 if order == 1 else 1.0 if age == 0 else 0.0
+        for j in range(d):
+            for o in range(l):
+                now[o] = share * tables.h[t, o, first + j]
+                for i in range(n):
+                    now[o] += tables.C[o, i] * x[i, j]
+            for o in range(l):
+                total = 0.0
+                for a in range(o + 1):
+                    total += tables.W[t, o, a] * now[a]
+                signature[k, o, j] = total
+            for i in range(n):
+                total = share * tables.e[t, i, first + j]
+                for a in range(n):
+                    total += tables.F[t, i, a] * x[a, j]
+                later[i, j] = total
+        x[:] = later

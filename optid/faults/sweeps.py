@@ -18,6 +18,7 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.errors import DataError, StructureError
+from optid.faults.scheduled import change
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
 from optid.models.experiments import samples_of
@@ -110,6 +111,15 @@ class Sweep:
         """Return the columns of a candidate among the correlations."""
         return slice(int(self.blocks.first[c]), int(self.blocks.first[c] + self.blocks.sizes[c]))
 
+    def signature(self, c: int, onset: int) -> Array:
+        """Return the whitened signature (N, l, d) of a candidate that has one."""
+        from optid.faults.sweep_kernels import course
+
+        result = np.zeros((self.window, self.found.model.l, int(self.blocks.sizes[c])))
+        order = ORDERS.get(self.found.candidates[c].kind, 0)
+        course(self.tables, int(self.blocks.first[c]), order, int(onset), result)
+        return result if self.nuisance is None else self.nuisance(result)
+
     def correlations(self, r: Array) -> Array:
         """Return the correlations (N, D) of a window (N, l) with the signatures."""
         from optid.faults.sweep_kernels import correlate
@@ -156,7 +166,7 @@ _MOST = 4
 
 def sweep(
     found: Dictionary, window: int, *, steady: Predictor | None = None, present: Array | None = None, u: Any = None,
-    nuisance: "Nuisance | None" = None,
+    nuisance: "Nuisance | None" = None, states: Array | None = None,
 ) -> Sweep:
     """Prepare the search for one fault.
 
@@ -169,6 +179,7 @@ def sweep(
         present: (N, l) whether a reading is there.
         u: (N, m) inputs, for losses and stuck actuators, which are not tested without it.
         nuisance: of an uncertain model.
+        states: (N, n) of the predictor, for scheduled changes, which are not tested without them and the inputs.
 
     Raises:
         DataError: inputs of another length, or missing.
@@ -181,7 +192,12 @@ def sweep(
     if window < least:
         raise StructureError(f"window={window}: at least {least} samples are needed for {found.model.nx} states.")
     inputs = None if u is None else _inputs(found, u, window)
-    able = tuple(c.additive or (bool(c.columns) and inputs is not None) for c in found.candidates)
+    able = tuple(
+        c.additive or (bool(c.columns) and inputs is not None)
+        or (c.schedule is not None and inputs is not None and states is not None) for c in found.candidates
+    )
+    if states is not None and len(states) != window:
+        raise DataError(f"The states have {len(states)} samples; the window has {window}: cut them like the rest.")
     if not any(able):
         raise StructureError(
             "No candidate has a signature to look for: add the kind 'bias', 'drift' or a state jump, or pass the input "
@@ -189,13 +205,13 @@ def sweep(
         )
     plain = present is None and nuisance is None and all(c.additive for c, a in zip(found.candidates, able) if a)
     if not plain:
-        return _prepared(found, window, steady, present, inputs, nuisance, able)
+        return _prepared(found, window, steady, present, inputs, nuisance, states, able)
     key = (window, able, *(part.tobytes() for part in (steady.A, steady.C, steady.K, steady.L, steady.root)))
     kept = _KEPT.setdefault(found, {})
     if key not in kept:
         if len(kept) >= _MOST:
             kept.pop(next(iter(kept)))
-        kept[key] = _prepared(found, window, steady, None, None, None, able)
+        kept[key] = _prepared(found, window, steady, None, None, None, None, able)
     return kept[key]
 
 
@@ -214,14 +230,16 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
 
 def _prepared(
     found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
-    nuisance: "Nuisance | None", able: tuple[bool, ...],
+    nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...],
 ) -> Sweep:
     from optid.faults.sweep_kernels import grams
 
     blocks, tables = _tables(found, window, steady, present, u, able)
+    if any(a and c.schedule for a, c in zip(able, found.candidates)):
+        tables = _with_schedules(found, steady, blocks, tables, states, u)
     columns = blocks.group.size
     products = np.zeros((window, columns, columns))
-    grams(tables, blocks.group, False, products, np.empty((1, steady.A.shape[0], columns)))
+    grams(tables, blocks.group, False, products, np.empty((1, tables.F.shape[1], columns)))
     largest = [_largest(products, blocks, c) for c in range(len(able))]
     if nuisance is not None:
         along = _along(tables, nuisance, columns)
@@ -286,7 +304,7 @@ def _tables(
     lasting = [i for i in order if found.candidates[i].kind not in ORDERS] + drifts
     line = lasting + drifts + [i for i in order if ORDERS.get(found.candidates[i].kind) == 2]
     into = [_into(found, found.candidates[i], window, u) for i in line]
-    driven = any(len(x) > 1 for x, _ in into)
+    driven = any(not found.candidates[i].additive for i in line)
     if driven:
         into = [tuple(np.broadcast_to(part, (window, *part.shape[1:])) for part in pair) for pair in into]
         gains, whitening, of = gains[of], whitening[of], np.arange(window)
@@ -309,6 +327,26 @@ def _tables(
     return Blocks(first, dimensions, places, group), tables
 
 
+def _with_schedules(
+    found: Dictionary, steady: Predictor, blocks: Blocks, tables: Tables, states: Array | None, u: Array | None
+) -> Tables:
+    """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
+    assert states is not None and u is not None
+    n = steady.A.shape[0]
+    chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and blocks.sizes[i]]
+    wide = n * (1 + len(chosen))
+    count, _, columns = tables.e.shape
+    F, h, e = np.zeros((count, wide, wide)), np.array(tables.h), np.zeros((count, wide, columns))
+    F[:, :n, :n], e[:, :n] = tables.F, tables.e
+    for place, (i, candidate) in enumerate(chosen, 1):
+        own, column = slice(n * place, n * (place + 1)), blocks.first[i]
+        added, A = change(found.model, candidate, states, u)
+        F[:, own, own] = tables.F + A - steady.A
+        h[:, :, column] = added[:, :, 0] @ steady.C.T
+        e[:, own, column] = np.einsum("kij,kj->ki", F[:, own, own], added[:, :, 0])
+    return tables._replace(F=F, C=np.tile(tables.C, 1 + len(chosen)), h=h, e=e)
+
+
 def _whitening(steady: Predictor, pattern: np.ndarray) -> Array:
     """The whitening (l, l) of a sample of which only some readings are there."""
     return np.ascontiguousarray(steady.whitened(np.eye(pattern.size)[None], pattern[None])[0])
@@ -316,6 +354,6 @@ def _whitening(steady: Predictor, pattern: np.ndarray) -> Array:
 
 def _into(found: Dictionary, candidate: Candidate, window: int, u: Array | None) -> tuple[Array, Array]:
     """What a candidate adds to the state (1 or N, n, d) and the output (1 or N, l, d) at a sample after its onset."""
-    if candidate.additive:
+    if candidate.additive or candidate.schedule is not None:  # what the latter adds comes with its matrices
         return candidate.into_state[None], candidate.into_output[None]
     return found.additions(candidate, window, 0, u)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.data import Data
+from optid.data import Data, Experiment
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
+from optid.models.roots import spectral_radius
 
 if TYPE_CHECKING:
     from optid.faults.nuisance import ModelUncertainty, Nuisance
@@ -21,6 +22,12 @@ LAGS = 20
 
 NOT_WHITE = 1e-3
 """Thresholds are refused below this p-value."""
+
+FORGETS = 1 - 1e-9
+"""Largest radius of the error of a predictor."""
+
+ADDED = 1e-2
+"""Measurement noise, as a share of the innovations, that is added where the noise has no power at some frequency."""
 
 OTHER_SCALE = 1.3
 """Thresholds are refused above this ratio of the innovations to their predicted size."""
@@ -96,6 +103,9 @@ def predictor(model: "HammersteinSS") -> Predictor:
 
     Raises:
         StructureError: no noise covariances, or no stabilising gain.
+
+    Warns:
+        DataWarning: a noise without power at some frequency.
     """
     if model.noise is None:
         raise StructureError(
@@ -103,8 +113,28 @@ def predictor(model: "HammersteinSS") -> Predictor:
             "them with optid.noise.with_noise(model, data)."
         )
     noise = model.noise
-    steady = kalman_gain(model.A, model.C, noise.Q, noise.R, noise.S)
+    steady, failure = _gain(model, noise.R)
+    if steady is None:
+        steady, _ = _gain(model, noise.R + ADDED * noise.innovation)
+        if steady is None:
+            raise StructureError(failure)
+        warnings.warn(
+            "The noise of the model has no power at some frequency, so that its predictor would never forget: "
+            f"measurement noise of {100 * ADDED:g} % of the innovations is added.", DataWarning, stacklevel=2,
+        )
     return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
+
+
+def _gain(model: "HammersteinSS", R: Array) -> tuple[Any, str]:
+    """The steady gain for a measurement noise; None, and why, without one whose predictor forgets."""
+    assert model.noise is not None
+    try:
+        steady = kalman_gain(model.A, model.C, model.noise.Q, R, model.noise.S)
+    except StructureError as error:
+        return None, str(error)
+    if spectral_radius(model.A - steady.K @ model.C) > FORGETS:
+        return None, "The Riccati equation has no stabilising solution: a mode stays on the unit circle."
+    return steady, ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +149,7 @@ class Whitened:
         outputs: names of the outputs.
         nuisance: what uncertain parameters of the model leave in the innovations, taken out of r; None for a model
             that is taken as exact.
+        states: (N, n) of the predictor, for faults that change the matrices; None where they are not known.
     """
 
     r: Array
@@ -127,6 +158,7 @@ class Whitened:
     predictor: Predictor
     outputs: tuple[str, ...]
     nuisance: "Nuisance | None" = None
+    states: Array | None = None
 
     def seen(self, signature: Array) -> Array:
         """Return what a signature (N, l, d) of the innovations is in r: whitened like them."""
@@ -146,14 +178,14 @@ def whiten(
         model: a model with noise covariances.
         data: the record; detrended or scaled data are taken back to raw units.
         x0: "fit" (least squares of the innovations), "zero", or the state (n,), one for each experiment.
-        uncertainty: of an identified model (`model_uncertainty`); its effect counts as noise.
+        uncertainty: of an identified model (`model_uncertainty`); its effect counts as noise; its predictor is used.
         scale: a predictor whose covariance replaces that of the model, as `Health.predictor` returns.
 
     Raises:
         DataError: a missing input, other channels or sampling time than the model's.
         StructureError: no noise covariances.
     """
-    steady = predictor(model) if scale is None else scale
+    steady = scale or (predictor(model) if uncertainty is None else uncertainty.predictor)
     gained = replace(model, K=steady.K)
     raw = in_units_of(model, data)
     parts = raw.experiments
@@ -165,14 +197,30 @@ def whiten(
         present = ~np.isnan(part.y)
         innovations = part.y - prediction
         r = steady.whitened(np.where(present, innovations, 0.0), present)
-        white = Whitened(r, innovations, present, steady, model.outputs)
+        start = states if len(parts) == 1 or isinstance(states, str) else states[number]
+        start = np.zeros(model.nx) if isinstance(start, str) else np.asarray(start, dtype=float)
+        white = Whitened(r, innovations, present, steady, model.outputs,
+                         states=_states(gained, part, prediction, start))
         if uncertainty is not None:
-            start = states if len(parts) == 1 else states[number]
-            start = np.zeros(model.nx) if isinstance(start, str) else np.asarray(start, dtype=float)
             nuisance = uncertainty.nuisance(part, start, present, free_start=isinstance(x0, str) and x0 == "fit")
             white = replace(white, r=nuisance(r), nuisance=nuisance)
         found.append(white)
     return found[0] if len(found) == 1 else tuple(found)
+
+
+def _states(model: "HammersteinSS", part: Experiment, prediction: Array, start: Array) -> Array | None:
+    """States (N, n) of the predictor; None where a missing input leaves them unknown."""
+    if np.isnan(part.u).any():
+        return None
+    from optid.faults.kernels import propagate
+
+    y = np.where(np.isnan(part.y), prediction, part.y)
+    drive = model.expanded(part.u) @ model.B.T + model.offset_x + y @ model.L.T + (y - prediction) @ model.K.T
+    for g, o, column in zip(model.feedback, model.output_of, model.E.T):
+        drive += np.outer(g(y[:, o]), column)
+    states = np.empty((len(y), model.nx))
+    propagate(np.ascontiguousarray(model.A), np.ascontiguousarray(drive), start, states)
+    return states
 
 
 @dataclass(frozen=True, eq=False)
