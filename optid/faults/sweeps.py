@@ -196,7 +196,7 @@ def sweep(
         c.additive or (bool(c.columns) and inputs is not None)
         or (c.schedule is not None and inputs is not None and states is not None) for c in found.candidates
     )
-    if states is not None and len(states) != window:
+    if states is not None and len(states) != window and any(c.schedule for c in found.candidates):
         raise DataError(f"The states have {len(states)} samples; the window has {window}: cut them like the rest.")
     if not any(able):
         raise StructureError(
