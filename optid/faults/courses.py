@@ -83,8 +83,8 @@ def _frozen(seen: "Seen", found: "Dictionary", candidate: Candidate) -> Explanat
     logs = logs - np.log(count)
     kept = np.flatnonzero(logs > logs.max() - NEGLIGIBLE)
     values = [readings[int(k) :][there[int(k) :]] for k in kept]
-    sizes = np.array([[np.mean(v)] for v in values])
-    covariances = np.array([[[np.var(v, ddof=1) / v.size]] for v in values])
+    sizes = np.array([[float(np.mean(v))] for v in values])
+    covariances = np.array([[[float(np.var(v, ddof=1)) / v.size]] for v in values])
 
     def rest(onset: int) -> Explained:
         columns = order[onset]

@@ -12,6 +12,7 @@ from optid.faults.evidence import Evidence
 from optid.faults.explaining import Fit, Ranking, doubles, ranked, singles
 from optid.faults.intervals import estimates
 from optid.faults.looking import Seen, look
+from optid.faults.methods import Way, by_bounds, by_programme
 from optid.faults.outliers import with_spikes
 from optid.faults.records import without_flat_lines
 from optid.faults.screening import check_channels
@@ -52,28 +53,54 @@ class Job:
         seen = look(self.record, still.part, self.found, asked, self.noise)
         notes = [self.remark, *(f"{line}." for line in still.lines), _outliers(seen, model.outputs)]
         p_value = seen.p_value(asked, self.found.unknown)
-        alarm = p_value <= asked.false_alarm
-        ranking = Ranking((), np.inf, True)
-        if alarm:
-            seen, ranking, widened = self.explained(seen, still.part)
-            notes.append(widened)
-        fits = ranking.fits if not self.found.unknown or any(fit.fits for fit in ranking.fits) else ()
+        seen, way, alarm = self.way(seen, still.part, p_value <= asked.false_alarm)
+        ranking = way.ranking
+        notes.append(way.note)
+        fits = ranking.fits if not self.found.unknown or _explains(ranking) else ()
         if alarm and not fits:
             check_channels(model, self.record)
         verdict = self.verdict(seen, alarm, bool(fits), bool(stuck.faults))
         answers = self.answers(fits, stuck.faults)
+        certificate = way.certificate
+        if stuck.faults and not fits:
+            certificate = Certificate("flat line", float(stuck.count))
         remaining = None
         if alarm:
             remaining = fits[0].remaining if fits else ranking.fits[0].remaining if ranking.fits else seen.healthy
         lost = dict(seen.lost) | self.untold()
         return Diagnosis(
-            verdict=verdict, detected=bool(alarm or stuck.faults), best=answers[0] if answers else None,
-            candidates=answers, p_value=0.0 if stuck.faults else p_value,
-            certificate=_certificate(fits, ranking, stuck.count, bool(stuck.faults)), untestable=lost,
+            verdict=verdict, detected=bool(alarm or stuck.faults),
+            best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
+            p_value=0.0 if stuck.faults else p_value, certificate=certificate, untestable=lost,
             window=len(seen.whitened.r), false_alarm=asked.false_alarm, coverage=asked.coverage, method=asked.method,
             status=" ".join(note for note in notes if note), model=model.title, outputs=model.outputs, dt=model.dt,
             remaining=remaining, evidence=_evidence(seen, fits),
         )
+
+    def way(self, seen: Seen, part: Experiment, alarm: bool) -> tuple[Seen, Way, bool]:
+        """Return what the method asked for finds, and whether the record is not healthy.
+
+        Args:
+            seen: the search.
+            part: the experiment.
+            alarm: whether the statistics raise an alarm.
+        """
+        unproved = ""
+        if self.asked.method == "set":
+            found, proved = by_bounds(self.record, seen, self.asked)
+            if proved or not alarm:
+                return seen, found, proved
+            unproved = f"{found.note} The answer is that of the exact search."
+        if not alarm:
+            return seen, Way(Ranking((), np.inf, True), NOTHING), False
+        if self.asked.method.startswith("sparse"):
+            return seen, by_programme(seen, self.asked), True
+        seen, ranking, note = self.explained(seen, part)
+        note = " ".join(words for words in (unproved, note) if words)
+        if not ranking.fits:
+            return seen, Way(ranking, NOTHING, note), True
+        kind = "exhaustive" if ranking.exhaustive else "grid"
+        return seen, Way(ranking, Certificate(kind, ranking.fits[0].gain, ranking.odds), note), True
 
     def explained(self, seen: Seen, part: Experiment) -> tuple[Seen, Ranking, str]:
         """Return what may have happened: by the candidates, with outliers beside them, by two faults.
@@ -132,12 +159,6 @@ class Job:
             merged = tuple(sorted((*stuck, *faults), key=lambda fault: fault.onset))
             result.append(Answer(merged, fit.probability, fit.gain))
         return tuple(result)
-
-
-def _certificate(fits: Sequence[Fit], ranking: Ranking, count: int, stuck: bool) -> Certificate:
-    if fits:
-        return Certificate("exhaustive" if ranking.exhaustive else "grid", fits[0].gain, ranking.odds)
-    return Certificate("flat line", float(count)) if stuck else NOTHING
 
 
 def _explains(ranking: Ranking) -> bool:
