@@ -1,6 +1,7 @@
 """The monitor against dense least squares, against the search of a whole record, and against what it was told."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest

@@ -10,6 +10,7 @@ from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.designing import design
 from optid.cli.diagnosing import diagnose
 from optid.cli.isolability import isolability
+from optid.cli.monitoring import monitor
 from optid.cli.options import (
     MODEL,
     RECORD,
@@ -313,4 +314,5 @@ def examples() -> None:
 app.command(cls=Command)(design)
 app.command(cls=Command)(diagnose)
 app.command(cls=Command)(isolability)
+app.command(cls=Command)(monitor)
 app.command(cls=Command)(order)

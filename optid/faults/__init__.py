@@ -53,6 +53,7 @@ _HOME = {
     "Monitor": "monitoring",
     "Event": "monitoring",
     "Calibration": "arl",
+    "cusum_arl": "cusum",
     "Estimate": "answers",
     "Answer": "answers",
     "Certificate": "answers",

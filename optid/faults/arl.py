@@ -145,7 +145,7 @@ def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
     level = length / arl0 / largest.shape[1]  # as if the candidates had nothing in common
     for _ in range(30):
         q = np.array([tail(column, level) for column in largest.T])
-        alarms = clusters((largest > q).any(axis=1))
+        alarms = clusters(np.any(largest > q, axis=1))
         rate = alarms / len(largest)
         goal = length / arl0
         if rate * len(largest) < FEWEST or abs(rate / goal - 1) < 0.005:
@@ -154,7 +154,7 @@ def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
     return q, alarms
 
 
-def clusters(above: np.ndarray) -> int:
+def clusters(above: Any) -> int:
     """Count runs of blocks with an alarm."""
     return int(above[0]) + int(np.sum(above[1:] & ~above[:-1]))
 

@@ -110,15 +110,15 @@ def blank(t: Tables) -> State:
 
 def _stacked(matrices: list[Any]) -> Array:
     whole = np.zeros((len(matrices), *(max(np.shape(part)[axis] for part in matrices) for axis in (0, 1))))
-    for space, part in zip(whole, matrices):
-        space[: np.shape(part)[0], : np.shape(part)[1]] = part
+    for number, part in enumerate(matrices):
+        whole[number, : np.shape(part)[0], : np.shape(part)[1]] = part
     return whole
 
 
 def _rows(vectors: list[Any], kind: Any) -> Any:
     whole = np.zeros((len(vectors), max(len(part) for part in vectors)), dtype=kind)
-    for space, part in zip(whole, vectors):
-        space[: len(part)] = part
+    for number, part in enumerate(vectors):
+        whole[number, : len(part)] = part
     return whole
 
 

@@ -347,7 +347,7 @@ class Monitor:
             f[:] = self.dictionary.model.expanded(u)
         else:  # as the bases do it, without their tables
             for j, (nonlinearity, c) in enumerate(zip(self.dictionary.model.nonlinearities, self._input_of)):
-                basis = nonlinearity.basis
+                basis: Any = nonlinearity.basis
                 self._one[0] = u[0, c]
                 if basis.outside == "clamp" and basis.interval is not None:
                     np.clip(self._one, *basis.interval, out=self._one)
