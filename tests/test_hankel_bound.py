@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 import optid
-from optid.certificate.hankel import CRITERIA, attach, hankel_bounds
+from optid.certificate.hankel import CRITERIA, hankel_bounds
 from optid.errors import RankError, StructureError
-from optid.solution import Bound, Status
-from optid.solving import Evidence
 
 
 def simulate(a, b, c, d, phi, x0, offset_x, offset_y):
@@ -137,16 +135,15 @@ def test_one_step_errors_lie_below_the_bound_and_are_refused():
     assert bounds.bound(1, error, "simulation").value <= error
 
 
-def test_attached_to_simulation_errors_alone():
+def test_for_simulation_errors_alone():
     rng = np.random.default_rng(1)
     raw = rng.normal(size=(200, 3))
     bounds = hankel_bounds([raw], None, inputs=[0], feedback=[1], outputs=[2], largest=2)
-    evidence = Evidence(None, 500.0, Bound(-np.inf, False, "none"), Status.LOCAL)
-    found = attach(evidence, bounds, 1, 500.0, "measured feedback")
-    assert found.bound.value == bounds.value(1)[0] and found.bound.method.startswith("Hankel")
+    found = bounds.bound(1, 500.0, "measured feedback")
+    assert found.value == bounds.value(1)[0] and found.method.startswith("Hankel")
     for criterion in set(CRITERIA) - {"measured feedback"}:
         with pytest.raises(StructureError, match="does not hold"):
-            attach(evidence, bounds, 1, 500.0, criterion)
+            bounds.bound(1, 500.0, criterion)
     with pytest.raises(StructureError, match="the criterion is one of"):
         bounds.bound(1, 500.0, "multi-step")
 

@@ -12,8 +12,7 @@ errors below it, and a free run feeds its own outputs back, for which phi is not
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -154,22 +153,6 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of {signals} "
                         "signals; use a longer record or fewer functions")
     return HankelBounds(tried, values, energy, bool(len(feedback)))
-
-
-def attach(evidence: Any, bounds: HankelBounds, n: int, error: float, criterion: str) -> Any:
-    """Return the evidence of a procedure with the Hankel bound in place of its own.
-
-    Args:
-        evidence: `optid.solving.Evidence` whose objective is that error.
-        bounds: of the same record, functions and weights.
-        n: order of its model.
-        error: squared error of the model on the record.
-        criterion: how it was measured.
-
-    Raises:
-        StructureError: as in `HankelBounds.bound`.
-    """
-    return replace(evidence, bound=bounds.bound(n, error, criterion))
 
 
 def _alphas(records: Sequence[Array], signals: int, largest: int) -> tuple[int, ...]:
