@@ -5,6 +5,7 @@ to some mode, and an actuator's loss is hidden by past outputs among the instrum
 process noise then reaches the same modes. Hence past and future inputs alone are the instruments by default.
 Rows: the outputs of a dead sensor depend on no input. Columns: no output depends on the input of a dead actuator, given
 past outputs and the other inputs. Both work on every plant.
+A mode too weak to be seen on a window is no failure: behind every smaller order stands what a healthy plant would show.
 A window that straddles the failure sees an average of both plants and keeps the nominal rank, and its rows and columns
 are not zero: the alarm comes about one window after the failure. Meant as confirmation beside faster detectors.
 
@@ -17,12 +18,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.faults.order_power import Positions, coefficients, least_order
 from optid.faults.zero_tests import ZeroTest, smallest_excitation, zero_test
-from optid.model_order.ranks import rank_test
+from optid.model_order.ranks import RankTest, rank_test
 from optid.subspace.hankel import HankelStatistics, hankel_statistics
 
 if TYPE_CHECKING:
@@ -54,6 +57,7 @@ class WindowVerdict:
         rows: one test per sensor.
         columns: one test per actuator.
         moving: sensors whose output has a memory that white sensor noise has not; a dead sensor has none.
+        least_order: order that a healthy plant would show at least on this window; a weak mode may go unseen.
     """
 
     experiment: int
@@ -65,6 +69,11 @@ class WindowVerdict:
     rows: tuple[ZeroTest, ...]
     columns: tuple[ZeroTest, ...]
     moving: frozenset[str] = frozenset()
+    least_order: int = 0
+
+    def changed(self, nominal: int) -> bool:
+        """Whether the order is another one than a healthy plant of the nominal order would show."""
+        return self.order is not None and not min(self.least_order, nominal) <= self.order <= nominal
 
     @property
     def dead(self) -> tuple[str, ...]:
@@ -110,7 +119,7 @@ class HardOver:
         """The first window with a dead row or column, or the second in a row with another order."""
         before = None
         for verdict in self.windows:
-            changed = verdict.order is not None and verdict.order != self.nominal_order
+            changed = verdict.changed(self.nominal_order)
             if verdict.dead or changed and before == verdict.experiment:
                 return verdict
             before = verdict.experiment if changed else None
@@ -155,6 +164,9 @@ class HardOver:
                 words += f"One of {', '.join(dead)} is dead; rank alone does not say which."
             if isolated is not None and isolated is not at:
                 words += f" That showed with the window of samples {isolated.start} to {isolated.stop - 1}."
+        least = min((v.least_order for v in self.windows if v.order is not None), default=self.nominal_order)
+        if least < self.nominal_order:
+            words += f" Modes are so weak that an order of {least} may be that of a healthy plant."
         if self.untestable:
             words += f" Untestable for lack of excitation: {', '.join(self.untestable)}."
         if self.instruments == "inputs+past":
@@ -196,9 +208,10 @@ class _Layout:
 
 @dataclass(frozen=True, eq=False)
 class _Healthy:
-    """What a healthy record shows: sizes, excitation and coefficients."""
+    """What a healthy record shows: order, coefficients of all outputs, sizes, excitation, coefficients of the tests."""
 
     order: int
+    outputs: Array
     sizes: Array
     excitation: float
     rows: tuple[Array, ...]
@@ -300,10 +313,12 @@ def _reference(
     if excitation < 1e-10:
         raise RankError(f"the inputs of the healthy record do not excite {2 * alpha} block rows (smallest eigenvalue "
                         f"{excitation:.1e}): use richer inputs or fewer block rows.")
+    z, phi, y = _positions(statistics, layout, instruments)
     if order is None:
-        order, _ = _order(statistics, layout, sizes, instruments, LEVEL)
+        order = _rank(statistics, z, phi, y, layout, sizes, LEVEL).order
     rows, columns, _ = _tests(statistics, layout, data, sizes, None, LEVEL)
-    return _Healthy(order, sizes, excitation, tuple(t for _, t in rows), tuple(t for _, t in columns))
+    return _Healthy(order, coefficients(statistics, z, y), sizes, excitation, tuple(t for _, t in rows),
+                    tuple(t for _, t in columns))
 
 
 def _judged(
@@ -321,28 +336,37 @@ def _judged(
     every = statistics.at(layout.all, range(2 * alpha))
     excitation = smallest_excitation(statistics, every, nominal.sizes[every]) / nominal.excitation
     rows, columns, moving = _tests(statistics, layout, data, nominal.sizes, nominal, level)
-    order, note = None, f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
+    order, least, note = None, 0, f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
     if excitation >= STILL:
+        z, phi, y = _positions(statistics, layout, instruments)
         try:
-            order, note = _order(statistics, layout, nominal.sizes, instruments, level)
+            test = _rank(statistics, z, phi, y, layout, nominal.sizes, level)
         except RankError as error:
             note = f"untestable: {error}"
+        else:
+            order, note = test.order, test.reason
+            least = least_order(statistics, z, phi, nominal.outputs, test, nominal.order, nominal.sizes[y])
     return WindowVerdict(*place, order, note, excitation, tuple(t for t, _ in rows), tuple(t for t, _ in columns),
-                         moving)
+                         moving, least)
 
 
-def _order(
-    statistics: HankelStatistics, layout: _Layout, sizes: Array, instruments: str, level: float
-) -> tuple[int, str]:
+def _positions(statistics: HankelStatistics, layout: _Layout, instruments: str
+               ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Instruments, regressors and outputs of the order test."""
     alpha, at = layout.alpha, statistics.at
     z = [np.zeros(1, dtype=np.intp), at(layout.all, range(2 * alpha))]
     if instruments == "inputs+past":
         z.append(at(layout.y, range(alpha)))
-    phi = np.concatenate([[0], at(layout.all, range(alpha, 2 * alpha))])
-    y = at(layout.y, range(alpha, 2 * alpha))
-    test = rank_test(statistics, np.concatenate(z), phi, y, rows=2 * alpha, level=level,
-                     largest=(alpha - 1) * layout.l, scale=sizes[y])
-    return test.order, test.reason
+    phi = np.concatenate([np.zeros(1, dtype=np.intp), at(layout.all, range(alpha, 2 * alpha))])
+    return np.concatenate(z), phi, at(layout.y, range(alpha, 2 * alpha))
+
+
+def _rank(
+    statistics: HankelStatistics, z: Positions, phi: Positions, y: NDArray[np.intp], layout: _Layout, sizes: Array,
+    level: float,
+) -> RankTest:
+    return rank_test(statistics, z, phi, y, rows=2 * layout.alpha, level=level, largest=(layout.alpha - 1) * layout.l,
+                     scale=sizes[y])
 
 
 def _tests(
