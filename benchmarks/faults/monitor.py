@@ -1,9 +1,10 @@
 """The monitor on streams of the standard plant: delay, isolation, and inputs that stand still.
 
 Every stream has its fault at sample 300; the delay is the number of samples after the onset at which the alarm comes.
-The candidate named so many samples after the alarm is the one isolated by then, or else the one with the largest gain. Goals: hard-over actuators within
-5 samples on average and 10 in 95 % of streams, named rightly 10 samples later in 99 %; losses of 30 % within 8 (act1)
-and 16 (act2), of 10 % (act1) within 25; no more false alarms than asked for while the inputs stand still.
+The candidate named so many samples after the alarm is the one isolated by then, or else the one with the largest gain.
+Goals: hard-over actuators within 5 samples on average and 10 in 95 % of streams, named rightly 10 samples later in
+99 %; losses of 30 % within 8 (act1) and 16 (act2), of 10 % (act1) within 25; no more false alarms than asked for while
+the inputs stand still.
 
     python benchmarks/faults/monitor.py [--runs 240]
 """
