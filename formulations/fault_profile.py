@@ -103,7 +103,6 @@ def _changing(problem: CourseProblem, prior: str, shares: Sequence[float], rules
             failed = failed or f"{prior} at {share:.2g}: {solution.status}, {solution.reason}"
             continue
         gaps.append(solution.gap)
-        program = replace(program, start={name: solution.values[name] for name in program.start})
         sizes = np.abs(np.ravel(solution.values["changes"])) * np.linalg.norm(columns, axis=0)
         support = np.flatnonzero(sizes > 1e-5 * max(float(sizes.max()), 1e-3 * float(np.linalg.norm(problem.r))))
         kept = problem.pruned(columns, support) if support.size else support
@@ -137,8 +136,9 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
     return Program(
         f"fault.profile {prior}", cp.Minimize(0.5 * cp.sum_squares(residual) + level * cp.norm1(changes)),
         {"residual": (residual == misfit,)}, {"changes": changes, "residual": residual},
-        {"changes": np.zeros((count, 1))}, dict, view, structural=frozenset({"residual"}), parameters={"lambda": level},
-        derived={"residual": misfit}, group=form, certify=certify, scale=0.5 * float(problem.r @ problem.r))
+        {"changes": _one(columns, problem.r)[:, None]}, dict, view, structural=frozenset({"residual"}),
+        parameters={"lambda": level}, derived={"residual": misfit}, group=form, certify=certify,
+        scale=0.5 * float(problem.r @ problem.r))
 
 
 def _refit(problem: CourseProblem, shapes: np.ndarray, prior: str, rules: Sequence[Any]) -> Program:
@@ -150,7 +150,7 @@ def _refit(problem: CourseProblem, shapes: np.ndarray, prior: str, rules: Sequen
     misfit: Any = problem.r - (columns / sizes) @ scaled if shapes.shape[1] else cp.Constant(problem.r)
     course: Any = (shapes / sizes) @ scaled if shapes.shape[1] else cp.Constant(np.zeros(problem.count))
     variables = {"scaled": scaled, "residual": residual} if shapes.shape[1] else {"residual": residual}
-    start = {"scaled": np.zeros(shapes.shape[1])} if shapes.shape[1] else {}
+    start = {"scaled": problem.refitted(columns / sizes)[0]} if shapes.shape[1] else {}
     changes: Any = cp.multiply(1 / sizes, scaled) if shapes.shape[1] else cp.Constant(np.zeros(1))
     program = Program(
         f"fault.profile {prior} refit", cp.Minimize(0.5 * cp.sum_squares(residual)),
@@ -214,14 +214,23 @@ def smooth_programme(problem: CourseProblem) -> Program:
     root = cp.Parameter(nonneg=True, name="root of rho", value=1.0)
     misfit = problem.r - problem.matrix @ f
     rough = cp.Variable(problem.count, name="rough")
+    steps_seen = problem.matrix @ problem.shapes("tv")
     steps: Any = root * (f - cp.hstack([np.zeros(1), f[:-1]]))
     return Program(
         "fault.profile smooth", cp.Minimize(0.5 * cp.sum_squares(residual) + 0.5 * cp.sum_squares(rough)),
         {"residual": (residual == misfit,), "roughness": (rough == steps,)},
-        {"f": f, "residual": residual, "rough": rough}, {"f": np.zeros(problem.count)}, dict,
+        {"f": f, "residual": residual, "rough": rough}, {"f": problem.shapes("tv") @ _one(steps_seen, problem.r)}, dict,
         View({"f": f, "changes": f - cp.hstack([np.zeros(1), f[:-1]])}, kind="profile"),
         structural=frozenset({"residual", "roughness"}), parameters={"root of rho": root},
         derived={"residual": misfit, "rough": steps}, scale=0.5 * float(problem.r @ problem.r))
+
+
+def _one(columns: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The one change that explains most: a start, and the size that is usual."""
+    sizes = np.linalg.norm(columns, axis=0)
+    along = np.where(sizes > 0, columns.T @ r / np.where(sizes > 0, sizes, 1.0), 0.0)
+    best = int(np.argmax(np.abs(along)))
+    return np.where(np.arange(sizes.size) == best, along / np.where(sizes > 0, sizes, 1.0), 0.0)
 
 
 def _rules(sign: str | None, limit: float | None, slew: float | None) -> list[Any]:

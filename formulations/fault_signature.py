@@ -84,10 +84,19 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
     return Program(
         "fault.signature", cp.Minimize(0.5 * cp.sum_squares(residual) + level * norms),
         {"residual": (residual == misfit,)}, {**variables, "residual": residual},
-        {name: np.zeros(a.shape) for name, a in variables.items()}, dict,
+        {name: _alone(atom, r) for name, atom in zip(variables, atoms)}, dict,
         View({**variables, **sizes}, kind="signature"),
         structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, group=form,
         certify=partial(certify), scale=0.5 * float(r @ r))
+
+
+def _alone(atom: Atoms, r: np.ndarray) -> np.ndarray:
+    """What every candidate would be if it were alone, at its best onset: a start, and the size that is usual."""
+    along = np.einsum("tkd,k->td", atom.axes, r)
+    best = int(np.argmax(np.sum(along**2, axis=1)))
+    start = np.zeros_like(along)
+    start[best] = along[best]
+    return start
 
 
 def _lengths(a: cp.Variable) -> Any:

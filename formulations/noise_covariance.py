@@ -71,7 +71,8 @@ def places_programme(problem: CovarianceProblem) -> Program:
     return Program(
         "fault.noise_covariance", cp.Minimize(0.5 * cp.sum_squares(residual)),
         {"residual": (residual == misfit,), "variances": (scaled >= 0,)}, {"scaled": scaled, "residual": residual},
-        {"scaled": np.zeros(sizes.size)}, dict, view, structural=frozenset({"residual", "variances"}),
+        {"scaled": np.maximum((problem.signatures / sizes).T @ problem.target, 1.0)}, dict, view,
+        structural=frozenset({"residual", "variances"}),
         derived={"residual": misfit}, scale=0.5 * float(problem.target @ problem.target))
 
 
@@ -88,7 +89,7 @@ def full_programme(problem: CovarianceProblem) -> Program:
     return Program(
         "fault.noise_covariance full", cp.Minimize(0.5 * cp.sum_squares(residual)),
         {"residual": (residual == misfit,), "process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)},
-        {"Q": Q, "R": R, "residual": residual}, {"Q": np.zeros((n, n)), "R": np.zeros((l, l))}, dict,
+        {"Q": Q, "R": R, "residual": residual}, {"Q": np.eye(n), "R": np.eye(l)}, dict,
         View({"Q": process, "R": sensor}, kind="covariance"),
         structural=frozenset({"residual", "process covariance", "sensor covariance"}), derived={"residual": misfit},
         scale=0.5 * float(problem.target @ problem.target))

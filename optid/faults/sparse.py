@@ -67,8 +67,8 @@ class SparseResult:
 
     @property
     def alarm(self) -> bool:
-        """Whether something is active."""
-        return bool(self.active)
+        """Whether zero is not the optimum: exactly where the search alarms, whatever the tolerance of the solver."""
+        return bool(self.active) if self.constrained else self.largest > self.penalty
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ class SparseResult:
     def __str__(self) -> str:
         """Print what is active, the gap and what is ruled out."""
         zero = sum(int(mask.sum()) for mask in self.provably_zero.values())
-        tested = "certified" if self.certified else f"not certified: {self.status}"
+        tested = "certified" if self.certified else "not certified"
         lines = [f"group-sparse programme, penalty {self.penalty:g}: "
                  f"{len(self.active)} groups active in {len(self.clusters)} clusters",
                  f"relative duality gap {self.gap:.1e} ({tested}); {zero} groups are zero for certain"]
@@ -113,4 +113,6 @@ class SparseResult:
             lines.append(f"  {group.label[:50]:<52}{group.onset:>6}   deflection {group.deflection:.3g}")
         if len(self.active) > 12:
             lines.append(f"  and {len(self.active) - 12} more")
+        if not self.certified:
+            lines.append(f"  {self.status}"[:80])
         return "\n".join([*lines, "Magnitudes are shrunk: the exact search over these onsets answers."])

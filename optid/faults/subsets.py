@@ -109,8 +109,8 @@ class SubsetSearch:
         after = "none" if self.runner_up is None else format(self.runner_up.gain, ".2f")
         lines.append(f"gain {self.gain:.2f}, next choice of candidates {after}")
         share = f"{int(self.searched.sum())} of {self.searched.size} onsets"
-        how = "all" if self.sparse is None else f"chosen by a programme with relative gap {self.sparse.gap:.1e}"
-        return "\n".join([*lines, f"{self.subsets} subsets of {share} compared ({how})"])
+        how = "" if self.sparse is None else f", chosen by a programme (gap {self.sparse.gap:.1e})"
+        return "\n".join([*lines, f"{self.subsets} subsets at {share}{how}"])
 
 
 def polish(

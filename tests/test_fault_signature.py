@@ -1,0 +1,343 @@
+"""Several faults at once: the group-sparse programme, its proof and its solvers, the exact search near its onsets."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from fault_plants import levels
+from test_fault_injection import small
+
+from optid import Data
+from optid.backends import Answer, BackEnd, find
+from optid.errors import LookupFailed, StructureError
+from optid.faults import (
+    Fault,
+    dictionary,
+    inject,
+    model_uncertainty,
+    pairs,
+    polish,
+    scan,
+    signature_estimate,
+    thresholds,
+    whiten,
+)
+from optid.faults.atoms import atoms_of, signatures
+from optid.registry import fault_formulation
+from optid.solution import Status
+from optid.solving import solve
+
+LOAD = np.array([0.3, -0.2, 0.5])
+N = 40
+
+
+@pytest.fixture(scope="module")
+def found():
+    return dictionary(small(), process={"load": LOAD})
+
+
+@pytest.fixture(scope="module")
+def limits(found):
+    return thresholds(found, N, draws=5000)
+
+
+def window(found, seed, faults=(), missing=0.0, **how):
+    u = levels(N, seed)
+    y = inject(found.model, u, faults, seed=seed, process={"load": LOAD})
+    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
+    return whiten(found.model, Data(u, y), x0="zero", **how), u
+
+
+def two(found, seed=1, **how):
+    faults = [Fault.step("sensor:y1", 10, 0.9), Fault.step("actuator:u2", 25, 1.5)]
+    return scan(found, window(found, seed, faults, **how)[0])
+
+
+# -- atoms ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+def test_atoms_explain_what_the_scan_says(found, limits, missing):
+    s = two(found, missing=missing)
+    for atom in atoms_of(s, limits):
+        row = s.statistic[s.index(atom.label)][atom.onsets]
+        energy = np.sum(np.einsum("tkd,k->td", atom.axes, s.whitened.r.ravel()) ** 2, axis=1)
+        np.testing.assert_allclose(energy, row, rtol=1e-6, atol=1e-9)
+        dense = np.stack([s.signature(atom.label, int(k)) for k in atom.onsets])
+        np.testing.assert_allclose(signatures(s, atom.label, atom.onsets), dense, atol=1e-10)
+
+
+def test_atoms_of_losses_and_of_an_uncertain_model(found):
+    u, u2 = levels(400, 9), levels(N, 4)
+    model = found.model
+    uncertain = model_uncertainty(model, Data(u, inject(model, u, seed=9)))
+    y = inject(model, u2, Fault.loss("actuator:u1", 15, 0.5), seed=4)
+    lossy = dictionary(model, kinds=["bias", "loss"])
+    s = scan(lossy, whiten(model, Data(u2, y), uncertainty=uncertain), u2)
+    for atom in atoms_of(s, thresholds(lossy, N, u=u2, draws=5000)):
+        row = s.statistic[s.index(atom.label)][atom.onsets]
+        energy = np.sum(np.einsum("tkd,k->td", atom.axes, s.whitened.r.ravel()) ** 2, axis=1)
+        np.testing.assert_allclose(energy, row, rtol=1e-5, atol=1e-8)
+
+
+# -- the programme -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_something_is_active_exactly_when_the_search_alarms(found, limits, seed):
+    size = 0.1 * seed
+    s = scan(found, window(found, seed, [Fault.step("sensor:y2", 15, size)] if seed else [])[0])
+    result = signature_estimate(s, limits)
+    q = limits.of(found.labels)[:, None]
+    assert result.certified and result.alarm == bool(np.nanmax(s.gains(limits)) > 0)
+    assert result.largest == pytest.approx(np.sqrt(np.nanmax(s.statistic / q)), rel=1e-9)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+def test_own_solver_and_conic_solvers_agree(found, limits, missing):
+    s = two(found, missing=missing)
+    own = signature_estimate(s, limits)
+    assert own.solver == "block_descent" and own.certified and own.gap <= 1e-9 and own.alarm
+    for solver in ("clarabel", "qoco"):
+        other = signature_estimate(s, limits, solver=solver)
+        assert other.certified and other.gap <= 1e-6
+        assert other.objective == pytest.approx(own.objective, rel=1e-6)
+
+
+@pytest.mark.parametrize("penalty", [0.3, 1.0, 3.0])
+def test_optimality_conditions_group_by_group(found, limits, penalty):
+    s = two(found)
+    atoms, r = atoms_of(s, limits), s.whitened.r.ravel()
+    result = signature_estimate(s, limits, penalty=penalty, settings={"accuracy": 1e-10})
+    fitted = sum((s.signature(label, onset) @ size for (label, onset), size in result.magnitudes.items()),
+                 np.zeros_like(s.whitened.r))
+    u = r - fitted.ravel()
+    for atom in atoms:
+        slopes = np.einsum("tkd,k->td", atom.axes, u)
+        level = penalty * np.sqrt(atom.threshold)
+        assert np.all(np.linalg.norm(slopes, axis=1) <= level * (1 + 1e-5))
+        for t, onset in enumerate(atom.onsets):
+            if (atom.label, int(onset)) in result.magnitudes:
+                assert np.linalg.norm(slopes[t]) == pytest.approx(level, rel=1e-4)
+
+
+def test_groups_ruled_out_are_zero_for_every_solver(found, limits):
+    s = two(found)
+    own = signature_estimate(s, limits)
+    tested = sum(int(np.sum(~np.isnan(row))) for row in s.statistic)
+    assert 0.5 * tested < sum(int(mask.sum()) for mask in own.provably_zero.values()) < tested
+    program = next(fault_formulation("fault.signature")(s, limits))
+    values = solve(program, "clarabel", accuracy=1e-10).values
+    for atom in atoms_of(s, limits):
+        sizes = np.linalg.norm(values[f"a[{atom.label}]"], axis=1)
+        assert np.all(sizes[own.provably_zero[atom.label][atom.onsets]] < 1e-4)
+    for group in own.active:
+        assert not own.provably_zero[group.label][group.onset]
+
+
+def test_user_constraints_bind_and_keep_a_proof(found, limits):
+    s = two(found)
+    free = signature_estimate(s, limits)
+    first = next(group for group in free.active if group.size.size == 1)
+    sign = np.sign(first.size[0])
+    held = signature_estimate(s, limits, constraints=[lambda v: {"falls": sign * v[f"size[{first.label}]"] <= 0}])
+    assert held.certified and held.objective > free.objective * (1 + 1e-4) and held.constrained == ("falls",)
+    assert all(sign * size[0] <= 1e-6 for (label, _), size in held.magnitudes.items() if label == first.label)
+    assert held.bound <= held.objective and held.gap < 1e-6
+    assert not any(mask.any() for mask in held.provably_zero.values())
+    loose = signature_estimate(s, limits, constraints=[lambda v: {"rises": v["size[sensor:y1]"] >= -9}])
+    assert loose.objective == pytest.approx(free.objective, rel=1e-6)
+    with pytest.raises(StructureError, match="takes no further constraints"):
+        signature_estimate(s, limits, solver="block_descent", constraints=[lambda v: v["size[sensor:y1]"] <= 0])
+
+
+def test_sizes_are_in_the_units_of_the_fault(found, limits):
+    s = two(found)
+    program = next(fault_formulation("fault.signature")(s, limits))
+    atoms = {atom.label: atom for atom in atoms_of(s, limits)}
+    rng = np.random.default_rng(0)
+    for name, variable in program.variables.items():
+        if name.startswith("a["):
+            variable.value = rng.normal(size=variable.shape)
+    for label in ("sensor:y1", "state"):
+        a, size = program.view[f"a[{label}]"].value, program.view[f"size[{label}]"].value
+        t = 7
+        onset = int(atoms[label].onsets[t])
+        left = (s.signature(label, onset) @ size[t]).ravel()
+        np.testing.assert_allclose(left, atoms[label].axes[t] @ a[t], atol=1e-9)
+
+
+# -- solvers that lie or fail --------------------------------------------------------------------------------------
+
+
+def liar(shift):
+    """A back end that claims success at a point beside the optimum."""
+    def run(program, settings):
+        answer = find("block_descent").run(program, settings)
+        moved = {name: value + shift for name, value in answer.values.items()}
+        return Answer(Status.OPTIMAL, "optimal", moved, answer.duals)
+
+    return BackEnd("liar", frozenset({"group-sparse"}), run)
+
+
+def test_a_solver_that_lies_is_not_believed(found, limits):
+    s = two(found)
+    result = signature_estimate(s, limits, solver=liar(0.05))
+    assert not result.certified and "bound is not reached" in result.status
+    assert not any(mask.any() for mask in result.provably_zero.values())
+    assert not polish(s, limits, result).certified
+
+
+def test_lying_multipliers_give_no_false_bound(found, limits):
+    s = two(found)
+    truth = signature_estimate(s, limits).objective
+
+    def run(program, settings):
+        answer = find("block_descent").run(program, settings)
+        for wild in (1e6, -3.0, np.nan):
+            answer = replace(answer, duals={"residual": wild * answer.duals["residual"]})
+        return answer
+
+    result = signature_estimate(s, limits, solver=BackEnd("wild", frozenset({"group-sparse"}), run))
+    assert result.certified and result.bound <= truth * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("answer", [
+    Answer(Status.FAILED, "out of memory"), Answer(Status.OPTIMAL, "optimal"), Answer(Status.INFEASIBLE, "infeasible"),
+    Answer(Status.OPTIMAL, "optimal", {"residual": np.zeros(2 * N)})])
+def test_a_solver_without_a_point_gives_no_certificate(found, limits, answer):
+    s = two(found)
+    result = signature_estimate(s, limits, solver=BackEnd("none", frozenset({"group-sparse"}), lambda *_: answer))
+    assert not result.certified and not result.active and result.status and np.isinf(result.gap)
+    search = polish(s, limits, result)
+    assert search.best is None and not search.certified
+    assert "not certified" in str(result) and max(map(len, str(result).splitlines())) <= 80
+
+
+def test_a_solver_that_raises_is_an_outcome(found, limits):
+    def run(program, settings):
+        raise ZeroDivisionError("boom")
+
+    result = signature_estimate(two(found), limits, solver=BackEnd("bad", frozenset({"group-sparse"}), run))
+    assert not result.certified and "boom" in result.status
+
+
+# -- the exact search near the onsets ------------------------------------------------------------------------------
+
+
+def dense_gain(s, limits, members):
+    r = s.whitened.r.ravel()
+    G = np.concatenate([s.signature(label, onset).reshape(r.size, -1) for label, onset in members], axis=1)
+    fitted = G @ np.linalg.lstsq(G, r, rcond=1e-9)[0]
+    return fitted @ fitted - sum(limits.q[found_index(s, label)] for label, _ in members)
+
+
+def found_index(s, label):
+    return s.labels.index(label)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+def test_all_onsets_give_what_all_pairs_give(found, limits, missing):
+    s = two(found, missing=missing)
+    search, exact = polish(s, limits), pairs(s, limits)
+    assert exact.best is not None and search.gain == pytest.approx(max(exact.gain, exact.single), rel=1e-8)
+    assert sorted(zip(search.best.labels, search.best.onsets)) == sorted(zip(exact.best.labels, exact.best.onsets))
+    for subset in search.ranked:
+        if len(subset.labels) == 2:
+            i, j = sorted(found_index(s, label) for label in subset.labels)
+            assert subset.gain == pytest.approx(exact.gains[i, j], rel=1e-7, abs=1e-7)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_equal_to_brute_force_over_all_subsets(found, limits, size):
+    u = levels(N, 2)
+    faults = [Fault.step("sensor:y1", 12, 0.5), Fault.jump("state", 20, [0.8, -0.8, 0.4]),
+              Fault.step("actuator:u1", 28, 0.8)]
+    s = scan(found, whiten(found.model, Data(u, inject(found.model, u, faults, seed=2)), x0="zero"),
+             onsets=[11, 12, 20, 28])
+    search = polish(s, limits, max_faults=size)
+    atoms = [(label, k) for label in found.labels for k in (11, 12, 20, 28)
+             if not np.isnan(s.statistic[found_index(s, label), k])]
+    values = {members: dense_gain(s, limits, members) for k in range(1, size + 1) for members in combinations(atoms, k)}
+    best = max(values, key=lambda members: values[members])
+    assert search.gain == pytest.approx(values[best], rel=1e-7)
+    assert set(zip(search.best.labels, search.best.onsets)) == set(best)
+    by_labels = {}
+    for members, value in values.items():
+        key = tuple(sorted(label for label, _ in members))
+        by_labels[key] = max(by_labels.get(key, -np.inf), value)
+    for subset in search.ranked:
+        assert subset.gain == pytest.approx(by_labels[tuple(sorted(subset.labels))], rel=1e-6, abs=1e-6)
+    others = [v for key, v in by_labels.items() if key != tuple(sorted(search.best.labels))]
+    assert search.runner_up.gain == pytest.approx(max(others), rel=1e-6) and search.margin >= 0
+
+
+def test_magnitudes_are_least_squares_and_two_faults_are_found(found, limits):
+    s = two(found)
+    search = polish(s, limits, signature_estimate(s, limits))
+    assert search.best.labels == ("actuator:u2", "sensor:y1") and search.certified
+    assert np.all(np.abs(np.array(search.best.onsets) - [25, 10]) <= 2)
+    nu, covariance = search.estimate(search.best)
+    assert np.all(np.abs(nu - [1.5, 0.9]) < 5 * np.sqrt(np.diag(covariance)))
+    members = zip(search.best.labels, search.best.onsets)
+    flat = np.concatenate([s.signature(a, k).reshape(2 * N, -1) for a, k in members], axis=1)
+    np.testing.assert_allclose(nu, np.linalg.lstsq(flat, s.whitened.r.ravel(), rcond=None)[0], rtol=1e-6)
+    assert search.searched.sum() < N
+    for text in (str(search), str(search.best), str(signature_estimate(s, limits))):
+        assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_mixed_integer_programme_agrees_on_a_tiny_grid(found, limits):
+    """The same optimum by branch and bound with binaries, on a grid small enough for it."""
+    if "SCIP" not in cp.installed_solvers():
+        pytest.skip("SCIP is not installed")
+    s = scan(found, two(found).whitened, onsets=[9, 10, 11, 24, 25, 26])
+    search = polish(s, limits)
+    atoms, r = [a for a in atoms_of(s, limits) if a.dimension == 1], s.whitened.r.ravel()
+    Q = np.hstack([a.axes[:, :, 0].T for a in atoms])
+    q = np.concatenate([np.full(a.onsets.size, a.threshold) for a in atoms])
+    a, z = cp.Variable(q.size), cp.Variable(q.size, boolean=True)
+    big = 2 * np.linalg.norm(r)
+    problem = cp.Problem(cp.Minimize(cp.sum_squares(r - Q @ a) + q @ z), [cp.abs(a) <= big * z, cp.sum(z) <= 2])
+    problem.solve(solver="SCIP", scip_params={"limits/time": 60.0, "limits/gap": 1e-7})
+    scalar = [x for x in search.ranked if "state" not in x.labels]
+    assert float(r @ r) - problem.value == pytest.approx(scalar[0].gain, rel=1e-5)
+
+
+# -- bad input -----------------------------------------------------------------------------------------------------
+
+
+def test_bad_input(found, limits):
+    s = two(found)
+    for penalty in (0.0, -1.0, np.nan):
+        with pytest.raises(StructureError, match="penalty="):
+            signature_estimate(s, limits, penalty=penalty)
+    with pytest.raises(StructureError, match="other candidates"):
+        signature_estimate(s, replace(limits, labels=limits.labels[::-1]))
+    with pytest.raises(StructureError, match="has no threshold"):
+        signature_estimate(s, replace(limits, q=np.full(len(limits.q), np.nan)))
+    for most in (0, 1.5, -1):
+        with pytest.raises(StructureError, match="max_faults="):
+            polish(s, limits, max_faults=most)
+    with pytest.raises(StructureError, match="too many for an exact search"):
+        polish(s, limits, max_faults=6)
+    with pytest.raises(LookupFailed, match="fault.signature"):
+        fault_formulation("fault.signatur")
+    with pytest.raises(StructureError, match="not convex"):
+        signature_estimate(s, limits, constraints=[lambda v: cp.norm(v["size[sensor:y1]"]) >= 1])
+    with pytest.raises(StructureError, match="no fault|none|does not have|asks for"):
+        signature_estimate(s, limits, constraints=[lambda v: v["size[sensor:y9]"] >= 1])
+    wide = replace(s, statistic=np.zeros((len(found.labels), 100_000)))
+    with pytest.raises(StructureError, match="shorter window"):
+        atoms_of(wide, limits)
+
+
+def test_a_healthy_window_gives_nothing(found, limits):
+    s = scan(found, window(found, 3)[0])
+    result = signature_estimate(s, limits)
+    assert not result.alarm and result.clusters == () and not result.near().any()
+    search = polish(s, limits, result)
+    assert search.best is None and search.gain == -np.inf and search.margin == np.inf
+    assert "no fault gains" in str(search)
