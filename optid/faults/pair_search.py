@@ -185,9 +185,9 @@ def _products(prepared: Sweep) -> tuple[Array, Array, Array]:
     from optid.faults.sweep_kernels import grams
 
     n, columns = prepared.tables.F.shape[1], prepared.blocks.group.size
-    products, states = np.zeros((prepared.window, columns, columns)), np.empty((prepared.window, n, columns))
-    grams(prepared.tables, prepared.blocks.group, True, products, states)
-    return products, states, prepared.along()
+    products, states = np.zeros((prepared.window, columns**2)), np.empty((prepared.window, n, columns))
+    grams(prepared.tables, prepared.blocks.group, np.arange(columns**2).reshape(columns, columns), products, states)
+    return products.reshape(-1, columns, columns), states, prepared.along()
 
 
 def _pair(labels: tuple[str, ...], gains: Array, onsets: np.ndarray, q: Array, i: int, j: int) -> Pair | None:

@@ -57,17 +57,18 @@ def correlate(tables, r, found):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def grams(tables, group, whole, products, states):
+def grams(tables, group, slots, products, states):
     """Products of the signatures of columns with the same onset, for all onsets, by one backward sweep.
 
     Args:
         tables: `optid.faults.sweeps.Tables`.
-        group: (D,) candidate of a column; products between groups are computed only if `whole`.
-        whole: whether they are.
-        products: (N, D, D) written.
-        states: (N, n, D) product of a column with what a unit state at its onset leaves, written if `whole`; (1, n, D)
-            otherwise.
+        group: (D,) candidate of a column; products between groups are computed only where states are wanted.
+        slots: (D, D) where in a row of products that of two columns is written; -1 for nowhere.
+        products: (N, R) written.
+        states: (N, n, D) product of a column with what a unit state at its onset leaves, written; (0, n, D) where it is
+            not wanted.
     """
+    whole = states.shape[0] > 0
     of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, n, columns, l = of.size, F.shape[1], h.shape[2], C.shape[0]  # noqa: E741
@@ -125,7 +126,8 @@ def grams(tables, group, whole, products, states):
                     for a in range(n):
                         total += e[t, a, i] * pushed[a, j] + carried[a, i] * e[t, a, j]
                     H[i, j] = total
-                    products[k, i, j] = total
+                    if slots[i, j] >= 0:
+                        products[k, slots[i, j]] = total
         for i in range(n):
             for j in range(columns):
                 P[i, j] = 0.0

@@ -237,18 +237,22 @@ def _prepared(
     blocks, tables = _tables(found, window, steady, present, u, able)
     if any(a and c.schedule for a, c in zip(able, found.candidates)):
         tables = _with_schedules(found, steady, blocks, tables, states, u)
-    columns = blocks.group.size
-    products = np.zeros((window, columns, columns))
-    grams(tables, blocks.group, False, products, np.empty((1, tables.F.shape[1], columns)))
-    largest = [_largest(products, blocks, c) for c in range(len(able))]
-    if nuisance is not None:
-        along = _along(tables, nuisance, columns)
-        products -= np.einsum("kqi,kqj->kij", along, along, optimize=True)
-    roots, tested = np.zeros((window, int(np.sum(blocks.sizes**2)))), np.zeros((len(able), window), dtype=bool)
+    columns, size = blocks.group.size, int(np.sum(blocks.sizes**2))
+    slots = np.full((columns, columns), -1, dtype=np.int64)
+    for d, place, begin in zip(blocks.sizes, blocks.places, blocks.first):
+        slots[begin : begin + d, begin : begin + d] = place + np.arange(d * d).reshape(d, d)
+    products = np.zeros((window, size))
+    grams(tables, blocks.group, slots, products, np.empty((0, tables.F.shape[1], columns)))
+    along = None if nuisance is None else _along(tables, nuisance, columns)
+    roots, tested = np.zeros((window, size)), np.zeros((len(able), window), dtype=bool)
     for c, (d, place, begin) in enumerate(zip(blocks.sizes, blocks.places, blocks.first)):
         if d:
-            own = slice(begin, begin + d)
-            root = inverse_roots(products[:, own, own], largest[c])
+            own = products[:, place : place + d * d].reshape(window, d, d)
+            largest = own[:, 0, 0] if d == 1 else np.asarray(np.linalg.eigvalsh(own)[:, -1], dtype=float)
+            if along is not None:
+                part = along[:, :, begin : begin + d]
+                own = own - np.einsum("kqi,kqj->kij", part, part, optimize=True)
+            root = inverse_roots(own, largest)
             roots[:, place : place + d * d] = root.reshape(window, -1)
             tested[c] = np.any(root, axis=(1, 2))
             tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
@@ -264,14 +268,6 @@ def _along(tables: Tables, nuisance: "Nuisance", columns: int) -> Array:
         correlate(tables, np.ascontiguousarray(axis.reshape(window, -1)), one)
         result[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
     return result
-
-
-def _largest(products: Array, blocks: Blocks, c: int) -> Array:
-    """The largest eigenvalue (N,) of the products of a candidate."""
-    own = slice(blocks.first[c], blocks.first[c] + blocks.sizes[c])
-    if not blocks.sizes[c]:
-        return np.zeros(len(products))
-    return np.asarray(np.linalg.eigvalsh(products[:, own, own])[:, -1], dtype=float)
 
 
 def inverse_roots(products: Array, largest: Array) -> Array:
