@@ -59,6 +59,8 @@ class Job:
         fits = ranking.fits if not self.found.unknown or _explains(ranking) else ()
         if alarm and not fits:
             check_channels(model, self.record)
+        if alarm and fits and model.l == 1:
+            notes.append("With one output only faults of a known course can be told apart.")
         verdict = self.verdict(seen, alarm, bool(fits), bool(stuck.faults))
         answers = self.answers(fits, stuck.faults)
         certificate = way.certificate
@@ -88,6 +90,9 @@ class Job:
         unproved = ""
         if self.asked.method == "set":
             found, proved = by_bounds(self.record, seen, self.asked)
+            if proved and not _explains(found.ranking):  # no single fault: what is proved is that something is wrong
+                seen, ranking, note = self.explained(seen, part)
+                return seen, found._replace(ranking=ranking, note=" ".join((found.note, note)).strip()), True
             if proved or not alarm:
                 return seen, found, proved
             unproved = f"{found.note} The answer is that of the exact search."

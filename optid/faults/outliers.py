@@ -59,7 +59,11 @@ def cleaned(found: Dictionary, part: Experiment, whitened_of: Callable[[Experime
     taken: list[tuple[int, int]] = []
     whitened = whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():
-        reading = _wildest(scan(wide, whitened, part.u), len(found.candidates))
+        search = scan(wide, whitened, part.u)
+        reading = _wildest(search, len(found.candidates))
+        if reading is None:  # behind a fault, perhaps
+            rest = scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u)
+            reading = _wildest(rest, len(found.candidates))
         if reading is None:
             break
         taken.append(reading)
@@ -76,6 +80,14 @@ def _wildest(search: Scan, count: int) -> tuple[int, int] | None:
         return None
     o = int(np.flatnonzero(search.dictionary.candidates[c].into_output[:, 0])[0])
     return int(np.argmax(statistic[c])), o
+
+
+def _fitted(search: Scan) -> Array:
+    """What the likeliest candidate leaves in the innovations."""
+    statistic = np.nan_to_num(search.statistic, nan=-np.inf)
+    c = _likeliest(search.dictionary, statistic)
+    candidate, onset = search.dictionary.candidates[c], int(np.argmax(statistic[c]))
+    return np.asarray(search.signature(candidate, onset) @ search.estimate(candidate, onset).nu)
 
 
 def _likeliest(found: Dictionary, statistic: Array) -> int:

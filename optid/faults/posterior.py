@@ -18,7 +18,7 @@ from optid.faults.signatures import Candidate
 if TYPE_CHECKING:
     from optid.faults.scanning import Scan
 
-SPREADS = 9.0, 25.0, 100.0, 400.0
+SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0
 """Squared deflections of the prior."""
 
 NEGLIGIBLE = 18.0
