@@ -243,6 +243,43 @@ def test_what_has_no_signature_is_not_tested():
     assert np.isnan(still.statistic[result.index("actuator:u1 loss")]).all()  # f(0) = 0: nothing to lose
 
 
+def in_closed_loop(model, fault, seed, count=80):
+    """Inputs and readings under a controller: what it does is repeated until it fits the readings it causes."""
+    reference = np.random.default_rng(seed).normal(size=(count, 2))
+    u = np.zeros((count, 2))
+    for _ in range(count + 1):
+        y = inject(model, u, fault, seed=seed)
+        before, u = u, np.zeros((count, 2))
+        for k in range(1, count):
+            u[k] = np.tanh(0.5 * u[k - 1] + 0.3 * (reference[k] - y[k - 1]))
+    np.testing.assert_array_equal(before, u)
+    return Data(u, y)
+
+
+@pytest.mark.parametrize("fault", [(), Fault.step("sensor:y1", 40, 0.8), Fault.jump("state", 50, [1.0, 0.5, -1.0])],
+                         ids=str)
+def test_a_controller_that_is_not_known_changes_nothing(fault):
+    """With the same noise the innovations of open and of closed loop are the same, and so is the search."""
+    model = small()
+    found = dictionary(model, process={"load": LOAD})
+    closed = in_closed_loop(model, fault, 3)
+    loose = whiten(model, Data(levels(80, 9), inject(model, levels(80, 9), fault, seed=3)), x0="zero")
+    strict = whiten(model, closed, x0="zero")
+    np.testing.assert_allclose(strict.r, loose.r, atol=1e-9)
+    np.testing.assert_allclose(scan(found, strict).statistic, scan(found, loose).statistic, atol=1e-8)
+
+
+def test_a_loss_in_closed_loop_is_named():
+    model = small()
+    found = dictionary(model, kinds=["bias", "loss"])
+    data = in_closed_loop(model, Fault.loss("actuator:u2", 40, 0.9), 3)
+    u = data.experiments[0].u
+    result = scan(found, whiten(model, data, x0="zero"), u)
+    gains = result.gains(thresholds(found, 80, u=u, draws=5000))
+    c, onset = np.unravel_index(np.nanargmax(gains), gains.shape)
+    assert gains[c, onset] > 0 and found.labels[c] == "actuator:u2 loss" and abs(onset - 40) <= 4
+
+
 # -- thresholds ------------------------------------------------------------------------------------------------------
 
 
