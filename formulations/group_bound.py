@@ -28,8 +28,8 @@ def certify(program: Program, values: Values, duals: Values) -> tuple[Bound, Non
     problem, residual = form.problem, np.asarray(program.variables[form.residual].value)
     slope, constant = _lagrangian(program, form, duals)
     candidates = [residual]
-    if form.residual in duals:
-        candidates.append(-np.asarray(duals[form.residual], dtype=float))
+    if form.residual in duals and np.size(duals[form.residual]) == residual.size:
+        candidates.append(-np.ravel(np.asarray(duals[form.residual], dtype=float)))
     bounds = [_bound(problem, v, penalty, slope, constant) for v in candidates]
     bounds += [_bound(problem, v, penalty, 0.0 * slope, 0.0) for v in candidates]
     value, point = max(bounds, key=lambda pair: pair[0])
@@ -58,7 +58,7 @@ def _lagrangian(program: Program, form: GroupForm, duals: Values) -> tuple[np.nd
         position = 0
         for member in group:
             length = sum(d.size for d in member.dual_variables)
-            given = np.asarray(duals[name][position : position + length]) if name in duals else np.zeros(0)
+            given = np.ravel(duals[name])[position : position + length] if name in duals else np.zeros(0)
             position += length
             terms = multiplier_terms(member, given) if given.size == length and np.isfinite(given).all() else None
             part = None if terms is None else _affine(terms, program.variables, form)

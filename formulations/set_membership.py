@@ -188,12 +188,12 @@ def _certified(window: BoundedWindow, signature: Signature | None, bounded: Arra
     """Return the factor that the parity vector near the multipliers proves."""
     program.assign(values)
     objective = float(np.asarray(program.objective.expr.value))
-    if "noise" not in duals:
+    if np.size(duals.get("noise", ())) != 2 * bounded.size:
         return Bound(-np.inf, False, "parity", "the solver gave no multipliers"), None
     weights = np.zeros(bounds.size)
     upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
-    if exact.size and "no noise" in duals:
+    if exact.size and np.size(duals.get("no noise", ())) == exact.size:
         weights[exact] = np.asarray(duals["no noise"], dtype=float)
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
     unseen = window.unseen(None, None) if signature is None else window.unseen(signature.state, signature.output)

@@ -83,7 +83,7 @@ class CovarianceMatch:
         """Print what was matched."""
         lines = [f"covariances up to lag {self.lags} matched; relative gap {self.gap:.1e}"]
         if self.Q is None:
-            lines += [f"  {label[:40]:<42}std added {np.sqrt(rho):>9.3g}   explains {gain:>7.2f} sigma"
+            lines += [f"  {label[:32]:<34}std added {np.sqrt(rho):>9.3g}   explains {gain:>7.2f} sigma"
                       for label, rho, gain in zip(self.labels, self.rho, self.gains)]
         else:
             assert self.R is not None

@@ -119,10 +119,10 @@ class WaveformTest:
     def __str__(self) -> str:
         """Print the places, and who is consistent."""
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
-                 f"  {'place':<36}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
+                 f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):
             numbers = f"{place.energy:>12.1f}{place.limit:>9.1f}{place.p_value:>10.2g}"
-            lines.append(f"  {place.name[:35]:<36}{numbers}  {'in the set' if place.consistent else 'ruled out'}"[:80])
+            lines.append(f"  {place.name[:33]:<34}{numbers}  {'in the set' if place.consistent else 'ruled out'}"[:80])
         lines += [f"  not tested: {label[:24]}, {why}"[:80] for label, why in self.untested.items()]
         return "\n".join([*lines, *map(str, self.flat)])
 
@@ -156,9 +156,9 @@ def waveform_test(
     untested: dict[str, str] = {}
     for candidate in found.candidates:
         if candidate.kind == "noise":
-            untested[candidate.label] = "noise has no course: test its covariance (noise_test)"
+            untested[candidate.label] = "noise has no course (see noise_test)"
         elif candidate.into_state.shape[1] >= found.model.l:
-            untested[candidate.label] = "a course in as many directions as outputs explains any window"
+            untested[candidate.label] = "as many directions as outputs explain anything"
         else:
             place = next((name for name, others in columns.items() if same_place(others[0], candidate)), None)
             columns.setdefault(place or " | ".join(candidate.places), []).append(candidate)

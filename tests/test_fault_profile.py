@@ -1,0 +1,151 @@
+"""The course of a fault: programmes that are optimal, courses that are right, constraints that hold."""
+
+import numpy as np
+import pytest
+from fault_plants import levels
+from scipy.optimize import nnls
+from test_fault_injection import small
+
+from formulations.fault_profile import profile_programme, smooth_programme
+from optid import Data
+from optid.backends import Answer, BackEnd
+from optid.errors import DataError, SolverFailed, StructureError
+from optid.faults import Fault, dictionary, inject, profile, scan, whiten
+from optid.faults.profiles import course_problem
+from optid.solution import Status
+from optid.solving import solve
+
+LOAD = np.array([0.3, -0.2, 0.5])
+N = 60
+
+
+@pytest.fixture(scope="module")
+def found():
+    return dictionary(small(), process={"load": LOAD}, kinds=["bias", "loss", "stuck", "noise"])
+
+
+def search(found, faults, seed=1, missing=0.0):
+    u = levels(N, seed)
+    y = inject(found.model, u, faults, seed=seed, process={"load": LOAD})
+    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
+    return scan(found, whiten(found.model, Data(u, y), x0="zero"), u)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+@pytest.mark.parametrize("fault, label, prior, course", [
+    (Fault.step("sensor:y1", 20, 1.5), "sensor:y1", "tv", 1.5 * (np.arange(N) >= 20)),
+    (Fault.step("sensor:y2", 20, 1.5, end=40), "sensor:y2", "tv",
+     1.5 * ((np.arange(N) >= 20) & (np.arange(N) < 40))),
+    (Fault.ramp("sensor:y1", 20, 0.1), "sensor:y1", "trend", 0.1 * np.maximum(np.arange(N) - 19, 0)),
+    (Fault.loss("actuator:u1", 20, 0.9), "actuator:u1 loss", "tv", 0.9 * (np.arange(N) >= 20))])
+def test_courses_are_found_and_the_prior_is_chosen(found, fault, label, prior, course, missing):
+    result = profile(search(found, fault, missing=missing), label)
+    assert result.prior == prior and result.certified and result.gap < 1e-6
+    assert result.bic[prior] == min(result.bic.values()) and set(result.bic) == {"tv", "trend"}
+    error = np.linalg.norm(result.course - course) / np.linalg.norm(course)
+    assert error < 0.25 and len(result.changes) <= 4
+    k, sigma = np.arange(N) >= 45, result.std
+    assert np.all(np.abs(result.course - course)[k] < 6 * sigma[k] + 1e-12)
+    assert max(map(len, str(result).splitlines())) <= 80
+
+
+@pytest.mark.parametrize("prior", ["tv", "trend"])
+def test_own_solver_agrees_with_clarabel_and_the_conditions_hold(found, prior):
+    problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1")
+    program = profile_programme(problem, prior)
+    own, other = (solve(program, solver, accuracy=1e-9) for solver in ("block_descent", "clarabel"))
+    assert own.proof and other.proof and other.objective == pytest.approx(own.objective, rel=1e-6)
+    columns = problem.matrix @ problem.shapes(prior)
+    penalty = float(program.parameters["lambda"].value)
+    slopes = columns.T @ (problem.r - columns @ own.values["changes"][:, 0])
+    assert np.all(np.abs(slopes) <= penalty * (1 + 1e-4))
+    active = np.abs(own.values["changes"][:, 0]) > 1e-7
+    np.testing.assert_allclose(np.abs(slopes[active]), penalty, rtol=1e-4)
+
+
+def test_the_random_walk_is_the_smoother(found):
+    problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1")
+    program = smooth_programme(problem)
+    program.parameters["root of rho"].value = 3.0
+    D = np.eye(N) - np.eye(N, k=-1)
+    known = np.linalg.solve(problem.matrix.T @ problem.matrix + 9 * D.T @ D, problem.matrix.T @ problem.r)
+    np.testing.assert_allclose(solve(program).values["f"], known, atol=1e-6)
+    result = profile(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1", "smooth")
+    assert result.prior == "smooth" and result.certified and 1 < result.freedom < N
+    assert np.linalg.norm(result.course - 1.0 * (np.arange(N) >= 20)) < 0.4 * np.sqrt(40)
+
+
+def test_constraints_hold_and_cost(found):
+    s = search(found, Fault.step("sensor:y1", 20, 1.5))
+    free = profile(s, "sensor:y1", "tv")
+    for how, holds in (({"sign": "positive"}, lambda f: f.min() >= -1e-7),
+                       ({"sign": "negative"}, lambda f: f.max() <= 1e-7),
+                       ({"limit": 0.7}, lambda f: np.abs(f).max() <= 0.7 + 1e-6),
+                       ({"slew": 0.2}, lambda f: np.abs(np.diff(f, prepend=0.0)).max() <= 0.2 + 1e-6)):
+        held = profile(s, "sensor:y1", "tv", **how)
+        assert held.certified and holds(held.course), how
+        assert held.bic["tv"] >= free.bic["tv"] - 1e-6
+    own = profile(s, "sensor:y1", "tv", constraints=[lambda v: {"late": v["f"][:30] == 0}])
+    assert np.abs(own.course[:30]).max() < 1e-6 and own.constraints == ("late",)
+    assert np.abs(profile(s, "sensor:y1", "tv", sign="negative").course).max() < 1e-6
+
+
+def test_the_refit_under_a_sign_is_non_negative_least_squares(found):
+    s = search(found, Fault.step("sensor:y1", 20, 1.5))
+    held = profile(s, "sensor:y1", "tv", constraints=[lambda v: {"rising": v["changes"] >= 0}])
+    problem = course_problem(s, "sensor:y1")
+    kept = sorted(held.changes)
+    columns = (problem.matrix @ problem.shapes("tv"))[:, kept]
+    np.testing.assert_allclose([held.changes[k] for k in kept], nnls(columns, problem.r)[0], atol=1e-6)
+
+
+def test_a_healthy_window_has_no_course(found):
+    result = profile(search(found, []), "sensor:y1")
+    assert len(result.changes) <= 2 and np.abs(result.course).max() < 0.8
+
+
+def test_pruning_never_worsens_the_criterion(found):
+    rng = np.random.default_rng(0)
+    problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1")
+    columns = problem.matrix @ problem.shapes("tv")
+    for _ in range(20):
+        support = np.sort(rng.choice(N, 12, replace=False))
+        kept = problem.pruned(columns, support)
+        assert set(kept) <= set(support)
+        before, after = (problem.criterion(problem.refitted(columns[:, c])[1], c.size) for c in (support, kept))
+        assert after <= before + 1e-9
+
+
+def test_solvers_that_fail_or_lie(found):
+    s = search(found, Fault.step("sensor:y1", 20, 1.5))
+    classes = frozenset({"QP", "SOCP", "group-sparse"})
+    with pytest.raises(SolverFailed, match="no memory"):
+        profile(s, "sensor:y1", solver=BackEnd("broken", classes, lambda *_: Answer(Status.FAILED, "no memory")))
+
+    def liar(program, settings):
+        values = {name: np.asarray(program.start.get(name, np.zeros(v.shape))) + 0.1
+                  for name, v in program.variables.items()}
+        return Answer(Status.OPTIMAL, "optimal", values, {name: np.zeros(0) for name in program.constraints})
+
+    with pytest.raises(SolverFailed):
+        profile(s, "sensor:y1", solver=BackEnd("liar", classes, liar))
+
+
+def test_bad_input(found):
+    s = search(found, [])
+    for how, words in (({"prior": "wavy"}, "prior="), ({"sign": "up"}, "sign="), ({"limit": 0.0}, "limit="),
+                       ({"slew": np.nan}, "slew="), ({"penalties": []}, "penalties="),
+                       ({"penalties": [-1]}, "penalties=")):
+        with pytest.raises(StructureError, match=words):
+            profile(s, "sensor:y1", **how)
+    for label in ("state", "actuator:u1 stuck"):
+        with pytest.raises(StructureError, match="several magnitudes"):
+            profile(s, label)
+    with pytest.raises(StructureError, match="noise has no course"):
+        profile(s, "sensor:y1 noise")
+    without = scan(found, s.whitened)
+    with pytest.raises(StructureError, match="depends on the input"):
+        profile(without, "actuator:u1 loss")
+    still = scan(found, s.whitened, np.zeros((N, 2)))
+    with pytest.raises(DataError, match="untestable"):
+        profile(still, "actuator:u2 loss")
