@@ -163,23 +163,25 @@ def signatures(t, s, count, clean):
         if clean and course != DRIVEN:
             continue
         for o in range(l):
-            row = c[j * l + o]
-            for a in range(start, W):
+            row = c[j * l + o, start:W]
+            for a in range(count):
                 row[a] = 0.0
             for i in range(n + l):
-                response = source[h + o * n + i] if i < n else source[direct + o * l + i - n]
+                response = source[h + o * n + i if i < n else direct + o * l + i - n, start:W]
                 if course == DRIVEN:
-                    drive = w[dim[S_STATE] + m * n + i] if i < n else w[dim[S_OUTPUT] + m * l + i - n]
+                    drive = w[dim[S_STATE] + m * n + i if i < n else dim[S_OUTPUT] + m * l + i - n, left : left + count]
                     for a in range(count):
-                        row[start + a] += response[start + a] * drive[left + a]
+                        row[a] += response[a] * drive[a]
                 else:
                     weight = t.m[INTO_STATE, i, j] if i < n else t.m[INTO_OUTPUT, i - n, j]
                     if weight != 0.0:
-                        for a in range(start, W):
+                        for a in range(count):
                             row[a] += weight * response[a]
             for _ in range(0 if course == JUMP else 2 if course == DRIFT else 1):
-                for a in range(W - 2, start - 1, -1):
-                    row[a] += row[a + 1]
+                total = 0.0
+                for back in range(count):
+                    total += row[count - 1 - back]
+                    row[count - 1 - back] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -190,24 +192,24 @@ def take(t, s, count):
     start, left = W - count, s.counts[PLACE] - count + 1
     for j in range(dim[COLUMNS]):
         for q in range(s.counts[ACTIVE]):
-            taken = w[dim[S_TAKEN] + q * dim[COLUMNS] + j]
+            taken = w[dim[S_TAKEN] + q * dim[COLUMNS] + j, left : left + count]
             for o in range(l):
-                row, weight = c[j * l + o], s.m[S0, o, q]
+                row, weight = c[j * l + o, start:W], s.m[S0, o, q]
                 for a in range(count):
-                    row[start + a] -= weight * taken[left + a]
+                    row[a] -= weight * taken[a]
         for q in range(s.counts[ACTIVE]):
-            taken = w[dim[S_TAKEN] + q * dim[COLUMNS] + j]
+            taken = w[dim[S_TAKEN] + q * dim[COLUMNS] + j, left : left + count]
             for o in range(l):
-                row, weight = c[j * l + o], s.m[TAKE, q, o]
+                row, weight = c[j * l + o, start:W], s.m[TAKE, q, o]
                 for a in range(count):
-                    taken[left + a] += weight * row[start + a]
+                    taken[a] += weight * row[a]
         for o in range(l - 1, -1, -1):  # lower triangular, in place from below
-            row, weight = c[j * l + o], s.m[TURN, o, o]
-            for a in range(start, W):
+            row, weight = c[j * l + o, start:W], s.m[TURN, o, o]
+            for a in range(count):
                 row[a] *= weight
             for i in range(o):
-                other, weight = c[j * l + i], s.m[TURN, o, i]
-                for a in range(start, W):
+                other, weight = c[j * l + i, start:W], s.m[TURN, o, i]
+                for a in range(count):
                     row[a] += weight * other[a]
 
 
@@ -219,11 +221,11 @@ def add(t, s, count, clean):
     start, left = W - count, s.counts[PLACE] - count + 1
     for j in range(dim[COLUMNS]):
         source, row = (t.w, dim[T_TRACE] + j * l) if clean and t.i[COURSE, j] != DRIVEN else (s.c, j * l)
-        b = w[j]
+        b = w[j, left : left + count]
         for o in range(l):
-            weight, line = s.v[R, o], source[row + o]
+            weight, line = s.v[R, o], source[row + o, start:W]
             for a in range(count):
-                b[left + a] += weight * line[start + a]
+                b[a] += weight * line[a]
     for k in range(dim[CANDIDATES]):
         if clean and t.i[ADDITIVE, k]:
             continue  # its products are those of the tables
@@ -232,11 +234,11 @@ def add(t, s, count, clean):
             first, row = (t.w, dim[T_TRACE] + i * l) if clean and t.i[COURSE, i] != DRIVEN else (s.c, i * l)
             for j in range(own, i + 1):
                 second, at = (t.w, dim[T_TRACE] + j * l) if clean and t.i[COURSE, j] != DRIVEN else (s.c, j * l)
-                product = w[pair]
+                product = w[pair, left : left + count]
                 for o in range(l):
-                    x, y = first[row + o], second[at + o]
+                    x, y = first[row + o, start:W], second[at + o, start:W]
                     for a in range(count):
-                        product[left + a] += x[start + a] * y[start + a]
+                        product[a] += x[a] * y[a]
                 pair += 1
 
 
@@ -265,39 +267,41 @@ def explain(t, s, count, clean):
         stop = count - max(t.i[LEAST, k] - 1, 0)
         # a loss needs the input of the sample before its onset
         early = 0 if t.i[ADDITIVE, k] else max(0, s.counts[BEGUN] + 1 - (now - count + 1))
-        b = w[own]
+        tested, at, age = max(stop - early, 0), left + early, start + early
+        b = w[own, at : at + tested]
         if clean and t.i[ADDITIVE, k]:
-            for a in range(early, stop):
+            for a in range(tested):
                 line[a] = 0.0
             for i in range(d):
-                for a in range(early, stop):
+                for a in range(tested):
                     other[a] = 0.0
                 for j in range(d):
-                    root, correlation = t.w[dim[T_ROOT] + t.i[ROOT_AT, k] + i * d + j], w[own + j]
-                    for a in range(early, stop):
-                        other[a] += root[start + a] * correlation[left + a]
-                for a in range(early, stop):
+                    root = t.w[dim[T_ROOT] + t.i[ROOT_AT, k] + i * d + j, age : age + tested]
+                    correlation = w[own + j, at : at + tested]
+                    for a in range(tested):
+                        other[a] += root[a] * correlation[a]
+                for a in range(tested):
                     line[a] += other[a] * other[a]
         elif d == 1:
-            product = w[pair]
-            for a in range(early, stop):
-                line[a] = b[left + a] * b[left + a] / max(product[left + a], 1e-300)
+            product = w[pair, at : at + tested]
+            for a in range(tested):
+                line[a] = b[a] * b[a] / max(product[a], 1e-300)
         elif d == 2:
-            second, first, cross, last = w[own + 1], w[pair], w[pair + 1], w[pair + 2]
-            for a in range(early, stop):
-                x, y, g, h, z = b[left + a], second[left + a], first[left + a], last[left + a], cross[left + a]
+            second, first = w[own + 1, at : at + tested], w[pair, at : at + tested]
+            cross, last = w[pair + 1, at : at + tested], w[pair + 2, at : at + tested]
+            for a in range(tested):
+                x, y, g, h, z = b[a], second[a], first[a], last[a], cross[a]
                 total, rest = max(g + h, 1e-150), g * h - z * z
-                if rest > SHARE * total * total:
-                    line[a] = (h * x * x - 2 * z * x * y + g * y * y) / rest
-                else:
-                    line[a] = (g * x * x + 2 * z * x * y + h * y * y) / (total * total)
+                full = rest > SHARE * total * total
+                along = (g * x * x + 2 * z * x * y + h * y * y) / (total * total)
+                line[a] = (h * x * x - 2 * z * x * y + g * y * y) / rest if full else along
         else:
-            for a in range(early, stop):
-                load(t, s, k, left + a)
+            for a in range(tested):
+                load(t, s, k, at + a)
                 line[a] = 0.0
                 for i in range(d):
                     if s.m[M, i, i] > 0.0:
-                        z = w[own + i, left + a]
+                        z = w[own + i, at + a]
                         for j in range(i):
                             z -= s.m[M, i, j] * s.v[Z1, j]
                         s.v[Z1, i] = z / s.m[M, i, i]
@@ -305,9 +309,9 @@ def explain(t, s, count, clean):
                     else:
                         s.v[Z1, i] = 0.0
         best, where = 0.0, -1
-        for a in range(early, stop):
+        for a in range(tested):
             if line[a] > best:
-                best, where = line[a], a
+                best, where = line[a], early + a
         s.v[STATISTIC, k] = best
         s.i[PEAK, k] = now - count + 1 + where if where >= 0 else -1
 
