@@ -32,6 +32,9 @@ PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
 ROUGHNESS = tuple(float(share) for share in np.geomspace(1e-4, 1e2, 9))
 """Weights of the random walk tried, over the mean square of the columns of T."""
 
+PROVED = 1e-6
+"""Relative gap up to which every programme must be solved."""
+
 SIGNS = {"positive": 1.0, "negative": -1.0}
 
 
@@ -79,7 +82,9 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
            if any(fit.prior == word for _, fit, _ in fits)}
     _, best, solution = min(fits, key=lambda fit: fit[0])
     gap = max(gaps, default=float("inf"))
-    best = replace(best, bic=bic, gap=gap, certified=gap < 1e-6 and not failed, status=failed)
+    if not gap < PROVED:
+        failed = failed or f"a programme was solved without a proof, relative gap {gap:.1e}"
+    best = replace(best, bic=bic, gap=gap, certified=not failed, status=failed)
     bound = solution.bound or Bound(-np.inf, False, "none", solution.reason)
     status = solution.status if best.certified else Status.INACCURATE
     return Evidence(best, solution.objective, bound, status, failed or solution.reason,
