@@ -10,8 +10,10 @@ from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import (
     Fault,
+    Monitor,
     diagnose,
     dictionary,
+    empirical_calibration,
     empirical_thresholds,
     inject,
     model_uncertainty,
@@ -142,3 +144,51 @@ def test_refusals(found):
     uncertain = whiten(found.model, data, uncertainty=model_uncertainty(found.model, record(400, 22)))
     with pytest.raises(StructureError, match="without uncertainty"):
         sliding_scan(found, uncertain, WINDOW)
+
+
+# -- monitors --------------------------------------------------------------------------------------------------------
+
+
+def alarms(found, limits, seeds, colour):
+    """Alarms of a monitor on healthy records."""
+    total = 0
+    for seed in seeds:
+        data = record(6000, seed, colour)
+        events = Monitor(found.model, found, arl0=3000, window=WINDOW, thresholds=limits).run(data.u, data.y)
+        total += sum(e.kind == "alarm" for e in events)
+    return total
+
+
+def test_a_monitor_keeps_its_rate_with_thresholds_of_a_healthy_record(found):
+    simulated = Monitor(found.model, found, arl0=3000, window=WINDOW)
+    limits = empirical_calibration(simulated, record(12_000, 31, 1.5))
+    assert not limits.extrapolated and limits.samples == 12_000 and 1 <= limits.alarms <= 8
+    assert alarms(found, simulated.calibration, (32, 33), 1.5) > 15  # 4 are asked for
+    assert alarms(found, limits, (32, 33), 1.5) <= 8
+    faulty = record(400, 34, 1.5, [Fault.step("sensor:y1", 200, 2.0)])
+    events = Monitor(found.model, found, arl0=3000, window=WINDOW, thresholds=limits).run(faulty.u, faulty.y)
+    assert any(e.kind == "alarm" and 200 <= e.sample < 215 for e in events)
+
+
+def test_a_record_shorter_than_the_time_between_alarms_gives_the_factor_of_more_frequent_ones(found):
+    simulated = Monitor(found.model, found, arl0=40_000, window=WINDOW, samples=400_000, extrapolate=True)
+    white = empirical_calibration(simulated, record(6000, 35))
+    assert white.extrapolated and white.alarms == 0
+    assert 0.8 < np.max(white.q / simulated.calibration.q) < 1.25
+    coloured = empirical_calibration(simulated, record(6000, 36, 1.5))
+    assert np.all(coloured.q > 1.2 * white.q) and coloured.arl0 == 40_000
+    parts = Data.join(record(4000, 37, 1.5), record(2000, 38, 1.5))
+    np.testing.assert_allclose(empirical_calibration(simulated, parts).q, coloured.q, rtol=0.4)
+
+
+def test_a_monitor_of_losses_is_calibrated_along_the_inputs():
+    found = dictionary(plant(), kinds=["bias", "loss"])
+    simulated = Monitor(found.model, found, arl0=500, window=WINDOW)
+    limits = empirical_calibration(simulated, record(2500, 39, 1.5))
+    assert limits.labels == simulated.labels and np.max(limits.q / simulated.calibration.q) > 1.1
+
+
+def test_a_monitor_needs_a_healthy_record_of_some_length(found):
+    simulated = Monitor(found.model, found, arl0=3000, window=WINDOW)
+    with pytest.raises(DataError, match="20 are needed"):
+        empirical_calibration(simulated, record(300, 40))

@@ -33,6 +33,7 @@ _HOME = {
     "sliding_scan": "empirical",
     "SlidingScan": "empirical",
     "empirical_thresholds": "empirical",
+    "empirical_calibration": "empirical_monitor",
     "EmpiricalThresholds": "empirical",
     "signature_estimate": "programmes",
     "membership": "programmes",
