@@ -281,7 +281,7 @@ class Health:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {self.p_value:.2g}): thresholds from "
                 "this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
-                "(empirical), or count the uncertainty of the identified model (model_uncertainty)."
+                "(empirical_thresholds), or count the uncertainty of the identified model (model_uncertainty)."
             )
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
