@@ -159,11 +159,12 @@ class Controller:
 
     def _inputs(self, v: Array, before: Array | None) -> Array:
         a = self.allocation
-        if any(one.refused for one in a.inverses):
+        if any(one.refused and not one.dead for one in a.inverses):
             return a.inputs(v, before)
         u = np.array((a.low + a.high) / 2)
         for i, (one, c) in enumerate(zip(a.inverses, a.model.input_of)):
-            u[c] = one.quick(v[i])
+            if not one.dead:
+                u[c] = one.quick(v[i])
         return np.minimum(np.maximum(u, a.low), a.high)
 
     def _goal(self, r: Array) -> Any:
