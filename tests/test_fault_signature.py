@@ -289,6 +289,23 @@ def test_magnitudes_are_least_squares_and_two_faults_are_found(found, limits):
         assert max(map(len, text.splitlines())) <= 80
 
 
+def test_exchanges_never_lose_and_end_where_no_single_one_gains(found, limits):
+    for seed in range(3):
+        s = two(found, seed)
+        result = signature_estimate(s, limits)
+        plain, better = (polish(s, limits, result, reach=1, exchange=e) for e in (False, True))
+        everywhere = polish(s, limits)
+        assert plain.gain - 1e-9 <= better.gain <= everywhere.gain + 1e-7
+        members = list(zip(better.best.labels, better.best.onsets))
+        assert better.gain == pytest.approx(dense_gain(s, limits, members), rel=1e-7)
+        for i in range(len(members)):
+            for label in found.labels:
+                for k in range(0, N, 3):
+                    if not np.isnan(s.statistic[found_index(s, label), k]):
+                        trial = [*members[:i], (label, k), *members[i + 1 :]]
+                        assert dense_gain(s, limits, trial) <= better.gain + 1e-6 or len(set(trial)) < len(trial)
+
+
 def test_a_mixed_integer_programme_agrees_on_a_tiny_grid(found, limits):
     """The same optimum by branch and bound with binaries, on a grid small enough for it."""
     if "SCIP" not in cp.installed_solvers():

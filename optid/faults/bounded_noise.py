@@ -164,7 +164,8 @@ class Membership:
     @property
     def consistent(self) -> tuple[str, ...]:
         """Candidates that are not excluded, the least factor first."""
-        return tuple(sorted((c for c, t in self.candidates.items() if t <= 1.0), key=lambda c: self.candidates[c]))
+        left = [c for c, t in self.candidates.items() if not t > 1.0]  # a solver that failed excludes nothing
+        return tuple(sorted(left, key=lambda c: np.nan_to_num(self.candidates[c], nan=np.inf)))
 
     @property
     def parity_vector(self) -> Array | None:

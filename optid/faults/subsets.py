@@ -15,6 +15,7 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.faults.atoms import Atoms, atoms_of
+from optid.faults.exchange import exchanged
 from optid.faults.scanning import Magnitude, Scan
 from optid.faults.sparse import REACH, SparseResult
 
@@ -26,6 +27,9 @@ SAME = 2e-6
 
 MOST = 400_000_000
 """Subsets that are searched at most."""
+
+EXCHANGED = 3
+"""Subsets that are improved by exchanges."""
 
 COLUMNS = 6000
 """Columns that the atoms of a search may have."""
@@ -57,7 +61,8 @@ class SubsetSearch:
 
     Attributes:
         scan: the search for one fault.
-        best: the subset with the largest gain, the exact optimum over the onsets searched; None where nothing gains.
+        best: the subset with the largest gain: the exact optimum over the onsets searched, which no exchange of one
+            fault for another at any onset improves; None where nothing gains.
         runner_up: the best one of other candidates.
         ranked: the best subset of every choice of candidates, largest gain first.
         searched: (N,) which onsets were searched.
@@ -115,6 +120,7 @@ class SubsetSearch:
 
 def polish(
     found: Scan, limits: "Thresholds", sparse: SparseResult | None = None, *, max_faults: int = 2, reach: int = REACH,
+    exchange: bool = True,
 ) -> SubsetSearch:
     """Search exactly for up to `max_faults` faults at the onsets near those a programme made use of (F3).
 
@@ -127,6 +133,7 @@ def polish(
         sparse: the programme's result; None searches all onsets.
         max_faults: faults in a subset at most.
         reach: onsets on either side of an active one.
+        exchange: whether the best subsets are improved by exchanges over all onsets afterwards.
 
     Raises:
         StructureError: too many subsets for an exact search, or an impossible number of faults.
@@ -151,10 +158,27 @@ def polish(
         alike += _search(pool, size, (), 0.0, best)
         ranked += [_subset(names, members, gain, pool.q) for gain, members in best.values()]
     ranked.sort(key=lambda s: -s.gain)
+    if exchange and sparse is not None and ranked and not mask.all():
+        ranked = _improved(found, limits, ranked)
     gaining = [s for s in ranked if s.gain > 0]
     runner = next((s for s in ranked[1:] if sorted(s.labels) != sorted(gaining[0].labels)), None) if gaining else None
     return SubsetSearch(
         found, gaining[0] if gaining else None, runner, tuple(ranked), mask, subsets, max_faults, sparse, alike)
+
+
+def _improved(found: Scan, limits: "Thresholds", ranked: list[Subset]) -> list[Subset]:
+    """Exchange the members of the best subsets over all onsets."""
+    atoms = atoms_of(found, limits)
+    labels, q = found.labels, {a.label: a.threshold for a in atoms}
+    best = {tuple(sorted(s.labels)): s for s in reversed(ranked)}
+    for subset in ranked[:EXCHANGED]:
+        gain, members = exchanged(atoms, found.whitened.r.ravel(), list(zip(subset.labels, subset.onsets)))
+        members.sort(key=lambda member: (labels.index(member[0]), member[1]))
+        names = tuple(label for label, _ in members)
+        if gain > best.get(tuple(sorted(names)), subset._replace(gain=-np.inf)).gain:
+            best[tuple(sorted(names))] = Subset(names, tuple(k for _, k in members), gain,
+                                                gain + sum(q[label] for label in names))
+    return sorted(best.values(), key=lambda s: -s.gain)
 
 
 class _Pool(NamedTuple):
