@@ -249,19 +249,22 @@ class RowReader:
 
     def _one_by_one(self, values: Array, lines: np.ndarray, stamps: list[str]) -> "_Checked":
         """Find the stamp that cannot be read, and read those before it."""
+        kind = None if self._last is None else self._last.dtype
         for row, stamp in enumerate(stamps):
             try:
                 found = as_stamps([stamp], self._label) if stamp else None
             except DataError:
                 found = np.array([np.nan])
-            other = found is not None and self._last is not None and found.dtype != self._last.dtype
-            if found is not None and (other or not np.isfinite(found).all()):
+            if found is None:
+                continue
+            kind = found.dtype if kind is None else kind
+            if found.dtype != kind or not np.isfinite(found).all():
                 head = self._checked(values[:row], lines[:row], stamps[:row])
                 return head if head.error else _Checked(*head[:3], (
                     f"{self._label}, line {lines[row]}: {stamp!r} is no time stamp like those before. Repair it, or "
                     "ignore the stamps with --time none."
                 ), int(lines[row]))
-        raise DataError(f"{self._label}, line {lines[0]}: the time stamps mix numbers and dates.")
+        raise DataError(f"{self._label}: the time stamps of lines {lines[0]} to {lines[-1]} cannot be read together.")
 
 
 class _Checked(NamedTuple):

@@ -1,0 +1,202 @@
+"""Latency per sample and throughput of the monitor; 6 candidates, two of them losses of two numbers, a jump of four.
+
+Latency: every call of `Monitor.step` is timed, by the clock on the wall and by the processor time of the thread (on a
+machine that does other things at the same time the first counts what others take); once with functions of the user
+(Python), once with functions of optid (compiled). The same search in plain NumPy, without missing readings and carried
+faults, is timed beside it and must give the same statistics. Goals at W = 100: p99 at most 50 us compiled and 300 us in
+NumPy, p99.9 at most 4 times the median, no memory allocated on the way.
+
+Throughput: `optid monitor --follow FILE --until-end` on a file of the standard plant, the start of the process taken
+out by the difference of two lengths. Goal: at least 50,000 samples/s on one core.
+
+    python benchmarks/faults/latency.py [--samples 30000] [--rows 200000]
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from plants import levels, standard_plant
+from streams import standard_dictionary, stream
+
+from optid.bases import BSpline, Polynomial
+from optid.faults import Dictionary, Monitor, inject
+from optid.faults.sweeps import inverse_roots
+from optid.models import HammersteinSS, Nonlinearity
+
+THRESHOLD = 60.0
+"""High enough for no alarm: every sample costs the same."""
+
+
+def compiled_plant() -> tuple[HammersteinSS, np.ndarray]:
+    """Return the standard plant with its functions in bases that a file holds, and the direction of its load."""
+    model, load = standard_plant()
+    grid = np.linspace(-1.2, 1.2, 400)
+    functions = []
+    for f, basis in zip(model.nonlinearities, (Polynomial(3, (-1.2, 1.2)), BSpline(24, interval=(-1.2, 1.2)))):
+        functions.append(Nonlinearity(basis, np.linalg.lstsq(basis.values(grid), f(grid), rcond=None)[0]))
+    return replace(model, nonlinearities=tuple(functions)), load
+
+
+class NumpySearch:
+    """The search of a window without missing readings, by matrix products."""
+
+    def __init__(self, found: Dictionary, window: int) -> None:
+        self.found, self.window, self.model, steady = found, window, found.model, found.predictor
+        n, l = self.model.nx, self.model.l  # noqa: E741
+        jolts, directs = [steady.root @ steady.C], [steady.root]
+        for _ in range(window - 1):
+            directs.append(-jolts[-1] @ steady.K)
+            jolts.append(jolts[-1] @ steady.F)
+        self.responses = np.concatenate([np.array(jolts[::-1]), np.array(directs[::-1])], axis=2)  # (W, l, n + l)
+        self.steady, self.x, self.before = steady, np.zeros(n), np.zeros(self.model.B.shape[1])
+        self.drives = {c.label: np.zeros((window, n + l)) for c in found.candidates if c.columns}
+        self.fixed, self.roots = {}, {}
+        for c in found.candidates:
+            part = c.into_state if not c.columns else c.into_state[:, : len(c.columns)]
+            into = np.vstack([part, c.into_output])
+            trace = self.responses @ into
+            if c.kind != "jump":
+                trace = np.cumsum(trace[::-1], axis=0)[::-1]
+            self.fixed[c.label] = trace
+            grams = np.cumsum(np.einsum("koi,koj->kij", trace, trace)[::-1], axis=0)[::-1]
+            self.roots[c.label] = inverse_roots(grams, np.linalg.eigvalsh(grams)[:, -1])
+        self.b = {c.label: np.zeros((window, c.dimension)) for c in found.candidates}
+        self.G = {label: np.zeros((window, 2, 2)) for label in self.drives}
+        self.seen = 0
+
+    def step(self, u: np.ndarray, y: np.ndarray) -> dict[str, float]:
+        """Take in one sample; return the largest statistics."""
+        model, steady = self.model, self.steady
+        f = model.expanded(u[None])[0]
+        innovation = y - model.C @ self.x - model.D @ f - model.offset_y
+        r = steady.root @ innovation
+        self.seen += 1
+        count, found = min(self.seen, self.window), {}
+        for c in self.found.candidates:
+            b = self.b[c.label]
+            b[:-1] = b[1:]
+            b[-1] = 0.0
+            if not c.columns:
+                b += np.einsum("kod,o->kd", self.fixed[c.label], r)
+                scores = np.einsum("kij,kj->ki", self.roots[c.label], b)
+                line = np.einsum("ki,ki->k", scores, scores)
+            else:
+                drive, G, columns = self.drives[c.label], self.G[c.label], list(c.columns)
+                drive[:-1], G[:-1] = drive[1:], G[1:]
+                drive[-1] = -np.concatenate([c.into_state @ self.before[columns], c.into_output @ f[columns]])
+                G[-1] = 0.0
+                moved = np.einsum("koi,ki->ko", self.responses, drive)
+                moved = np.cumsum(moved[::-1], axis=0)[::-1]
+                signature = np.stack([moved, self.fixed[c.label][:, :, 0]], axis=2)
+                b += np.einsum("kod,o->kd", signature, r)
+                G += np.einsum("koi,koj->kij", signature, signature)
+                g, cross, h = G[:, 0, 0], G[:, 0, 1], G[:, 1, 1]
+                rest = g * h - cross**2
+                there = rest > 1e-9 * (g + h) ** 2
+                full = (h * b[:, 0] ** 2 - 2 * cross * b[:, 0] * b[:, 1] + g * b[:, 1] ** 2) / np.where(there, rest, 1)
+                along = (g * b[:, 0] ** 2 + 2 * cross * b[:, 0] * b[:, 1] + h * b[:, 1] ** 2) / (g + h + 1e-150) ** 2
+                line = np.where(there, full, along)
+            early = 1 if c.columns and self.seen <= self.window else 0  # nothing is known of the input before
+            first, last = self.window - count + early, self.window - (-(-c.dimension // model.l) - 1)
+            found[c.label] = float(np.max(line[first:last], initial=0.0))
+        self.x = model.A @ self.x + model.B @ f + model.offset_x + steady.K @ innovation
+        self.before = f
+        return found
+
+
+def timed(step, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time every call, on the wall and on the processor, in microseconds."""
+    for k in range(500):
+        step(u[k], y[k])
+    wall, processor = np.empty(len(u) - 500), np.empty(len(u) - 500)
+    for k in range(500, len(u)):
+        a, b = time.perf_counter_ns(), time.thread_time_ns()
+        step(u[k], y[k])
+        processor[k - 500], wall[k - 500] = time.thread_time_ns() - b, time.perf_counter_ns() - a
+    return wall / 1e3, processor / 1e3
+
+
+def latencies(samples: int) -> None:
+    print(f"latency in us over {samples} samples      wall p50    p99  p99.9    max   processor p50    p99  p99.9")
+
+    def show(name: str, window: int, step, u: np.ndarray, y: np.ndarray, goal: str = "") -> None:
+        wall, processor = timed(step, u, y)
+        marks = np.percentile(wall, [50, 99, 99.9, 100]), np.percentile(processor, [50, 99, 99.9])
+        print(f"{name:<22} W = {window:<4} {'':>8}" + "".join(f"{v:>9.1f}" for v in marks[0]) + f"{'':>7}"
+              + "".join(f"{v:>8.1f}" for v in marks[1]) + f"   {goal}", flush=True)
+
+    for name, (model, load) in (("functions of optid", compiled_plant()), ("functions of the user", standard_plant())):
+        found = standard_dictionary(model, load)
+        for window in (50, 100, 200):
+            monitor = Monitor(model, found, window=window, thresholds=np.full(6, THRESHOLD), x0="zero")
+            u, y = stream(model, samples, 1)
+            show(name, window, monitor.step, u, y, "p99 <= 50, p99.9 <= 4 x p50" if window == 100 else "")
+    model, load = standard_plant()
+    found = standard_dictionary(model, load)
+    u, y = stream(model, 6000, 2)
+    plain = NumpySearch(found, 100)
+    show("plain NumPy", 100, plain.step, u, y, "p99 <= 300")
+    plain, monitor = NumpySearch(found, 100), Monitor(model, found, thresholds=np.full(6, THRESHOLD), x0="zero")
+    worst = 0.0
+    for now, reading in zip(u[:400], y[:400]):
+        monitor.step(now, reading)
+        for label, value in plain.step(now, reading).items():
+            worst = max(worst, abs(monitor.statistics[label] - value) / max(value, 1e-3))
+    print(f"largest difference of the statistics, compiled and NumPy: {worst:.1e} (goal 1e-9)")
+    tracemalloc.start()
+    for k in range(400, 5400):
+        monitor.step(u[k], y[k])
+    before = tracemalloc.get_traced_memory()[0]
+    for k in range(400, 5400):
+        monitor.step(u[k], y[k])
+    print(f"memory after 5000 more samples: {tracemalloc.get_traced_memory()[0] - before:+d} bytes (goal 0)\n")
+    tracemalloc.stop()
+
+
+def throughput(rows: int) -> None:
+    model, load = compiled_plant()
+    with tempfile.TemporaryDirectory() as folder:
+        plant, table, thresholds = (Path(folder) / name for name in ("plant.json", "rows.csv", "thresholds.json"))
+        model.save(plant)
+        u = levels(rows, 5)
+        np.savetxt(table, np.hstack([u, inject(model, u, seed=6)]), "%.9g", ",", header="u1,u2,y1,y2", comments="")
+        command = [sys.executable, "-m", "optid", "monitor", str(plant), "--until-end", "--thresholds", str(thresholds),
+                   "--kinds", "bias", "loss", "--arl0", "1000000", "--extrapolate", "--load",
+                   "load=" + ",".join(map(str, load)), "--follow"]
+        short = Path(folder) / "short.csv"
+        with table.open() as file:
+            short.write_text("".join(line for line, _ in zip(file, range(1001))))
+        found = []
+        for path in (short, short, table, short, table):
+            before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+            subprocess.run([*command, str(path)], check=True, capture_output=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            found.append((spent, time.perf_counter() - begun))
+        start, whole = np.min(found[1::2], axis=0), np.min([found[2], found[4]], axis=0)
+    processor, wall = (rows - 1000) / (whole - start)
+    print(f"throughput from a file of {rows} rows, W = 100, candidates: two biases and losses of actuators, two biases "
+          f"of sensors, load, jump:\n{processor:,.0f} samples/s of processor time, {wall:,.0f} on the wall "
+          f"(start of the process {start[0]:.1f} s); goal 50,000; load of the machine {os.getloadavg()[0]:.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=int, default=30_000)
+    parser.add_argument("--rows", type=int, default=200_000)
+    given = parser.parse_args()
+    latencies(given.samples)
+    throughput(given.rows)
+
+
+if __name__ == "__main__":
+    main()

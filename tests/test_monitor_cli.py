@@ -1,0 +1,204 @@
+"""`optid monitor` from end to end, and the rows of a table that is still being written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from test_monitor import plant, stream
+
+from optid.errors import DataError
+from optid.reading.rows import RowReader
+
+NAMES = ["u1", "u2", "y1", "y2"]
+QUICK = ["--arl0", "300", "--window", "30", "--kinds", "bias", "loss"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("monitor")
+    plant().save(where / "model.json")
+    u, y = stream(plant(), 500)
+    rows = ["t,u1,u2,y1,y2"]
+    for k, row in enumerate(np.hstack([u, y])):
+        rows.append(f"{k}," + ",".join("" if np.isnan(v) else repr(float(v)) for v in row))
+    (where / "stream.csv").write_text("\n".join(rows) + "\n")
+    run(where, "--thresholds", "thresholds.json", text="t,u1,u2,y1,y2\n")
+    return where
+
+
+def run(folder, *words, text=None, code=0):
+    done = subprocess.run(
+        [sys.executable, "-m", "optid", "monitor", "model.json", *QUICK, *words], cwd=folder, capture_output=True,
+        input=(folder / "stream.csv").read_text() if text is None else text, text=True,
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout, " ".join(done.stderr.split())
+
+
+def known(folder, *words, **how):
+    return run(folder, "--thresholds", "thresholds.json", *words, **how)
+
+
+def test_one_line_per_event(folder):
+    out, errors = known(folder)
+    lines = out.splitlines()
+    assert errors == ""
+    assert lines[0].startswith("t = 15") and ": alarm: " in lines[0]
+    assert any("isolated: sensor:y1" in line for line in lines)
+    assert any("isolated: actuator:u2 loss" in line for line in lines)
+    objects = [json.loads(line) for line in known(folder, "--json")[0].splitlines()]
+    assert len(objects) == len(lines)
+    assert [o["line"] for o in objects] == [o["sample"] + 2 for o in objects]
+    assert objects[0]["kind"] == "alarm" and objects[0]["time"] == str(objects[0]["sample"])
+
+
+def test_a_state_is_resumed_as_if_nothing_had_happened(folder, tmp_path):
+    whole = known(folder)[0]
+    rows = (folder / "stream.csv").read_text().splitlines(keepends=True)
+    state = str(tmp_path / "state.npz")
+    parts = [known(folder, "--state", state, text="".join([rows[0], *part]))[0]
+             for part in (rows[1:150], rows[150:158], rows[158:])]
+    assert "".join(parts) == whole
+    with open(tmp_path / "grown.csv", "w") as file:
+        file.writelines(rows[:200])
+    followed = ["--follow", str(tmp_path / "grown.csv"), "--until-end", "--state", str(tmp_path / "followed.npz")]
+    first = known(folder, *followed)[0]
+    with open(tmp_path / "grown.csv", "a") as file:
+        file.writelines(rows[200:])
+    assert first + known(folder, *followed)[0] == whole
+    assert known(folder, *followed)[0] == ""
+    (tmp_path / "grown.csv").write_text("".join(rows[:5]))
+    assert "shorter than what was read" in known(folder, *followed, code=2)[1]
+
+
+def test_a_state_of_another_model_or_file_is_refused(folder, tmp_path):
+    state = str(tmp_path / "state.npz")
+    known(folder, "--state", state, "--follow", "stream.csv", "--until-end")
+    (tmp_path / "copy.csv").write_text((folder / "stream.csv").read_text())
+    text = known(folder, "--state", state, "--follow", str(tmp_path / "copy.csv"), "--until-end", code=2)[1]
+    assert "is the state of" in text and "copy.csv" in text
+    plant(True).save(folder / "other.json")
+    done = subprocess.run([sys.executable, "-m", "optid", "monitor", "other.json", "--state", state], cwd=folder,
+                          capture_output=True, text=True, input="")
+    assert done.returncode == 2 and "another model" in done.stderr
+    (tmp_path / "state.npz").write_bytes(b"not a state")
+    assert "not the complete state of a monitor" in known(folder, "--state", state, code=2)[1]
+
+
+def test_rows_that_cannot_be_read_are_named_and_the_stream_goes_on(folder):
+    rows = (folder / "stream.csv").read_text().splitlines()
+    rows[20] = "19,0.5,0.5,oops,1.0"
+    rows[30] = "29,0.5,0.5"
+    rows[40] = "39,0.5,0.5,inf,1.0"
+    rows[60] = ""
+    text = "\r\n".join(rows) + "\r\n\r\n"
+    out, errors = known(folder, text=text)
+    assert "line 21, column 'y1' holds 'oops', not a number" in errors
+    assert "line 31 has 3 cells, the header has 5" in errors
+    assert "line 41, column 'y1' holds 'inf'" in errors
+    assert "line 61 is blank" in errors
+    assert "4 of 500 rows could not be read" in errors
+    assert "isolated: sensor:y1" in out
+    out, errors = known(folder, "--strict", text=text, code=2)
+    assert "line 21, column 'y1' holds 'oops'" in errors and out == ""
+
+
+def test_time_stamps_that_are_not_those_of_the_model_end_the_stream(folder):
+    rows = (folder / "stream.csv").read_text().splitlines()
+    del rows[200:203]
+    out, errors = known(folder, text="\n".join(rows), code=2)
+    assert "line 201: the time stamp 202 comes 4 after the one before, the sampling time of the model is 1" in errors
+    assert "--fill-gaps" in errors and "isolated: sensor:y1" in out  # what came before has been judged
+    out, errors = known(folder, "--fill-gaps", text="\n".join(rows))
+    assert "isolated: actuator:u2 loss" in out and errors == ""
+    jittered = [rows[0], *(f"{0.5 * k}," + row.partition(",")[2] for k, row in enumerate(rows[1:]))]
+    assert "comes 0.5 after the one before" in known(folder, text="\n".join(jittered), code=2)[1]
+    assert known(folder, "--time", "none", text="\n".join(jittered))[0] != ""
+
+
+def test_what_is_wrong_with_the_table_is_said_by_name(folder):
+    assert "has no column 'y2'" in known(folder, text="u1,u2,y1\n1,2,3\n", code=2)[1]
+    assert "no header row" in known(folder, text="1,2,3,4\n", code=2)[1]
+    assert "two columns named 'u1'" in known(folder, text="u1,u1,u2,y1,y2\n", code=2)[1]
+    assert known(folder, "--columns", *NAMES, text="1,2,3,4\n") == ("", "")
+    assert known(folder, "--delimiter", ";", "--decimal", ",", text="u1;u2;y1;y2\n0,5;1,0;2;3\n") == ("", "")
+    assert "No such file" in known(folder, "--follow", "nowhere.csv", code=2)[1]
+
+
+def test_thresholds_of_something_else_and_impossible_requests_are_refused(folder):
+    (folder / "broken.json").write_text("{}")
+    assert "does not hold thresholds" in run(folder, "--thresholds", "broken.json", code=2)[1]
+    assert "in a window of 30" in known(folder, "--window", "40", code=2)[1]
+    assert "cannot support a false alarm every 1e+09" in run(folder, "--arl0", "1e9", code=2)[1]
+    assert "no fault of kind 'biass'" in run(folder, "--kinds", "biass", code=2)[1]
+
+
+def test_a_file_is_followed_until_the_monitor_is_stopped(folder, tmp_path):
+    rows = (folder / "stream.csv").read_text().splitlines(keepends=True)
+    grown, state = tmp_path / "grown.csv", tmp_path / "state.npz"
+    grown.write_text("".join(rows[:100]) + rows[100][:7])  # a line that is not complete
+    process = subprocess.Popen(
+        [sys.executable, "-m", "optid", "monitor", "model.json", *QUICK, "--thresholds", "thresholds.json", "--follow",
+         str(grown), "--state", str(state)], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )
+    try:
+        time.sleep(1.0)
+        with grown.open("a") as file:
+            file.write(rows[100][7:] + "".join(rows[101:]))
+        lines = [process.stdout.readline() for _ in range(2)]
+        assert ": alarm: " in lines[0] and lines[1]
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 0 and errors == ""
+    finally:
+        process.kill()
+    assert state.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes")
+def test_whoever_reads_the_events_may_leave(folder):
+    command = f"{sys.executable} -m optid monitor model.json {' '.join(QUICK)} --thresholds thresholds.json " \
+              "< stream.csv | head -n 1"
+    done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True)
+    assert done.stdout.count("\n") == 1 and "Traceback" not in done.stderr and "Broken" not in done.stderr
+
+
+def reader(**how):
+    return RowReader(["u"], ["y"], dt=0.5, **how)
+
+
+def test_rows_come_in_any_pieces():
+    text = ["t,u,y", "0,1,2", "0.5,,3", "1.0,NA,4", "1.5,5,6"]
+    whole = reader().read(text)
+    one_by_one = reader()
+    parts = [one_by_one.read([line]) for line in text]
+    assert np.array_equal(np.vstack([p.u for p in parts]), whole.u, equal_nan=True)
+    assert np.concatenate([p.lines for p in parts]).tolist() == whole.lines.tolist() == [2, 3, 4, 5]
+    assert whole.u.ravel().tolist()[0] == 1 and np.isnan(whole.u[1:3]).all() and whole.bad == []
+    assert reader(time=False).read(["t,u,y", "9,1,2", "1,1,2"]).error == ""
+
+
+def test_dates_quotes_and_gaps():
+    dates = ["time,u,y", "2024-05-01T12:00:00,1,2", '"2024-05-01T12:00:00.5","1","2"', "2024-05-01T12:00:02,3,4"]
+    stopped = reader().read(dates)
+    assert len(stopped.y) == 2 and stopped.stop == 4 and "comes 1.5 after" in stopped.error
+    filled = reader(fill=True).read(dates)
+    assert filled.lines.tolist() == [2, 3, 0, 0, 4] and np.isnan(filled.y[2:4]).all() and filled.y[4, 0] == 4
+    assert "no time stamp like those before" in reader().read([*dates[:2], "3.5,1,2"]).error
+    assert "no time stamp like those before" in reader().read(["t,u,y", "0,1,2", "soon,1,2"]).error
+
+
+def test_reading_goes_on_where_it_stopped():
+    first = reader()
+    first.read(["t,u,y", "0,1,2", "bad"])
+    again = reader()
+    again.resume(json.loads(json.dumps(first.memory)))
+    found = again.read(["1.0,1,2"])  # one row, of which no stamp is known, lies between
+    assert found.error == "" and found.lines.tolist() == [4]
+    with pytest.raises(DataError, match="not the delimiter"):
+        reader(delimiter=",", decimal=",")
