@@ -23,7 +23,7 @@ def test_class_of_every_case_is_what_its_name_says():
     for name, entry in CASES.items():
         kind = entry.build().kind
         expected = {"lp": {"LP"}, "qp": {"QP"}, "socp": {"SOCP"}, "sdp": {"SDP"}, "exp": {"conic"}, "nlp": {"NLP"},
-                    "rank": {"NLP"}, "nuclear": {"SDP"}}[name.split("_")[0]]
+                    "rank": {"NLP"}, "nuclear": {"SDP"}, "group": {"SOCP"}}[name.split("_")[0]]
         assert kind in expected, name
 
 

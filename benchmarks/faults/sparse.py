@@ -106,7 +106,8 @@ def double(found, limits, runs, load, model):
     reached = {7: .83, 10: .85, 20: .98}
     for d in (7, 10, 20):
         rng = np.random.default_rng(50 + d)
-        score = dict.fromkeys(("raw programme", "refit, same types", "type swap", "type swap + exchange", "all pairs"), 0)
+        names = "raw programme", "refit, same types", "type swap", "type swap + exchange", "all pairs"
+        score = dict.fromkeys(names, 0)
         best = better = 0
         clock = dict.fromkeys(("programme", "type swap", "with exchange", "all pairs"), 0.0)
         for run in range(runs):
