@@ -23,6 +23,7 @@ from optid.cli.options import (
     reads_a_record,
 )
 from optid.cli.ordering import order
+from optid.cli.reformulating import reformulate
 from optid.cli.results import command_line, conclude
 from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
 
@@ -315,4 +316,5 @@ app.command(cls=Command)(design)
 app.command(cls=Command)(diagnose)
 app.command(cls=Command)(isolability)
 app.command(cls=Command)(monitor)
+app.command(cls=Command)(reformulate)
 app.command(cls=Command)(order)
