@@ -255,7 +255,9 @@ def test_solvers_are_listed_from_the_registry():
 
 
 @pytest.mark.parametrize(
-    ("command", "group"), [("formulations", "optid.formulations"), ("constraints", "optid.constraints")]
+    ("command", "group"),
+    [("formulations", "optid.formulations"), ("formulations", "optid.fault_formulations"),
+     ("constraints", "optid.constraints")],
 )
 def test_registered_names_are_listed(command, group):
     from importlib.metadata import entry_points

@@ -6,11 +6,11 @@ from problems import BASIS, record
 import optid
 from formulations import pole_regions, responses, shape
 from optid.errors import LookupFailed, StructureError
-from optid.registry import CONSTRAINTS, FORMULATIONS, check_arguments, formulation, named_constraint, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, check_arguments, formulation, named_constraint, registered
 
 
 def test_every_entry_point_loads_and_is_callable():
-    for group in (FORMULATIONS, CONSTRAINTS):
+    for group in (FORMULATIONS, CONSTRAINTS, FAULTS):
         assert registered(group)
         for point in registered(group).values():
             assert callable(point.load())

@@ -45,7 +45,7 @@ def solvers() -> Show:
 
 
 def formulations() -> Show:
-    """Return what prints every formulation with its summary, arguments and named variables."""
+    """Return what prints every formulation with its summary, arguments and named variables, then those about faults."""
     from optid.registry import FORMULATIONS, registered
 
     rows = []
@@ -63,12 +63,39 @@ def formulations() -> Show:
             "\n",
         )
         rows.append((Text(name, "bold"), about))
-    return _table(
+    models = _table(
         "Formulations",
         ("formulation", "what it poses"),
         rows,
         "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
         "Arguments in brackets may be left out.",
+    )
+    faults = _fault_programmes()
+
+    def show() -> None:
+        models()
+        faults()
+
+    return show
+
+
+def _fault_programmes() -> Show:
+    from optid.registry import FAULTS, registered
+
+    rows = []
+    for name, point in sorted(registered(FAULTS).items()):
+        try:
+            function = point.load()
+        except ImportError as error:
+            rows.append((Text(name, "dim"), Text(f"cannot be loaded: {error}", "dim")))
+            continue
+        about = Text.assemble(_summary(function), ("\narguments: ", "dim"), _arguments(function), "\n")
+        rows.append((Text(name, "bold"), about))
+    return _table(
+        "Programmes about faults",
+        ("programme", "what it poses"),
+        rows,
+        "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.",
     )
 
 
