@@ -385,6 +385,8 @@ def test_bad_arguments_are_named(found, limits):
         diagnose(replace(small(), A=small().A * 0.9), data, found)
     with pytest.raises(StructureError, match="windows of 120 samples; the record has 100"):
         diagnose(small(), (data[0][:100], data[1][:100]), found, thresholds=limits)
+    with pytest.raises(DataError, match="simulated windows"):
+        diagnose(small(), data, found, false_alarm=1e-9)
     with pytest.raises(StructureError, match="noise covariances"):
         diagnose(replace(small(), noise=None), data)
     with pytest.raises(StructureError, match="state-space model"):

@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.data import Data, Experiment
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.faults.calibration import EXCEEDING, Thresholds, thresholds
 from optid.faults.courses import courses, without_signature
 from optid.faults.excitation import untestable
@@ -34,8 +34,8 @@ COURSE_SHARE = 0.1
 SIMULATED = 2_000_000
 """Samples of all simulated windows together, above which fewer windows are simulated."""
 
-DRAWS = 20_000
-"""Simulated windows behind the thresholds of a short record."""
+DRAWS, MOST_DRAWS = 20_000, 500_000
+"""Simulated windows behind the thresholds of a short record, and the most that are simulated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +152,12 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> 
         return given
     rate = asked.false_alarm * (1 - UNKNOWN_SHARE * found.unknown - COURSE_SHARE * any(without_signature(found)))
     needed = int(np.ceil(EXCEEDING / rate))
+    if needed > MOST_DRAWS:
+        raise DataError(
+            f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated windows; "
+            f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher probability, "
+            "or simulate them yourself: thresholds(..., draws=...)."
+        )
     draws = max(needed, min(DRAWS, SIMULATED // count))
     inputs = u if any(c.columns for c in found.candidates) else None
     return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)
