@@ -72,8 +72,10 @@ def estimate(faults, label, size, half=0.1, onset=ONSET):
 def diagnosis(model, *answers, verdict="faulty"):
     proof = Certificate("exhaustive", 10.0)
     best = answers[0] if answers else None
-    return Diagnosis(verdict, bool(answers), best, answers, 1e-3, proof, {}, COUNT, 0.01, 0.95, "exact", "", model.title,
-                     model.outputs)
+    return Diagnosis(
+        verdict, bool(answers), best, answers, 1e-3, proof, {}, COUNT, 0.01, 0.95, "exact", "", model.title,
+        model.outputs,
+    )
 
 
 def answer(*estimates, posterior=1.0):
@@ -297,7 +299,8 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         reformulate(healthy, good, Data(data.u[:50], data.y[:50]))
     with pytest.raises(StructureError, match="if_ambiguous"):
         twice = answer(estimate(faults, "actuator:u1 loss", 0.5), posterior=0.5)
-        reformulate(healthy, diagnosis(healthy, twice, twice), data, if_ambiguous="maybe")
+        other = answer(estimate(faults, "actuator:u2 loss", 0.5), posterior=0.5)
+        reformulate(healthy, diagnosis(healthy, twice, other), data, if_ambiguous="maybe")
     u = np.array(data.u)
     u[ONSET + 10, 0] = np.nan
     with pytest.raises(DataError, match=f"Sample {ONSET + 10} lacks an input"):
@@ -534,6 +537,14 @@ def test_the_model_stays_healthy_while_several_answers_are_left(healthy, faults)
     assert "advice: wait" in str(found) and max(map(len, str(found).splitlines())) <= 80
     for action in ("robust", "probe", "wait"):
         assert reformulate(healthy, several, data, if_ambiguous=action).if_ambiguous.action == action
+
+
+def test_kinds_of_one_part_are_one_explanation(healthy, faults):
+    data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5))
+    kinds = diagnosis(healthy, answer(estimate(faults, "actuator:u2 loss", 0.5), posterior=0.6),
+                      answer(estimate(faults, "actuator:u2 stuck", [0.5, 0.0]), posterior=0.35))
+    found = reformulate(healthy, kinds, data)
+    assert found.status == "refitted" and found.members[0].damage.posterior == pytest.approx(0.95)
 
 
 def test_robust_control_is_the_best_for_the_worst_member(healthy, faults):

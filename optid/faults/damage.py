@@ -102,6 +102,23 @@ def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
     return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
 
 
+def merged(broken: list[Damage]) -> list[Damage]:
+    """Return one explanation for those that break the same parts, as a loss and a stuck actuator do.
+
+    They are refitted alike; the most probable speaks for them, and their probabilities add up.
+    """
+    groups: dict[Any, list[Damage]] = {}
+    for one in broken:
+        key = (frozenset(one.columns), frozenset(one.sensors), frozenset(c.label for c in one.offsets),
+               frozenset(one.louder_sensors), bool(one.louder_states.any()))
+        groups.setdefault(key, []).append(one)
+    found = []
+    for group in groups.values():
+        best = max(group, key=lambda one: one.posterior)
+        found.append(replace(best, posterior=sum(one.posterior for one in group)))
+    return sorted(found, key=lambda one: -one.posterior)
+
+
 def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posterior: float) -> Damage:
     r, n = len(model.nonlinearities), model.nx
     columns: list[int] = []

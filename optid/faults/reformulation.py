@@ -15,7 +15,7 @@ from optid.data import Data
 from optid.errors import DataError, StructureError
 from optid.faults.allocation import Allocation, Target, allocate
 from optid.faults.ambiguity import Ambiguity, advise, robust_allocation
-from optid.faults.damage import Damage, check_answers, damages
+from optid.faults.damage import Damage, check_answers, damages, merged
 from optid.faults.inversion import inverse
 from optid.faults.refitting import NODES, Prior
 from optid.faults.schedule import Schedule, refit
@@ -160,7 +160,7 @@ def reformulate(
         allocation, notes = _allocated(model, bounds)
         return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
     check_answers(diagnosis)
-    broken = [one for answer in diagnosis.candidates for one in damages(model, answer)]
+    broken = merged([one for answer in diagnosis.candidates for one in damages(model, answer)])
     how: dict[str, Any] = {
         "constraints": constraints, "prior": prior, "nodes": nodes, "stage": stage, "solver": solver, "seed": seed,
     }
