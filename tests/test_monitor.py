@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fault_plants import levels, noisy
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from optid.bases import Linear, Polynomial, UserFunctions
 from optid.data import Data
@@ -282,12 +284,29 @@ def test_what_no_candidate_explains_is_unknown():
         found = dictionary(model, kinds="bias")
     u = levels(count, 6)
     y = inject(model, u, seed=7)
-    y[150:220] += 2.0 * np.random.default_rng(0).standard_normal((70, 2))
+    shaken = y.copy()
+    shaken[150:220] += 2.0 * np.random.default_rng(0).standard_normal((70, 2))
     monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 30.0))
-    events = monitor.run(u, y)
+    events = monitor.run(u, shaken)
     assert events[0].kind == "alarm"
     assert events[1].kind == "isolated" and events[1].candidates == (("unknown", 1.0),)
     assert events[-1].kind == "cleared" and not monitor.alarmed
+    sure = Monitor(model, replace(found, unknown=False), window=60, thresholds=np.full(len(found.labels), 30.0))
+    assert all(label != "unknown" for event in sure.run(u, shaken) for label, _ in event.candidates)
+
+
+def test_a_loss_without_excitation_gets_no_verdict_alone():
+    model, count = plant(), 400
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds="stuck", sensors=[], state_jump=False)
+    u = levels(count, 4)
+    u[100:] = [0.8, -0.5]
+    y = inject(model, u, Fault.loss("actuator:u1", 250, 1.0), seed=5)
+    monitor = Monitor(model, found, window=50, thresholds=np.full(len(found.labels), 30.0))
+    named = [event for event in monitor.run(u, y) if event.kind == "isolated"]
+    assert len(named) == 1 and named[0].candidates[0][0] == "actuator:u1 stuck"
+    assert named[0].sample >= 250 + 10 and "cannot be told from a constant" in named[0].note
 
 
 def test_a_spike_is_a_spike():
@@ -339,3 +358,35 @@ def test_a_healthy_record_that_contradicts_the_noise_is_refused():
         silent(model, everything(model), healthy=Data(u, loud))
     monitor = silent(model, everything(model), healthy=Data(u, loud), rescale=True)
     assert np.trace(monitor.dictionary.predictor.covariance) > 1.5 * np.trace(everything(model).predictor.covariance)
+
+
+@st.composite
+def systems(draw):
+    """A stable plant with poles of any kind, one to three outputs, one or two inputs, and a share of lost readings."""
+    n, m, l = draw(st.integers(1, 5)), draw(st.integers(1, 2)), draw(st.integers(1, 3))  # noqa: E741
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    A = rng.standard_normal((n, n))
+    A *= draw(st.floats(0.1, 0.95)) / np.abs(np.linalg.eigvals(A)).max()
+    D = rng.standard_normal((l, m)) * draw(st.sampled_from([0.0, 0.3]))
+    model = noisy(A, rng.standard_normal((n, m)), rng.standard_normal((l, n)), 0.1 * np.eye(n), 0.2 * np.eye(l), D=D,
+                  L=0.1 * rng.standard_normal((n, l)) * draw(st.integers(0, 1)))
+    lost = draw(st.sampled_from([0.0, 0.1, 0.5]))
+    return model, lost, draw(st.integers(12, 60)), rng
+
+
+@settings(max_examples=40, deadline=None)
+@given(systems())
+def test_random_plants_against_dense_least_squares(system):
+    model, lost, count, rng = system
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = dictionary(model, kinds=["bias", "loss", "stuck", "drift", "spike"])
+    u = rng.standard_normal((count, model.m))
+    y = inject(model, u, seed=1)
+    y[rng.random(y.shape) < lost] = np.nan
+    window = max(2 * model.nx + 2, 20)
+    monitor = silent(model, found, window=window, x0="zero")
+    monitor.run(u, y)
+    white = whiten(model, Data(u, y), x0="zero")
+    for label, (energy, _) in dense(found, window, white.r, u, white.present).items():
+        assert monitor.statistics[label] == pytest.approx(energy, rel=1e-6, abs=1e-9), label

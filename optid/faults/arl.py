@@ -1,15 +1,16 @@
 """Thresholds of a running search from the mean time between false alarms that is asked for, by simulation.
 
 The whitened innovations of a healthy plant are white with unit covariance, so that the search itself can be run on
-random numbers, without the plant. The largest statistics of blocks as long as the window are kept; alarms are rare, so
-that those of different blocks are nearly independent and their rate is
+random numbers, without the plant. The largest statistics of blocks as long as the window are kept. An alarm is a block
+that exceeds a threshold after one that did not, and the rate of alarms while there is none is
 
-    1 / ARL0 = -log(1 - share of blocks with an alarm) / length of a block
+    1 / ARL0 = -log(1 - alarms / blocks without an alarm before) / length of a block.
 
-after blocks that follow one another have been counted once. Every candidate gets the same rate of its own, which is
-found such that all of them together have the rate asked for.
+Every candidate gets the same rate of its own, which is found such that all of them together have the rate asked for.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +22,8 @@ from optid.faults import monitor_layout as at
 from optid.faults.monitor_layout import Tables
 from optid.faults.monitor_tables import blank
 
-ALARMS = 200
-"""False alarms that a simulation must see, so that their rate is known to 7 %."""
+ALARMS = 400
+"""False alarms that a simulation must see, so that their rate is known to 5 %."""
 
 FEWEST = 50
 """With fewer alarms than this the threshold is extrapolated, or refused."""
@@ -32,6 +33,9 @@ LONGEST = 4_000_000
 
 CHUNK = 20_000
 """Samples simulated at a time; every one of them has random numbers of its own."""
+
+RUNS = 4
+"""Simulations that may run at the same time; the result does not depend on how many do."""
 
 HOLD = 5
 """Samples over which the simulated input keeps its level."""
@@ -121,17 +125,22 @@ def maxima(t: Tables, f: Array, samples: int, seed: int | None) -> Array:
 
     window, l, candidates = (int(t.i[0, d]) for d in (at.WINDOW, at.NY, at.CANDIDATES))  # noqa: E741
     blocks = max(CHUNK // window, 1)
-    count = max(1, -(-samples // (blocks * window)))
-    streams = np.random.SeedSequence(seed).spawn(count + 1)
-    s, found = blank(t), np.empty((count * blocks, candidates))
-    inputs = np.resize(f, (blocks * window, f.shape[1])) if f.size else np.zeros((blocks * window, f.shape[1]))
-    # the first window fills up
-    rehearse(t, s, inputs, np.random.default_rng(streams[0]).standard_normal((window, l)), np.empty((1, candidates)))
-    for number, stream in enumerate(streams[1:]):
-        r = np.random.default_rng(stream).standard_normal((blocks * window, l))
-        shifted = np.roll(inputs, -number * blocks * window % max(len(f), 1), axis=0)
-        rehearse(t, s, shifted, r, found[number * blocks : (number + 1) * blocks])
-    return found
+    length = blocks * window
+    count = max(1, -(-samples // (RUNS * length)))
+    inputs = np.resize(f, (length, f.shape[1])) if f.size else np.zeros((length, f.shape[1]))
+
+    def run(seeds: np.random.SeedSequence) -> Array:
+        s, streams = blank(t), [np.random.default_rng(part) for part in seeds.spawn(count + 1)]
+        found = np.empty((count, blocks, candidates))
+        # the first window fills up
+        rehearse(t, s, inputs, streams[0].standard_normal((window, l)), np.empty((1, candidates)))
+        for number, stream in enumerate(streams[1:]):
+            shifted = np.roll(inputs, -number * length % max(len(f), 1), axis=0)
+            rehearse(t, s, shifted, stream.standard_normal((length, l)), found[number])
+        return found.reshape(-1, candidates)
+
+    with ThreadPoolExecutor(min(RUNS, os.cpu_count() or 1)) as pool:
+        return np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
 
 
 def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
@@ -142,21 +151,21 @@ def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
         length: samples of a block.
         arl0: samples between alarms.
     """
-    level = length / arl0 / largest.shape[1]  # as if the candidates had nothing in common
+    goal = -np.expm1(-length / arl0)
+    level = goal / largest.shape[1]  # as if the candidates had nothing in common
     for _ in range(30):
         q = np.array([tail(column, level) for column in largest.T])
-        alarms = clusters(np.any(largest > q, axis=1))
-        rate = alarms / len(largest)
-        goal = length / arl0
-        if rate * len(largest) < FEWEST or abs(rate / goal - 1) < 0.005:
+        alarms, quiet = onsets(np.any(largest > q, axis=1))
+        share = alarms / max(quiet, 1)
+        if alarms < FEWEST or abs(share / goal - 1) < 0.005:
             break
-        level *= goal / rate
+        level *= goal / share
     return q, alarms
 
 
-def clusters(above: Any) -> int:
-    """Count runs of blocks with an alarm."""
-    return int(above[0]) + int(np.sum(above[1:] & ~above[:-1]))
+def onsets(above: Any) -> tuple[int, int]:
+    """Return how many blocks begin an alarm, and how many follow one without."""
+    return int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
 
 
 def tail(column: Array, level: float) -> float:

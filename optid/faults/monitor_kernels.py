@@ -180,12 +180,12 @@ def judge(t, s, count):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def record(t, s, kind, k, line):
-    """Write one event: kind, sample, candidate, onset, statistic, gains of all candidates, magnitudes."""
+    """Write one event: kind, sample, candidate, onset, statistic, gains of all, magnitudes, whether it is testable."""
     candidates = t.i[0, CANDIDATES]
     line[:] = 0.0
     line[0], line[1], line[2], line[3] = kind, s.counts[NOW], k, -1.0
     if k >= 0:
-        line[3], line[4] = s.i[PEAK, k], s.v[STATISTIC, k]
+        line[3], line[4], line[-1] = s.i[PEAK, k], s.v[STATISTIC, k], s.i[TESTED, k]
     if kind == UNTESTABLE or kind == TESTABLE:
         line[4] = excited(t, s, k)
     for i in range(candidates):
@@ -206,7 +206,7 @@ def march(t, s, functions, f, y, events):
         functions: of the feedback.
         f: (T, r) functions of the inputs, NaN where an input is missing.
         y: (T, l) readings, NaN where one is missing.
-        events: (M, 5 + C + d) written.
+        events: (M, 6 + C + d) written.
 
     Returns:
         samples taken in, events written, whether the feedback refused an output.

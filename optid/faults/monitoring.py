@@ -84,8 +84,9 @@ class Event:
         """Say it in one line."""
         text = f"{self.sample}: {self.kind}"
         if self.candidates:
-            names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates]
-            text += ": " + ", ".join(names)
+            names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates[:3]]
+            more = len(self.candidates) - len(names)
+            text += ": " + ", ".join(names) + (f" and {more} more" if more else "")
         if self.kind == "untestable":
             text += f" since {self.onset}"
         elif self.onset is not None:
@@ -189,8 +190,8 @@ class Monitor:
         for label, why in self.skipped.items():
             warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
         strength = float(np.max(np.sum((found.predictor.root @ found.predictor.C) ** 2, axis=0), initial=1e-300))
-        numbers = [*({**RULES, **rules} | {"wide": WIDE / strength}).values()]
-        t = tables(found, self._chosen, self.window, numbers)
+        numbers = {**RULES, **rules} | {"wide": WIDE / strength} | ({} if found.unknown else {"odd": np.inf})
+        t = tables(found, self._chosen, self.window, list(numbers.values()))
         self.calibration = self._calibrated(t, arl0, thresholds, u, samples, extrapolate)
         self._start(with_thresholds(t, self.calibration.q), blank(t))
         if isinstance(x0, str) and x0 == "unknown":
@@ -223,7 +224,7 @@ class Monitor:
         self._u, self._y = np.empty((1, model.m)), np.empty((1, model.l))
         self._f = np.empty((1, int(t.i[0, at.NF])))
         self._input_of = np.array(model.input_of, dtype=np.int64)
-        width = 5 + len(self.labels) + max(c.dimension for c in self._chosen)
+        width = 6 + len(self.labels) + max(c.dimension for c in self._chosen)
         self._events, self._event = np.zeros((EVENTS, width)), np.zeros((1, width))
 
     def _calibrated(
@@ -377,7 +378,22 @@ class Monitor:
         kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
         size = tuple(float(v) for v in line[5 + count : 5 + count + self._chosen[best].dimension])
         named = tuple((self.labels[c], float(weight[c])) for c in order[:kept])
-        return Event(kind, sample, named, onset, size, float(line[4]))
+        note = ""
+        if code == at.ISOLATED and not (self._chosen[best].additive or line[-1]):
+            note = "the actuator hardly moves: its loss cannot be told from a constant"
+        elif code == at.ISOLATED and kept > 1:
+            note = "not told apart in time"
+        return Event(kind, sample, named, onset, size, float(line[4]), note)
+
+    def __str__(self) -> str:
+        """Say what is looked for, what the thresholds rest on, what was seen, and what is carried."""
+        lines = [f"{self.samples} samples seen, window {self.window}" + ", in alarm" * self.alarmed]
+        lines.append(str(self.calibration))
+        lines += [f"  not monitored: {label}" for label in self.skipped]
+        for fault in self.carried:
+            sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(fault.size, fault.deviation))
+            lines.append(f"carried: {fault.label}, size {sizes}")
+        return "\n".join(lines)
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
