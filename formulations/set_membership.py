@@ -165,17 +165,22 @@ def membership_programme(window: BoundedWindow, signature: Signature | None = No
     t, x = cp.Variable(name="t"), cp.Variable(count * n, name="states")
     variables: dict[str, cp.Variable] = {"t": t, "states": x}
     expressions: dict[str, cp.Expression] = {"t": t, "x": cp.reshape(x, (count, n), order="C")}
-    noise: Any = level - matrix @ x
+    added = np.zeros((level.size, 0))
     if signature is not None and signature.state.shape[2]:
         d = signature.state.shape[2]
-        size = variables["size"] = expressions["size"] = cp.Variable(d, name="size")
+        variables["size"] = expressions["size"] = cp.Variable(d, name="size")
         added = np.vstack([signature.state[1:].reshape(-1, d), signature.output.reshape(-1, d)])
-        noise = level - (matrix @ x + added @ size)
     bounded, exact = np.flatnonzero(known & (bounds > 0)), np.flatnonzero(known & (bounds == 0))
-    relative: Any = cp.multiply(1 / bounds[bounded], noise[bounded])
+
+    def noise(rows: Array, units: Array) -> Any:
+        """The noise in some rows, in units, as an expression of as few parts as possible: it is judged often."""
+        found = level[rows] / units - (sp.diags_array(1 / units) @ matrix[rows]) @ x
+        return found - (added[rows] / units[:, None]) @ variables["size"] if "size" in variables else found
+
+    relative = noise(bounded, bounds[bounded])
     constraints: dict[str, tuple[Any, ...]] = {"noise": (relative <= t, -relative <= t)}
     if exact.size:
-        constraints["no noise"] = (noise[exact] == 0,)
+        constraints["no noise"] = (noise(exact, np.ones(exact.size)) == 0,)
     return Program(
         "fault.membership", cp.Minimize(t), constraints, variables,
         {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions, kind="membership"),

@@ -128,8 +128,8 @@ class WaveformTest:
 
 
 def waveform_test(
-    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0, u: ArrayLike | None = None,
-    free_start: bool = True, data: Data | None = None,
+    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0, free_start: bool = True,
+    data: Data | None = None,
 ) -> WaveformTest:
     """Test every place of a dictionary for a fault of any course.
 
@@ -140,7 +140,6 @@ def waveform_test(
         whitened: the window; one experiment.
         probability: with which the set is to hold the true place.
         onset: first sample that the fault can change; a later one makes the test sharper.
-        u: not needed; accepted so that all tests are called alike.
         free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
         data: the record of the window, for the flat-line test of frozen sensors.
 
