@@ -87,7 +87,8 @@ def _heat(figure: Figure, ax: Axes, found: Diagnosis, seen: Evidence) -> None:
     if highest > 0:
         shown = ax.imshow(np.where(gains > 0, gains, np.nan), cmap="YlOrBr", vmin=0, vmax=highest, **how)
         figure.colorbar(shown, ax=ax, label="energy beyond\nthe threshold", pad=0.01)
-        title = "energy that one candidate explains by its onset; encircled: the best answer"
+        mark = "; encircled: the best answer" if found.best is not None else ""
+        title = f"energy that one candidate explains by its onset{mark}"
     for fault in found.best.faults if found.best is not None else ():
         if fault.label in seen.labels:
             ax.plot(fault.onset, seen.labels.index(fault.label), "o", markerfacecolor="none", markeredgecolor=BLUE,

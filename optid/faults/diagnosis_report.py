@@ -41,10 +41,11 @@ def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str 
 
 def render(found: Diagnosis, *, record: str = "", command: str = "") -> str:
     """Return the page that `write` writes."""
+    best = ", what the best answer leaves in them, and its onset with the interval" if found.best is not None else ""
+    several = "; the probability of every answer in the set" if len(found.candidates) > 1 else ""
     caption = (
-        "Whitened innovations of every output with what the best answer leaves in them, and its onset with the "
-        "interval; the energy that every candidate explains by its onset, beyond the threshold at which a healthy "
-        "plant alarms; the probability of every answer in the set."
+        f"Whitened innovations of every output{best}; the energy that every candidate explains by its onset, beyond "
+        f"the threshold at which a healthy plant alarms{several}."
     )
     content: dict[str, Any] = {
         "version": __version__,
@@ -92,16 +93,18 @@ def _answers(found: Diagnosis) -> Table:
     rows = []
     for place, answer in enumerate(found.candidates, start=1):
         for i, fault in enumerate(answer.faults):
+            first, *more = size_words(fault)
             rows.append((
                 f"{place}. {fault.label}" if i == 0 else f"and {fault.label}",
                 f"{answer.posterior:.3f}" if i == 0 else "", onset_words(fault).removeprefix("onset "),
-                "; ".join(size_words(fault)), number(fault.deflection, 3),
+                number(fault.deflection, 3), first,
             ))
+            rows += [("", "", "", "", words) for words in more]
     note = (
         f"The smallest set that holds {100 * found.coverage:g} % of the probability. Intervals in brackets hold "
         f"{100 * found.coverage:g} %, the search for the onset included."
     )
-    return Table("Answers", ("fault", "probability", "onset", "magnitude", "deflection"), rows, note)
+    return Table("Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows, note)
 
 
 def _evidence(found: Diagnosis) -> list[tuple[str, str]]:
@@ -110,7 +113,7 @@ def _evidence(found: Diagnosis) -> list[tuple[str, str]]:
         ("False alarms", f"{found.false_alarm:g} of healthy records"),
         ("p-value of health", probability_words(found.p_value)),
     ]
-    if found.detected:
+    if found.certificate.kind != "none":
         facts.append(("Proof", certificate_words(found).removeprefix("proof: ")))
     if found.remaining is not None:
         facts.append(("Left unexplained", remaining_words(found).removeprefix("left unexplained: ")))

@@ -31,7 +31,7 @@ def untestable(found: "Scan") -> dict[str, str]:
             flat = trace.reshape(-1, trace.shape[2])
             beside = flat[:, 1:]
             rest = flat[:, 0] - beside @ np.linalg.lstsq(beside, flat[:, 0], rcond=1e-9)[0]
-            deflection = float(np.linalg.norm(rest))
+            deflection = round(float(np.linalg.norm(rest)), 6)
             if deflection < LEAST:
                 value = float(np.linalg.eigvalsh(flat.T @ flat)[0])
                 result[candidate.label] = (

@@ -71,7 +71,7 @@ def printed(found: "Diagnosis") -> str:
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
         lines += [f"  {line}" for line in str(answer).splitlines()]
     if found.detected:
-        lines += ["", certificate_words(found)]
+        lines += ["", certificate_words(found)] if found.certificate.kind != "none" else [""]
     if found.remaining is not None:
         lines += [remaining_words(found)]
     lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
@@ -161,7 +161,7 @@ def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
     """
     if found.verdict == "healthy":
         sentences = [
-            f"The record of {found.window} samples is what the healthy {found.model} predicts.",
+            f"The record of {found.window} samples is what the healthy {_model(found)} predicts.",
             f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
             f"{found.false_alarm:g} that would be an alarm.",
         ]
@@ -169,13 +169,12 @@ def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
         sentences = [_nothing_said(found)]
     elif found.verdict in ("unknown", "not isolable"):
         sentences = [
-            f"The record departs from the healthy {found.model} (p-value {probability_words(found.p_value)}), but "
+            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
             + ("no fault of the dictionary fits it." if found.verdict == "unknown" else
                "with one output a fault of any course explains it, in any place."),
         ]
         if found.remaining is not None:
-            rest = course_words(found)
-            sentences.append(rest[0].upper() + rest[1:] + ".")
+            sentences.append(f"What is left of it: {course_words(found)}.")
     else:
         sentences = _faulty(found)
     if notes:
@@ -189,8 +188,8 @@ def _nothing_said(found: "Diagnosis") -> str:
     names = _list(list(found.untestable))
     if found.detected:
         return (
-            f"The record departs from the healthy {found.model} (p-value {probability_words(found.p_value)}), but the "
-            f"input does not excite what is suspected: {names}."
+            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
+            f"the input does not excite what is suspected: {names}."
         )
     return f"Nothing can be said about {names}: the input does not excite it."
 
@@ -216,6 +215,11 @@ def _phrase(answer: "Answer") -> str:
     return " and ".join(
         f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in answer.faults
     )
+
+
+def _model(found: "Diagnosis") -> str:
+    """The title of the model inside a sentence; Hammerstein is a name."""
+    return found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
 
 
 def _list(words: list[str], joint: str = "and") -> str:

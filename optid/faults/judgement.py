@@ -63,7 +63,7 @@ class Job:
             notes.append("With one output only faults of a known course can be told apart.")
         verdict = self.verdict(seen, alarm, bool(fits), bool(stuck.faults))
         answers = self.answers(fits, stuck.faults)
-        certificate = way.certificate
+        certificate = way.certificate if fits or way.certificate.kind == "infeasible healthy" else NOTHING
         if stuck.faults and not fits:
             certificate = Certificate("flat line", float(stuck.count))
         remaining = None
