@@ -204,6 +204,30 @@ def test_lying_multipliers_give_no_false_bound(found, limits):
     assert result.certified and result.bound <= truth * (1 + 1e-9)
 
 
+def test_wild_multipliers_of_a_user_constraint_give_no_false_bound(found, limits):
+    s = two(found)
+    first = next(group for group in signature_estimate(s, limits).active if group.size.size == 1)
+    rule = [lambda v: {"size": first.size[0] * v[f"size[{first.label}]"] <= 0.01,
+                       "sum": cp.sum(v[f"size[{first.label}]"]) == 0.02}]
+    truth = signature_estimate(s, limits, constraints=rule)
+    assert truth.certified
+    rng = np.random.default_rng(0)
+    for scale in (1e-3, 1.0, 1e3):
+        def run(program, settings, scale=scale):
+            answer = find("clarabel").run(program, settings)
+            wild = {name: scale * rng.standard_normal(d.shape) for name, d in answer.duals.items()}
+            return replace(answer, duals=wild)
+
+        result = signature_estimate(s, limits, constraints=rule, solver=BackEnd("wild", frozenset({"SOCP"}), run))
+        assert result.bound <= truth.objective * (1 + 1e-7) and not result.certified
+
+    def short(program, settings):
+        return replace(find("clarabel").run(program, settings), duals={"size": np.ones(2), "residual": np.ones(1)})
+
+    result = signature_estimate(s, limits, constraints=rule, solver=BackEnd("short", frozenset({"SOCP"}), short))
+    assert result.bound <= truth.objective * (1 + 1e-7)
+
+
 @pytest.mark.parametrize("answer", [
     Answer(Status.FAILED, "out of memory"), Answer(Status.OPTIMAL, "optimal"), Answer(Status.INFEASIBLE, "infeasible"),
     Answer(Status.OPTIMAL, "optimal", {"residual": np.zeros(2 * N)})])
