@@ -210,6 +210,24 @@ def test_robust_estimates_see_through_outliers(found, limits):
     assert same.best.label == "sensor:y2" and same.size[0] == pytest.approx(clean.size[0], abs=0.1)
 
 
+def test_a_second_fault_is_not_bounded_as_if_it_were_outliers(found, limits):
+    data = record(Fault.step("sensor:y2", 40, 1.5), Fault.step("actuator:u1", 80, 2.0))
+    plain, robust = (diagnose(small(), data, found, thresholds=limits, max_faults=2, robust=r) for r in (False, True))
+    assert set(robust.best.labels) == set(plain.best.labels) == {"sensor:y2", "actuator:u1"}
+    for first, second in zip(plain.best.faults, robust.best.faults):
+        assert second.size[0] == pytest.approx(first.size[0], rel=0.1)
+
+
+def test_a_scheduled_change_of_the_plant_is_a_candidate():
+    other = small().A.copy()
+    other[0, 0] = 0.6
+    faults = dictionary(small(), kinds=["bias"], schedules={"aged": Fault.schedule(A=other)})
+    answer = diagnose(small(), record(Fault.schedule(60, A=other)), faults)
+    assert answer.best.label == "process:aged schedule" and answer.size_interval[0, 0] < 1 < answer.size_interval[0, 1]
+    assert "share of the change" in str(answer)
+    assert answer.onset_interval[0] <= 60 <= answer.onset_interval[1]
+
+
 # -- several faults ----------------------------------------------------------------------------------------------------
 
 

@@ -31,15 +31,16 @@ class Estimate:
     Attributes:
         label: what it is called; the whole group where no record can tell its members apart.
         name: where it is, as in `Fault`; of a group the first member.
-        kind: a kind of the dictionary ("bias", "loss", "stuck", "jump", "drift", "frozen", "noise", "spike").
-        candidate: the entry of the dictionary.
+        kind: a kind of the dictionary ("bias", "loss", "stuck", "jump", "drift", "frozen", "noise", "spike",
+            "schedule").
+        candidate: the entry of the dictionary; read from a file, without the matrices of a scheduled change.
         onset: most probable first sample that it changes.
         onset_interval: first and last sample of its interval.
         onset_censored: whether the record starts (or ends) so near the onset that only the interval of the size is
             known; the onset is then "at or before" the end of its interval (or "at or after" its start).
         size: (d,) estimates of the magnitudes: size of a bias, slope of a drift, jump of the state, share lost of a
-            loss, share lost and constants added of a stuck actuator, standard deviation of an added noise; NaN where
-            only the interval is known.
+            loss, share lost and constants added of a stuck actuator, standard deviation of an added noise, reading of a
+            frozen sensor, share of a scheduled change; NaN where only the interval is known.
         size_interval: (d, 2) intervals that account for the search for the onset. Not cut to what is possible: the
             interval of a share lost may reach above one, and does where all is lost.
         covariance: (d, d) of the size, with the spread over the onsets.

@@ -10,7 +10,10 @@ if TYPE_CHECKING:
 
 WIDTH = 80
 
-WORDS = {"drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading"}
+WORDS = {
+    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading",
+    "schedule": "share of the change",
+}
 """What the magnitude of a kind is called."""
 
 

@@ -127,7 +127,7 @@ def look(
     outliers: tuple[tuple[int, int], ...] = ()
     search = limits = None
     gains, lost = np.full((len(found.candidates), len(white.r)), np.nan), {}
-    if any(c.additive or c.columns for c in found.candidates):
+    if any(c.additive or c.columns or c.schedule is not None for c in found.candidates):
         if asked.robust:
             search, part, outliers = cleaned(found, part, whitened_of)
         else:
@@ -155,9 +155,9 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> 
     if needed > MOST_DRAWS:
         raise DataError(
             f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated windows; "
-            f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher probability, "
-            "or simulate them yourself: thresholds(..., draws=...)."
+            f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher "
+            "probability, or simulate them yourself: thresholds(..., draws=...)."
         )
     draws = max(needed, min(DRAWS, SIMULATED // count))
-    inputs = u if any(c.columns for c in found.candidates) else None
+    inputs = u if any(c.columns or c.schedule is not None for c in found.candidates) else None
     return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)

@@ -32,6 +32,12 @@ MOST = 0.05
 ROUNDS = 20
 """Repetitions of the search on bounded innovations at most."""
 
+AT_ONCE = 4
+"""Faults whose signatures are kept from being bounded."""
+
+LIKELY = 5.0
+"""Logarithm of the likelihood beside health that such a fault has at least."""
+
 
 class Cleaned(NamedTuple):
     """A search without the influence of wild readings.
@@ -113,14 +119,24 @@ def with_spikes(found: Dictionary) -> Dictionary:
 def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:
     search, before = scan(found, whitened, u), None
     for _ in range(ROUNDS):
-        statistic = np.nan_to_num(search.statistic, nan=-np.inf)
-        c = _likeliest(found, statistic)
-        candidate, onset = found.candidates[c], int(np.argmax(statistic[c]))
-        nu = search.estimate(candidate, onset).nu
-        fitted = search.signature(candidate, onset) @ nu
-        rest = whitened.r - fitted
-        search = scan(found, replace(whitened, r=fitted + np.clip(rest, -BOUND, BOUND)), u)
-        if before is not None and before[:2] == (c, onset) and np.allclose(nu, before[2], rtol=1e-3):
+        fitted = _several(found, search, u)
+        rest = np.clip(whitened.r - fitted, -BOUND, BOUND)
+        search = scan(found, replace(whitened, r=fitted + rest), u)
+        if before is not None and np.allclose(fitted, before, atol=1e-3):
             break
-        before = c, onset, nu
+        before = fitted
     return search
+
+
+def _several(found: Dictionary, search: Scan, u: Array) -> Array:
+    """What the likeliest candidates leave, one after the other: what a fault explains is not bounded."""
+    fitted = np.zeros_like(search.whitened.r)
+    rest = search
+    for _ in range(AT_ONCE):
+        statistic = np.nan_to_num(rest.statistic, nan=-np.inf)
+        c = _likeliest(found, statistic)
+        if marginal(statistic[c].max(keepdims=True), found.candidates[c].dimension)[0] < LIKELY:
+            break
+        fitted = fitted + _fitted(rest)
+        rest = scan(found, replace(search.whitened, r=search.whitened.r - fitted), u)
+    return fitted
