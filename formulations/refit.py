@@ -107,7 +107,7 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
     width = problem.size + len(shares)
     rows, target = np.zeros((len(r), width)), s @ theta - r
     rows[:, : problem.size] = s
-    believed, wanted = _believed(problem)
+    believed, wanted = problem.believed()
     triangle, target, rest = _compressed(np.vstack([rows, believed]), np.concatenate([target, wanted]))
     variables = {key: cp.Variable(shape, name=key) for key, shape in problem.shapes.items()}
     variables |= {key: cp.Variable(1, name=key) for key in shares}
@@ -164,24 +164,6 @@ def _entry(variable: cp.Variable, flat: int) -> Any:
     return variable[np.unravel_index(flat, variable.shape)] if variable.ndim > 1 else variable[flat]
 
 
-def _believed(problem: Refitting) -> tuple[Array, Array]:
-    """What is believed beforehand as rows of a least-squares problem in [z; shares lost]."""
-    width = problem.size + len(problem.curves)
-    spread = problem.spread()
-    finite = np.flatnonzero(np.isfinite(spread) & (spread > 0))
-    rows, wanted = [np.eye(width)[finite] / spread[finite, None]], [problem.start[finite] / spread[finite]]
-    for i, curve in enumerate(problem.curves):
-        first = problem.slices[f"mu[{curve.name}]"].start
-        part, count, half = slice(first, first + curve.nodes.size), curve.nodes.size, curve.half_range
-        near, bend = np.zeros((count, width)), np.zeros((max(count - 2, 0), width))
-        near[:, part] = curve.to_nodes / (problem.prior.damaged * half)
-        second = np.diff(np.eye(count), n=2, axis=0) / (problem.prior.curvature * half)
-        bend[:, part], bend[:, problem.size + i] = second @ curve.to_nodes, second @ curve.healthy
-        rows += [near, bend]
-        wanted += [curve.healthy / (problem.prior.damaged * half), second @ curve.healthy]
-    return np.vstack(rows), np.concatenate(wanted)
-
-
 def _not_stronger(curve: Any, mu: Any) -> list[Any]:
     """Monotone like the healthy nonlinearity and nowhere steeper; nothing for one that is not monotone."""
     steps = np.diff(curve.healthy)
@@ -218,6 +200,6 @@ def _vector(problem: Refitting, values: Values) -> Array:
 
 def _cost(problem: Refitting, theta: Array, lost: dict[str, float], r: Array) -> float:
     """Value of the objective with the innovations r at theta, linearised in nothing."""
-    rows, wanted = _believed(problem)
+    rows, wanted = problem.believed()
     point = np.concatenate([theta, [lost.get(curve.name, 0.0) for curve in problem.curves]])
     return float(np.sum(r**2) + np.sum((rows @ point - wanted) ** 2))

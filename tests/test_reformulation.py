@@ -140,6 +140,24 @@ def test_refit_equals_regularised_least_squares_where_no_rule_binds(healthy):
     assert found.solution.proof
 
 
+def test_evidence_is_the_density_of_the_record(healthy):
+    from scipy.stats import multivariate_normal
+
+    data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.4), count=ONSET + 12)
+    found = []
+    for curvature in (0.02, 0.1, 0.5):
+        problem = refitting(healthy, data, ONSET, damaged=[1], prior=Prior(curvature=curvature))
+        r, s = problem.linearised(problem.start)
+        rows, wanted = problem.believed()
+        rows, wanted = np.vstack([rows, 2 * np.eye(8)[7:]]), np.append(wanted, 1.0)
+        spread = np.linalg.inv(rows.T @ rows)
+        full = np.column_stack([s, np.zeros(len(s))])
+        mean = full @ spread @ rows.T @ wanted
+        density = multivariate_normal(mean, np.eye(len(s)) + full @ spread @ full.T).logpdf(s @ problem.start - r)
+        found.append(problem.evidence() - density)
+    assert found == pytest.approx([found[0]] * 3, abs=1e-6)
+
+
 @pytest.mark.parametrize("solver", ["clarabel", "osqp", "daqp", "ipopt"])
 def test_refit_is_the_same_by_any_back_end(healthy, solver):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 10)

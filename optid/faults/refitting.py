@@ -225,6 +225,40 @@ class Refitting:
                 spread[self.slices[name]] = self.prior.healthy * np.abs(values).max(initial=0.0)
         return spread
 
+    def believed(self) -> tuple[Array, Array]:
+        """Return what is believed beforehand: rows of a least-squares problem in [z; shares lost], and their target."""
+        width = self.size + len(self.curves)
+        spread = self.spread()
+        finite = np.flatnonzero(np.isfinite(spread) & (spread > 0))
+        rows, wanted = [np.eye(width)[finite] / spread[finite, None]], [self.start[finite] / spread[finite]]
+        for i, curve in enumerate(self.curves):
+            first = self.slices[f"mu[{curve.name}]"].start
+            part, count, half = slice(first, first + curve.nodes.size), curve.nodes.size, curve.half_range
+            near, bend = np.zeros((count, width)), np.zeros((max(count - 2, 0), width))
+            near[:, part] = curve.to_nodes / (self.prior.damaged * half)
+            second: Any = np.diff(np.eye(count), n=2, axis=0) / (self.prior.curvature * half)
+            bend[:, part], bend[:, self.size + i] = second @ curve.to_nodes, second @ curve.healthy
+            rows += [near, bend]
+            wanted += [curve.healthy / (self.prior.damaged * half), second @ curve.healthy]
+        return np.vstack(rows), np.concatenate(wanted)
+
+    def evidence(self) -> float:
+        """Return the log probability of the record under the prior, rules not counted, up to a constant.
+
+        Every share lost is taken as 0.5 +- 0.5. Exact where the unknowns enter linearly.
+        """
+        r, s = self.linearised(self.start)
+        rows, wanted = self.believed()
+        shares = np.eye(self.size + len(self.curves))[self.size :] / 0.5
+        rows, wanted = np.vstack([rows, shares]), np.concatenate([wanted, np.ones(len(shares))])
+        full = np.column_stack([s, np.zeros((len(s), len(self.curves)))])
+        before, after = rows.T @ rows, rows.T @ rows + full.T @ full
+        mean = np.linalg.solve(before, rows.T @ wanted)
+        point = np.linalg.solve(after, rows.T @ wanted + full.T @ (s @ self.start - r))
+        left = float(np.sum((full @ point - (s @ self.start - r)) ** 2) + np.sum((rows @ point - wanted) ** 2))
+        left -= float(np.sum((rows @ mean - wanted) ** 2))
+        return -0.5 * (left + float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]))
+
     def held_out(self, samples: int) -> "Refitting":
         """Return the same without the last samples of the last window."""
         last = self.windows[-1]

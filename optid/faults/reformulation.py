@@ -134,7 +134,7 @@ def reformulate(
         data: the record with the fault; without it the plant is what the diagnosis alone says.
         constraints: of a damaged nonlinearity: rules of `formulations.shape` or their words; "default": monotone as
             before and nowhere steeper.
-        prior: what is believed beforehand.
+        prior: what is believed beforehand; by default with the curvature that makes the record most probable.
         nodes: values of a damaged nonlinearity that has no nodes of its own.
         stage: "affected only", "all with prior", or "auto": by hold-out.
         low: (m,) least inputs; the intervals of the bases by default.

@@ -29,6 +29,9 @@ MARGIN = 2.0
 
 DRAWS = 100
 
+BENDS = (0.01, 0.03, 0.1, 0.2)
+"""Curvatures of the prior that are tried."""
+
 STAGES = ("prior", "affected only", "all with prior")
 
 
@@ -124,7 +127,7 @@ def refit(
         data: the record with the fault.
         damage: what broke.
         constraints: of the damaged nonlinearities; see `formulations.refit`.
-        prior: what is believed beforehand.
+        prior: what is believed beforehand; by default with the curvature that makes the record most probable.
         nodes: values of a nonlinearity that has no nodes of its own.
         stage: "affected only", "all with prior", or "auto": by hold-out.
         solver: back end.
@@ -147,6 +150,9 @@ def refit(
         none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, (float("nan"), float("nan")), (), None,
                         "too few for a refit: the model is what the diagnosis says")
         return damage.believed(model), none
+    if prior is None and narrow.curves:
+        prior = likeliest(narrow)
+        how["prior"], narrow = prior, replace(narrow, prior=prior)
     scores: dict[str, float] = {}
     reason = "as asked for"
     if stage == "auto":
@@ -163,6 +169,12 @@ def refit(
     found = _solved(problem, constraints, solver)
     least = -(-sum(1 if c.dead else c.nodes.size for c in problem.curves) // model.l)
     return _told(problem, found, stage, least, scores, reason, seed)
+
+
+def likeliest(problem: Refitting) -> Prior:
+    """Return the prior whose curvature makes the record most probable: how much a fault bends is not known before."""
+    priors = [Prior(problem.prior.damaged, curvature, problem.prior.healthy) for curvature in BENDS]
+    return max(priors, key=lambda prior: replace(problem, prior=prior).evidence())
 
 
 def _held(problem: Refitting) -> tuple[int, int]:

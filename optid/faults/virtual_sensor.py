@@ -102,7 +102,7 @@ class Observer:
         rows = [
             f"  {name}: predicted RMSE {value:.4g}" + (
                 f" (its own noise {self._noise(name):.4g}, simulation {self.open_loop[name]:.4g})"
-            ) for name, value in self.rmse.items() if name in self.lost or not self.lost
+            ) for name, value in self.rmse.items() if name in self.lost
         ]
         return "\n".join([head, *rows])
 
