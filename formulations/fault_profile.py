@@ -4,8 +4,9 @@
 
 with f = 0 before the window, so that a change in the first sample counts, and optional constraints on f: its sign, its
 size, its slew rate. The penalties shrink the course and share one change among neighbours; so they only propose where
-the course changes. Changes that the Bayesian information criterion does not pay for are dropped, and the course is
-fitted again by least squares under the same constraints. BIC chooses the penalty and, if asked, the prior.
+the course changes. Changes that the Bayesian information criterion does not pay for are dropped, the others move to
+where they explain most, and the course is fitted again by least squares under the same constraints. BIC chooses the
+penalty and, if asked, the prior.
 
 Named expressions: ``f`` (N,), the course; ``changes``, what the penalty counts.
 """
@@ -110,7 +111,9 @@ def _changing(problem: CourseProblem, prior: str, shares: Sequence[float], rules
         gaps.append(solution.gap)
         sizes = np.abs(np.ravel(solution.values["changes"])) * np.linalg.norm(columns, axis=0)
         support = np.flatnonzero(sizes > 1e-5 * max(float(sizes.max()), 1e-3 * float(np.linalg.norm(problem.r))))
-        kept = problem.pruned(columns, support) if support.size else support
+        kept = support
+        if support.size:
+            kept = problem.pruned(columns, problem.moved(columns, problem.pruned(columns, support)))
         if tuple(kept.tolist()) in seen:
             continue
         seen.add(tuple(kept.tolist()))

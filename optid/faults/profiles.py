@@ -21,6 +21,12 @@ PRIORS = {
 }
 """What is believed of the course."""
 
+ROUNDS = 20
+"""Passes over the changes in which they are moved, at most."""
+
+ALIKE = 2e-6
+"""Share of a change of its own below which the others explain it."""
+
 LONGEST = 2000
 """Samples of a window at most."""
 
@@ -129,6 +135,32 @@ class CourseProblem:
                 break
             kept, best = trial, value
         return np.array(kept, dtype=int)
+
+
+    def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
+        """Move every change to the sample where it explains most beside the others, until none moves.
+
+        Args:
+            columns: (N l, N) of all changes.
+            kept: changes to begin with.
+        """
+        places = [int(k) for k in kept]
+        for _ in range(ROUNDS):
+            before = list(places)
+            for i in range(len(places)):
+                others = places[:i] + places[i + 1 :]
+                basis = np.linalg.qr(columns[:, others])[0] if others else np.zeros((len(columns), 0))
+                rest = self.r - basis @ (basis.T @ self.r)
+                own = np.einsum("ij,ij->j", columns, columns)
+                left = own - np.sum((basis.T @ columns) ** 2, axis=0)
+                there = left > ALIKE * own
+                energy = np.where(there, (columns.T @ rest) ** 2 / np.where(there, left, 1.0), -np.inf)
+                best = int(np.argmax(energy))
+                if energy[best] > energy[places[i]] * (1 + 1e-9):
+                    places[i] = best
+            if places == before:
+                break
+        return np.unique(places)
 
 
 def course_problem(found: "Scan", label: str) -> CourseProblem:
