@@ -16,7 +16,7 @@ from optid.faults import Fault, Monitor, allocate, diagnose, inject, reformulate
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
 from optid.models.kalman import kalman_gain
 
-ONSET, SEEN = 400, 60
+ONSET, SEEN = 400, 100
 LOST = 0.6
 
 
@@ -99,7 +99,7 @@ def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuil
         stream.plot(k, record[1][shown, o], color=colour, linewidth=1, label=f"y{o + 1}")
     stream.axvline(ONSET, color="black", linestyle=":", label="it breaks")
     for event, colour in zip([e for e in events if e.sample >= ONSET], ("tab:red", "tab:orange")):
-        name = event.kind + (f": {event.candidates[0][0]}" if event.candidates else "")
+        name = event.kind + (f": {event.candidates[0][0]}" if event.kind == "isolated" else "")
         stream.axvline(event.sample, color=colour, label=name)
     stream.set(title="monitor", xlabel="sample", ylim=(None, 1.9 * np.max(np.abs(record[1][shown]))))
     stream.legend(fontsize=8, ncols=2, loc="upper left")

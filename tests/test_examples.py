@@ -38,6 +38,10 @@ EXPECTED: dict[str, dict[str, Range]] = {
     "larger_than_memory": {
         "a1": about(-1.5, 1e-3), "a2": about(0.7, 1e-3), "b1 / b0": about(0.75, 2e-3), "rows": (1_999_998, 1_999_998),
     },
+    "faults_end_to_end": {
+        "delay": (0, 5), "unique": (1, 1), "share lost": about(0.6, 0.05), "fit before": (60, 80),
+        "fit after": (97, 100), "control gains": (2, 100),
+    },
     "noise_models": {
         "hammerstein_arx.exact error": (0.005, 0.1), "hammerstein_oe.exact error": (0, 0.005),
         "hammerstein_bj.exact error": (0, 0.005), "hammerstein_bj.exact 1": (95, 96),
