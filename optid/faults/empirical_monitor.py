@@ -14,7 +14,7 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataError
-from optid.faults.arl import Calibration, clusters
+from optid.faults.arl import Calibration
 from optid.faults.empirical import COMMON, LEAST, SURE, sliding_scan
 from optid.faults.whitening import Whitened, whiten
 from optid.models.experiments import in_units_of
@@ -78,7 +78,7 @@ def empirical_calibration(monitor: "Monitor", healthy: Data, *, seed: int | None
     else:
         factor = float(np.quantile(largest, 1 - level, method="higher"))
     return Calibration(base.labels, factor * base.q, base.arl0, window, sum(len(part.r) for part in parts),
-                       clusters(largest > factor), seed, extrapolated)
+                       _runs(largest > factor), seed, extrapolated)
 
 
 def _repeated(parts: list[Whitened], inputs: list[Array | None], window: int) -> list[tuple[Whitened, Array | None]]:
@@ -90,3 +90,8 @@ def _repeated(parts: list[Whitened], inputs: list[Array | None], window: int) ->
 def _noise(part: Whitened, rng: np.random.Generator) -> Whitened:
     """White innovations with the readings of an experiment."""
     return replace(part, r=np.where(part.present, rng.standard_normal(part.r.shape), 0.0))
+
+
+def _runs(above: np.ndarray) -> int:
+    """Count runs of blocks with an alarm."""
+    return int(above[0]) + int(np.sum(above[1:] & ~above[:-1]))

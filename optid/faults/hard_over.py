@@ -116,7 +116,7 @@ class HardOver:
 
     @property
     def alarm(self) -> WindowVerdict | None:
-        """The first window with a dead row or column, or the second in a row with another order."""
+        """The first window with a dead row or column, or the second in a row of an order no healthy plant shows."""
         before = None
         for verdict in self.windows:
             changed = verdict.changed(self.nominal_order)
