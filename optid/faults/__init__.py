@@ -52,7 +52,7 @@ _HOME = {
     "noise_search": "noise_changes",
     "NoiseTest": "noise_changes",
     "Monitor": "monitoring",
-    "Event": "monitoring",
+    "Event": "monitor_events",
     "Calibration": "arl",
     "cusum_arl": "cusum",
     "Estimate": "answers",

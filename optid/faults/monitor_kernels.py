@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from optid.faults.carry_kernels import carry, estimate, innovate, lose_state, review
+from optid.faults.carry_kernels import carry, estimate, lose_state, review
 from optid.faults.monitor_layout import (
     ACTIVE,
     ADDITIVE,
@@ -55,6 +55,7 @@ from optid.faults.monitor_layout import (
     D,
     M,
 )
+from optid.faults.predict_kernels import innovate
 from optid.faults.search_kernels import begin, factor, search
 
 

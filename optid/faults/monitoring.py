@@ -3,7 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import monitor_layout as at
 from optid.faults.arl import Calibration, calibrate, held_levels
+from optid.faults.monitor_events import Carried, Event
 from optid.faults.monitor_layout import State, Tables
 from optid.faults.monitor_tables import blank, monitored, tables, with_thresholds
 from optid.faults.signatures import Dictionary, dictionary
@@ -54,65 +55,6 @@ INPUTS = 20_000
 """Samples of simulated input for the calibration."""
 
 _KNOWN: dict[str, Calibration] = {}
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that happened.
-
-    Attributes:
-        kind: "alarm", "isolated" (the set of candidates shrank to one, or did not in time), "cleared", "untestable" (a
-            whole loss of the actuator would go unnoticed, or be taken for a constant) or "testable" (again).
-        sample: when, counted from the first sample that the monitor saw.
-        candidates: (label, posterior), most probable first, those of the 95 % set; ("unknown", 1.0) where nothing
-            explains the alarm.
-        onset: sample that the fault began at, of the first candidate; for "untestable" the sample since when.
-        size: magnitudes of the first candidate, as in `Dictionary.signature`.
-        statistic: energy that the first candidate explains; of "untestable" the energy that a whole loss would have.
-        note: what else is to be known.
-    """
-
-    kind: str
-    sample: int
-    candidates: tuple[tuple[str, float], ...] = ()
-    onset: int | None = None
-    size: tuple[float, ...] = ()
-    statistic: float = 0.0
-    note: str = ""
-
-    def __str__(self) -> str:
-        """Say it in one line."""
-        text = f"{self.sample}: {self.kind}"
-        if self.candidates:
-            names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates[:3]]
-            more = len(self.candidates) - len(names)
-            text += ": " + ", ".join(names) + (f" and {more} more" if more else "")
-        if self.kind == "untestable":
-            text += f" since {self.onset}"
-        elif self.onset is not None:
-            text += f", since {self.onset}"
-        if self.size:
-            text += ", size " + " ".join(f"{value:.4g}" for value in self.size)
-        return text + (f" ({self.note})" if self.note else "")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        return {**self.__dict__, "candidates": [[label, p] for label, p in self.candidates], "size": list(self.size)}
-
-
-@dataclass(frozen=True)
-class Carried:
-    """A fault that was named and is accounted for since.
-
-    Attributes:
-        label: the candidate.
-        size: its magnitudes.
-        deviation: their standard deviations; zero once they are known well enough and no longer estimated.
-    """
-
-    label: str
-    size: tuple[float, ...]
-    deviation: tuple[float, ...]
 
 
 class Monitor:
@@ -339,7 +281,7 @@ class Monitor:
 
     def _expand(self, u: Array, f: Array) -> None:
         if self._functions.compiled:
-            from optid.faults.carry_kernels import expand
+            from optid.faults.predict_kernels import expand
 
             bad = expand(self._functions, self._input_of, u, f)
             if bad >= 0:
