@@ -37,7 +37,7 @@ def told(statistic: np.ndarray, dimensions: np.ndarray, d: float) -> int:
     x = d * np.sqrt(statistic[:, slice(*ONSETS)])
     half = dimensions[:, None] / 2 - 1
     logs = gammaln(half + 1) - half * np.log(x / 2) + np.log(ive(half, x)) + x
-    return int(np.argmax(logsumexp(logs, axis=1)))
+    return int(np.argmax(np.asarray(logsumexp(logs, axis=1))))
 
 
 def main() -> None:
