@@ -1,0 +1,94 @@
+"""A plant that can break, a controller in its loop, and the picture of both, for faults_end_to_end.py."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import optid
+from optid.bases import Triangular
+from optid.faults import allocate
+from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
+from optid.models.kalman import kalman_gain
+
+ONSET = 400
+LOST = 0.6
+
+
+def plant(left: float = 1.0) -> HammersteinSS:
+    """Return a plant with two actuators; of the second so much is left."""
+    A = np.array([[0.85, 0.15, 0.0], [-0.15, 0.8, 0.1], [0.0, 0.0, 0.6]])
+    B, C = np.array([[0.9, 0.1], [0.2, -0.8], [0.4, 0.5]]), np.array([[1.0, 0.0, 0.3], [0.1, 1.0, -0.2]])
+    Q, R = 4e-4 * np.eye(3), 2.5e-3 * np.eye(2)
+    steady, basis = kalman_gain(A, C, Q, R), Triangular(6, (-1.2, 1.2))
+    u = np.delete(basis.nodes, basis.dropped)
+    functions = (Nonlinearity(basis, u + 0.25 * u**3), Nonlinearity(basis, left * np.tanh(1.5 * u)))
+    return HammersteinSS(A, B, C, K=steady.K, nonlinearities=functions,
+                         noise=NoiseCovariances(Q, R, np.zeros((3, 2)), steady.innovation))
+
+
+def levels(count: int, seed: int) -> np.ndarray:
+    drawn = np.random.default_rng(seed).uniform(-1.2, 1.2, (-(-count // 5), 2))
+    return np.repeat(drawn, 5, axis=0)[:count]
+
+
+def held(true: HammersteinSS, believed: HammersteinSS, r: np.ndarray, count: int = 60) -> np.ndarray:
+    """Return the outputs (N, l) of a plant whose controller and observer believe in a model of it."""
+    controller, rng = allocate(believed).controller(30), np.random.default_rng(0)
+    x, seen, outputs = np.zeros(true.nx), np.zeros(believed.nx), []
+    for _ in range(count):
+        u = controller.step(seen, r).u
+        v, w = true.expanded(u[None])[0], believed.expanded(u[None])[0]
+        y = true.C @ x + 0.05 * rng.standard_normal(2)
+        e = y - believed.C @ seen - believed.D @ w - believed.offset_y
+        x = true.A @ x + true.B @ v + 0.02 * rng.standard_normal(3)
+        seen = believed.A @ seen + believed.B @ w + believed.offset_x + believed.K @ e
+        outputs.append(y)
+    return np.array(outputs)
+
+
+def fit(truth: np.ndarray, simulated: np.ndarray) -> float:
+    return float(100 * (1 - np.linalg.norm(truth - simulated) / np.linalg.norm(truth - truth.mean(axis=0))))
+
+
+def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuilt: optid.faults.Reformulation,
+         courses: dict[str, np.ndarray], r: np.ndarray) -> None:
+    """Draw the stream with its events, the nonlinearity before and now, what can be held, and the control."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    stream, shape, reach, control = figure.subplots(2, 2).ravel()
+    shown = slice(ONSET - 60, None)
+    k = np.arange(len(record[1]))[shown]
+    for o, colour in enumerate(("tab:blue", "tab:green")):
+        stream.plot(k, record[1][shown, o], color=colour, linewidth=1, label=f"y{o + 1}")
+    stream.axvline(ONSET, color="black", linestyle=":", label="it breaks")
+    for event, colour in zip([e for e in events if e.sample >= ONSET], ("tab:red", "tab:orange")):
+        name = event.kind + (f": {event.candidates[0][0]}" if event.kind == "isolated" else "")
+        stream.axvline(event.sample, color=colour, label=name)
+    stream.set(title="monitor", xlabel="sample", ylim=(None, 1.9 * np.max(np.abs(record[1][shown]))))
+    stream.legend(fontsize=8, ncols=2, loc="upper left")
+
+    if rebuilt.schedule is not None:
+        one = rebuilt.schedule.values[0]
+        shape.plot(one.u, one.healthy, "--", color="gray", label="before")
+        shape.errorbar(one.u, one.values, 2 * one.std, fmt="o-", color="tab:orange", capsize=3, label="refitted")
+        ratio = (one.healthy[-1] - one.healthy[0]) / (2 * np.tanh(1.8))  # gauge of the identified model
+        shape.plot(one.u, (1 - LOST) * ratio * np.tanh(1.5 * one.u), color="black", linewidth=1, label="truth")
+    shape.set(title="actuator u2", xlabel="input", ylabel="effect")
+    shape.legend(fontsize=8)
+
+    for allocation, colour, label in ((allocate(rebuilt.healthy), "gray", "before"),
+                                      (allocate(rebuilt.model), "tab:orange", "now")):
+        corners = allocation.corners()
+        reach.fill(*corners.T, color=colour, alpha=0.25, label=label)
+    reach.plot(*r, "k*", markersize=11, label="reference")
+    reach.set(title="outputs that can be held", xlabel="y1", ylabel="y2")
+    reach.legend(fontsize=8)
+
+    for (name, course), colour in zip(courses.items(), ("gray", "tab:orange")):
+        control.plot(course[:, 0], color=colour, label=f"y1, {name}")
+        control.plot(course[:, 1], color=colour, linestyle="--", label=f"y2, {name}")
+    for value in r:
+        control.axhline(value, color="black", linewidth=0.6)
+    control.set(title="control of the damaged plant", xlabel="sample")
+    control.legend(fontsize=8, ncols=2)
+    figure.savefig(path, dpi=120)
