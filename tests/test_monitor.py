@@ -340,6 +340,13 @@ def test_refusals_name_what_is_wrong(tmp_path):
         monitor.run(np.zeros((3, 2)), [[0, 0], [0, np.inf], [0, 0]])
     with pytest.raises(DataError, match="2 samples and y has 3"):
         monitor.run(np.zeros((2, 2)), np.zeros((3, 2)))
+    for u, y in (([1.0], [0.0, 0.0]), ([1.0, 2.0, 3.0], [0.0, 0.0]), ([0.0, 0.0], "ab"), ([0.0, None], [0.0, 0.0])):
+        if None in u:
+            assert monitor.step(u, y) is None  # missing
+            continue
+        with pytest.raises(DataError, match=f"sample {monitor.samples}: .* 2 and 2 numbers are needed"):
+            monitor.step(u, y)
+    assert "thresholds as given" in str(monitor) and max(map(len, str(monitor).splitlines())) <= 80
     with pytest.raises(DataError, match="infinite"):
         monitor.step([0, 0], [np.inf, 0])
     with pytest.warns(DataWarning, match="sensor:y1 frozen is not monitored"):

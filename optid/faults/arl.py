@@ -69,6 +69,8 @@ class Calibration:
         """Say what the thresholds rest on."""
         tail = ", the tail extrapolated" if self.extrapolated else ""
         lines = [f"false alarm every {self.arl0:g} samples: {self.alarms} alarms in {self.samples} simulated{tail}"]
+        if not self.samples:
+            lines = ["thresholds as given"]
         return "\n".join(lines + [f"  {label:<40} {q:7.2f}" for label, q in zip(self.labels, self.q)])
 
     def to_dict(self) -> dict[str, Any]:

@@ -242,7 +242,15 @@ class Monitor:
         """
         from optid.faults.monitor_kernels import march
 
-        self._u[0], self._y[0] = u, y
+        try:
+            if np.size(u) != self._u.size or np.size(y) != self._y.size:
+                raise ValueError
+            self._u[0], self._y[0] = u, y
+        except (ValueError, TypeError):
+            raise DataError(
+                f"sample {self.samples}: u = {u!r} and y = {y!r}; {self._u.size} and {self._y.size} numbers are "
+                "needed, NaN for one that is missing."
+            ) from None
         if np.isinf(self._u).any() or np.isinf(self._y).any():
             raise DataError(f"sample {self.samples}: an infinite value; use NaN for one that is missing.")
         self._expand(self._u, self._f)
