@@ -20,7 +20,7 @@ import numpy as np
 
 from formulations.group_bound import certify
 from optid.errors import StructureError, nearest
-from optid.faults.profiles import PRIORS, CourseProblem, Profile, course_problem
+from optid.faults.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
 from optid.faults.scanning import Scan
 from optid.group_sparse import GroupProblem
 from optid.program import GroupForm, Program, View
@@ -183,8 +183,9 @@ def _fitted(problem: CourseProblem, prior: str, shapes: np.ndarray, columns: np.
         scale = 1.0 if prior == "tv" else 1.0 / problem.count
         changes = {int(k): float(height * scale) for k, height in zip(kept, heights)}
     rest = problem.r - problem.matrix @ course
-    value = problem.criterion(float(rest @ rest), kept.size)
-    fit = Profile(problem.label, course, std, prior, changes, {}, float(kept.size), 0.0, False,
+    freedom = float(EACH * kept.size)
+    value = problem.criterion(float(rest @ rest), freedom)
+    fit = Profile(problem.label, course, std, prior, changes, {}, freedom, 0.0, False,
                   tuple(refit.user_constraints))
     return value, fit, solution
 

@@ -159,7 +159,8 @@ def _sizes(found: Dictionary, whitened: Whitened, onsets: tuple[int, ...]) -> Ar
     if not onsets:
         return np.zeros((0, found.model.nx))
     flat = np.concatenate([_response(found, whitened, k).reshape(whitened.r.size, -1) for k in onsets], axis=1)
-    return np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0].reshape(len(onsets), -1)
+    solved = np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0]
+    return np.asarray(solved, dtype=float).reshape(len(onsets), -1)
 
 
 def _price(found: Dictionary, whitened: Whitened, penalty: "float | Thresholds | None") -> float:

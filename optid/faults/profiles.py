@@ -21,6 +21,9 @@ PRIORS = {
 }
 """What is believed of the course."""
 
+EACH = 2
+"""Degrees of freedom of a change: its size and its place."""
+
 ROUNDS = 20
 """Passes over the changes in which they are moved, at most."""
 
@@ -118,7 +121,7 @@ class CourseProblem:
             support: changes to begin with.
         """
         kept = list(support)
-        best = self.criterion(self.refitted(columns[:, kept])[1], len(kept)) if kept else np.inf
+        best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
         while len(kept) > 1:
             q, triangle = np.linalg.qr(columns[:, kept])
             try:
@@ -130,7 +133,7 @@ class CourseProblem:
             loss = solved**2 / np.sum(inverse**2, axis=1)  # by which the energy rises without each of them
             weakest = int(np.argmin(loss))
             trial = kept[:weakest] + kept[weakest + 1 :]
-            value = self.criterion(self.refitted(columns[:, trial])[1], len(trial))
+            value = self.criterion(self.refitted(columns[:, trial])[1], EACH * len(trial))
             if value > best:
                 break
             kept, best = trial, value
