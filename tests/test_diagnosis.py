@@ -185,6 +185,13 @@ def test_a_sensor_that_stands_still_in_its_noise_and_noise_that_grows_are_named(
     assert diagnose(small(), record(seed=5), faults).verdict == "healthy"
 
 
+def test_a_record_that_is_too_long_for_a_kind_says_so():
+    faults = dictionary(small(), kinds=["bias", "frozen"], state_jump=False)
+    u = inputs(1600)
+    answer = diagnose(small(), (u, inject(small(), u, Fault.step("sensor:y2", 800, 0.5), seed=1)), faults)
+    assert answer.best.label == "sensor:y2" and "cut it" in answer.untestable["sensor:y1 frozen"]
+
+
 def test_an_outlier_does_not_become_a_step(found, limits):
     u, y = record()
     y = y.copy()

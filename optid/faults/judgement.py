@@ -8,6 +8,7 @@ import numpy as np
 
 from optid.data import Data, Experiment
 from optid.faults.answers import Answer, Certificate, Diagnosis, Estimate
+from optid.faults.courses import LONGEST
 from optid.faults.evidence import Evidence
 from optid.faults.explaining import Fit, Ranking, doubles, ranked, singles
 from optid.faults.intervals import estimates
@@ -69,7 +70,7 @@ class Job:
         remaining = None
         if alarm:
             remaining = fits[0].remaining if fits else ranking.fits[0].remaining if ranking.fits else seen.healthy
-        lost = dict(seen.lost) | self.untold()
+        lost = dict(seen.lost) | self.untold(seen)
         return Diagnosis(
             verdict=verdict, detected=bool(alarm or stuck.faults),
             best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
@@ -144,14 +145,14 @@ class Job:
             return "not isolable"
         return "untestable" if not seen.tested and seen.lost else "unknown"
 
-    def untold(self) -> dict[str, str]:
+    def untold(self, seen: Seen) -> dict[str, str]:
         """Return the candidates that no search covers, and why."""
-        if self.found.model.l > 1:
-            return {}
-        return {
-            c.label: "with one output a fault of any course explains every record"
-            for c in self.found.candidates if c.kind == "frozen"
-        }
+        found = self.found
+        if seen.whitened.r.size > LONGEST:
+            why = f"the record has more than {LONGEST} readings, too many for this kind: cut it"
+            return {c.label: why for c in found.candidates if c.kind in ("frozen", "noise")}
+        why = "with one output a fault of any course explains every record"
+        return {c.label: why for c in found.candidates if c.kind == "frozen" and found.model.l == 1}
 
     def answers(self, fits: Sequence[Fit], stuck: tuple[Estimate, ...]) -> tuple[Answer, ...]:
         """Return the set of answers, sensors that stand still in each of them."""
