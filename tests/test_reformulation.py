@@ -319,6 +319,9 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         twice = answer(estimate(faults, "actuator:u1 loss", 0.5), posterior=0.5)
         other = answer(estimate(faults, "actuator:u2 loss", 0.5), posterior=0.5)
         reformulate(healthy, diagnosis(healthy, twice, other), data, if_ambiguous="maybe")
+    for wrong in ({"stage": "everything"}, {"nodes": 2}, {"if_ambiguous": "maybe"}):
+        with pytest.raises(StructureError, match=next(iter(wrong))):
+            reformulate(healthy, good, data, **wrong)
     u = np.array(data.u)
     u[ONSET + 10, 0] = np.nan
     with pytest.raises(DataError, match=f"Sample {ONSET + 10} lacks an input"):

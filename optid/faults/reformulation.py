@@ -147,14 +147,15 @@ def reformulate(
 
     Raises:
         DataError: a record that does not go with the model or the diagnosis.
-        StructureError: a diagnosis that names nothing; a damaged plant that is not detectable or not stabilisable, with
-            the mode; no noise covariances.
+        StructureError: an unknown word; a diagnosis that names nothing; a damaged plant that is not detectable or not
+            stabilisable, with the mode; no noise covariances.
         SolverFailed: a refit whose point does not hold.
 
     Warns:
         DataWarning: too few samples for a refit; values that no sample supports; a nonlinearity without an inverse.
     """
     _check(model, diagnosis, data)
+    _check_words(stage, nodes, if_ambiguous)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "route": route, "solver": solver}
     if diagnosis.verdict == "healthy":
         allocation, notes = _allocated(model, bounds)
@@ -202,6 +203,15 @@ def _check(model: Any, diagnosis: Any, data: Any) -> None:
         )
     if data is not None and not isinstance(data, Data):
         raise DataError("data is not a record: pass optid.Data(u, y, dt).")
+
+
+def _check_words(stage: str, nodes: int, if_ambiguous: str) -> None:
+    for word, given, known in (("stage", stage, ("auto", "affected only", "all with prior")),
+                               ("if_ambiguous", if_ambiguous, ("auto", "wait", "probe", "robust"))):
+        if given not in known:
+            raise StructureError(f"{word}={given!r}: use one of {', '.join(map(repr, known))}.")
+    if isinstance(nodes, bool) or nodes != int(nodes) or nodes < 3:
+        raise StructureError(f"nodes={nodes!r}: a whole number from 3 is needed.")
 
 
 def _member(model: "HammersteinSS", damage: Damage, data: Data | None, how: dict[str, Any], bounds: dict[str, Any]
