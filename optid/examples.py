@@ -61,11 +61,31 @@ def thruster(seed: int = 0, n: int = 600) -> Example:
         n: samples.
     """
     rng = np.random.default_rng(seed)
-    staircase = signals.steps(n, -1.2, 1.2, levels=9, hold=12)
-    ripple = signals.multisine(n, -0.5, 0.5, dt=0.1, band=(0.0, 2.0), phases="random", seed=seed)
-    u = np.clip(staircase + ripple, -1.5, 1.5)[:, None]
+    u = _currents(n, seed)
     power = float(np.mean(_THRUSTER.output(u) ** 2))
     return _THRUSTER.example(u, power / 30, rng)
+
+
+def broken_thruster(seed: int = 0, n: int = 400) -> Example:
+    """Return the rig of `thruster` with a propeller that breaks after five eighths of the record.
+
+    From then on the thrust that the current drives is half of what it was; input, dynamics and noise are of the same
+    kind. For `optid diagnose`, with a state-space model of `thruster`.
+
+    Args:
+        seed: seed of input and noise.
+        n: samples.
+    """
+    rng = np.random.default_rng([seed, 2])
+    u = _currents(n, seed + 1)
+    left = np.where(np.arange(n) < 5 * n // 8, 1.0, 0.5)
+    sigma = thruster(seed).truth["sigma"]
+    whole = _filter(_THRUSTER.b[0], _THRUSTER.a, left * _thrust(u[:, 0]))
+    noise = _filter(np.ones(1), _THRUSTER.a, sigma * rng.standard_normal(n))
+    data = Data(u, whole + noise, _THRUSTER.dt, inputs=["current"], outputs=["thrust"], input_units=["A"],
+                output_units=["N"], name="broken_thruster")
+    truth = {"f": (_thrust,), "noise_free": whole[:, None], "onset": 5 * n // 8, "lost": 0.5}
+    return Example(data, truth, dict(_THRUSTER.suggestion))
 
 
 def two_inputs(seed: int = 0, n: int = 2000) -> Example:
@@ -119,6 +139,7 @@ def vanderpol(seed: int = 0, n: int = 6000) -> Example:
 
 EXAMPLES: dict[str, Callable[..., Example]] = {
     "thruster": thruster,
+    "broken_thruster": broken_thruster,
     "dead_zone": dead_zone,
     "two_inputs": two_inputs,
     "pendulum": pendulum,
@@ -178,6 +199,13 @@ class _System:
             "noise_free": clean[:, None],
         }
         return Example(data, truth, dict(self.suggestion))
+
+
+def _currents(n: int, seed: int) -> np.ndarray:
+    """The input (n, 1) of the thruster rig: a staircase plus a multisine."""
+    staircase = signals.steps(n, -1.2, 1.2, levels=9, hold=12)
+    ripple = signals.multisine(n, -0.5, 0.5, dt=0.1, band=(0.0, 2.0), phases="random", seed=seed)
+    return np.clip(staircase + ripple, -1.5, 1.5)[:, None]
 
 
 def _filter(b: np.ndarray, a: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -35,12 +35,23 @@ def test_records_depend_on_the_seed_alone(name):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_suggestions_have_the_orders_of_the_truth(name):
     ex = EXAMPLES[name]()
-    if name in ARX:
+    if name == "broken_thruster":
+        assert ex.suggestion == thruster().suggestion
+    elif name in ARX:
         assert set(ex.suggestion) == {"na", "nb", "nk", "basis", "constraints"}
         assert (ex.suggestion["na"], ex.suggestion["nb"]) == (ex.truth["a"].size, ex.truth["b"][0].size)
     else:
         assert set(ex.suggestion) == {"na", "nb", "nk", "basis", "nx", "feedback_basis"}
         assert ex.suggestion["nx"] == ex.truth["n"]
+
+
+def test_half_of_the_thrust_is_lost_in_the_broken_rig():
+    ex = EXAMPLES["broken_thruster"](n=800)
+    f, onset, clean = ex.truth["f"][0], ex.truth["onset"], ex.truth["noise_free"][:, 0]
+    drive = 0.2 * f(ex.data.u[:, 0])  # b_0 of the rig
+    part = np.r_[0.0, 0.0, clean[2:] - 1.2 * clean[1:-1] + 0.4 * clean[:-2]]
+    np.testing.assert_allclose(part[2:onset], drive[2:onset], atol=1e-12)
+    np.testing.assert_allclose(part[onset:], (1 - ex.truth["lost"]) * drive[onset:], atol=1e-12)
 
 
 def test_dead_zone_has_the_noise_of_the_source():

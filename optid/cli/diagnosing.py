@@ -5,7 +5,18 @@ from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Load, Picture, Report, StateJump, reads_a_record
+from optid.cli.options import (
+    MODEL,
+    RECORD,
+    RESULT,
+    SOLVER,
+    Example,
+    Load,
+    Picture,
+    Report,
+    StateJump,
+    reads_a_record,
+)
 from optid.cli.results import command_line, conclude, save_picture
 from optid.cli.terminal import FILES, Waiting, hearing
 
@@ -14,9 +25,13 @@ from optid.cli.terminal import FILES, Waiting, hearing
 def diagnose(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (.json) of a state-space model.")],
     data: Annotated[
-        list[Path], typer.Argument(metavar="DATA", help="The record: a CSV, Parquet, MAT, NPZ or npy file.")
-    ],
+        list[Path] | None,
+        typer.Argument(
+            metavar="DATA", help="The record: a CSV, Parquet, MAT, NPZ or npy file.", show_default=False
+        ),
+    ] = None,
     *,
+    example: Example = None,
     how: dict[str, Any],
     healthy: Annotated[
         list[Path] | None,
@@ -29,7 +44,8 @@ def diagnose(
         list[Path] | None,
         typer.Option(
             "--identified", metavar=FILES, rich_help_panel=RECORD,
-            help="The record that the model was identified from: the uncertainty of the model counts as noise.",
+            help="The record that the model was identified from, or the name of a built-in one: the uncertainty of "
+            "the model counts as noise. [dim]the model is exact[/]",
         ),
     ] = None,
     rescale: Annotated[
@@ -63,7 +79,9 @@ def diagnose(
     solver: Annotated[
         str, typer.Option("--solver", "-s", metavar="NAME", rich_help_panel=SOLVER, help="See optid solvers.")
     ] = "auto",
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=SOLVER, help="Seed of simulated thresholds.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", rich_help_panel=SOLVER, help="Seed of simulated thresholds, and of an example.")
+    ] = 0,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", rich_help_panel=RESULT, help="Write the diagnosis (.json)."),
@@ -86,14 +104,14 @@ def diagnose(
         waiting.step("reading")
         plant = words.state_space_model(model)
         how = words.as_modelled(how, plant)
-        record: Any = words.read_record(data, how)
+        record: Any = words.record(data, how, example, seed)[0]
         if record.n_experiments > 1:
             raise DataError(
                 f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and cut it to the "
                 "experiment)."
             )
         sound: Any = words.read_record(healthy, how) if healthy else None
-        origin: Any = words.read_record(identified, how) if identified else None
+        origin = _origin(identified, how)
         waiting.step("signatures")
         found = dictionary(
             plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--load"),
@@ -111,8 +129,28 @@ def diagnose(
             from optid.faults.diagnosis_report import write
 
             waiting.step("report")
-            write(answer, report, record=record.name or data[0].name, command=command_line())
+            write(answer, report, record=record.name, command=command_line())
         if picture is not None:
             waiting.step("drawing")
             save_picture(answer.plot(), picture)
+    if origin is None and answer.detected:
+        heard.append(
+            "The model counts as exact, so that its errors may look like a fault: --identified FILE (the record that "
+            "it was identified from) takes its uncertainty into account."
+        )
     conclude(str(answer), heard, diagnosis=out, report=report, picture=picture)
+
+
+def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:
+    """Return the record that a model was identified from; a built-in one where no file has its name."""
+    from optid.cli import arguments as words
+
+    if not identified:
+        return None
+    name = str(identified[0])
+    if len(identified) == 1 and not identified[0].exists() and not identified[0].suffix:
+        from optid.examples import EXAMPLES
+
+        if name in EXAMPLES:
+            return EXAMPLES[name]().data
+    return words.read_record(identified, how)
