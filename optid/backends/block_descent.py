@@ -24,8 +24,7 @@ def run(program: Program, settings: Settings) -> Answer:
                      limit=int(dict(settings.options).get("limit", 2000)), start=start)
     values = form.shaped(found.a)
     duals = {form.residual: -found.point}
-    # the judgement allows a hundred times the accuracy asked for
-    if found.converged or found.gap <= 10 * settings.accuracy:
+    if found.converged or found.gap <= max(100 * settings.accuracy, 1e-7):  # what the judgement allows
         return Answer(Status.LOCAL, "duality gap closed", values, duals, found.rounds)
     return Answer(Status.LIMIT, f"stopped at a relative gap of {found.gap:.1e}", values, duals, found.rounds)
 
