@@ -36,7 +36,7 @@ VARIANCES = np.geomspace(1e-2, 1e4, 61)
 """Variances of an added noise, over the inverse mean eigenvalue of H H'."""
 
 ONSETS = 12
-"""Onsets of an added noise that are tried at most."""
+"""Onsets of an added noise that are tried over the record, and again around the best of them."""
 
 
 def without_signature(found: "Dictionary") -> tuple[list[Candidate], list[Candidate]]:
@@ -108,11 +108,13 @@ def _noises(seen: "Seen", found: "Dictionary", noises: list[Candidate]) -> list[
     from scipy.special import logsumexp
 
     white, count = seen.whitened, len(seen.whitened.r)
-    onsets = np.unique(np.linspace(0, max(count - 2 * SHORTEST, 0), ONSETS).astype(int))
+    last = int(np.flatnonzero(white.present.any(axis=1))[-1])  # later readings are taken out or missing
+    onsets = np.unique(np.linspace(0, max(last + 1 - 2 * SHORTEST, 0), ONSETS).astype(int))
     rows: dict[str, list[tuple[float, ...]]] = {}
     prepared = {}
-    for onset in onsets:
-        search = noise_search(found, white, onset=int(onset), free_start=False)
+
+    def attempt(onset: int) -> None:
+        search = noise_search(found, white, onset=onset, free_start=False)
         for place in search.places:
             z2 = ((place.axes.T @ white.r.ravel()) ** 2)[None]
             grid = VARIANCES / float(np.mean(place.s))
@@ -122,25 +124,40 @@ def _noises(seen: "Seen", found: "Dictionary", noises: list[Candidate]) -> list[
             weights /= weights.sum()
             mean = float(weights @ np.sqrt(grid))
             spread = float(weights @ (np.sqrt(grid) - mean) ** 2)
-            rows.setdefault(place.label, []).append((int(onset), total, mean, spread, float(values.max())))
-            prepared[place.label, int(onset)] = place, float(grid[values.argmax()])
+            rows.setdefault(place.label, []).append((onset, total, mean, spread, float(values.max())))
+            prepared[place.label, onset] = place, float(grid[values.argmax()])
+
+    for onset in onsets.tolist():
+        attempt(onset)
+    labels = {c.label for c in noises} & set(rows)
+    if not labels:
+        return []
+    best = max((row for label in labels for row in rows[label]), key=lambda row: row[1])[0]
+    at = int(np.searchsorted(onsets, best))
+    around = np.linspace(onsets[max(at - 1, 0)], onsets[min(at + 1, onsets.size - 1)], ONSETS + 1).astype(int)
+    for onset in sorted(set(around.tolist()) - set(onsets.tolist())):
+        attempt(onset)
     explanations = []
     for candidate in noises:
         found_here = rows.get(candidate.label)
         if not found_here:
             continue
         k, logs, means, spreads, highest = (np.array(column) for column in zip(*found_here))
-        logs = logs - np.log(len(onsets))
+        every = np.arange(count)  # an onset that was not tried counts as the nearest that was
+        near = np.argmin(np.abs(every[:, None] - k), axis=1)
+        logs = logs[near] - np.log(count)
+        logs[k.astype(int)] += 1e-9  # of equals the one that was tried is reported
         kept = logs > logs.max() - NEGLIGIBLE
+        means, spreads, highest = means[near], spreads[near], highest[near]
 
-        def rest(onset: int, label: str = candidate.label) -> Explained:
-            place, rho = prepared[label, onset]
+        def rest(onset: int, label: str = candidate.label, tried: np.ndarray = k[near].astype(int)) -> Explained:
+            place, rho = prepared[label, int(tried[onset])]
             along = place.axes.T @ white.r.ravel()
             shrunk = place.axes @ ((1 - 1 / np.sqrt(1 + rho * place.s)) * along)
             return Explained(np.zeros_like(white.r), white.r - shrunk.reshape(white.r.shape), 1)
 
         explanations.append(Explanation(
-            (candidate,), k[kept].astype(int)[:, None], logs[kept], means[kept][:, None], spreads[kept][:, None, None],
+            (candidate,), every[kept][:, None], logs[kept], means[kept][:, None], spreads[kept][:, None, None],
             2 * highest[kept], rest,
         ))
     return explanations

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
 """Deflections at which the probabilities are computed."""
 
+NUMBERS = 200_000_000
+"""Numbers in the simulated windows of one fault, above which a study is refused: they would not fit in memory."""
+
 MIDDLE = 0.3, 0.7
 """Where in the window an unknown onset is drawn from."""
 
@@ -172,8 +175,17 @@ def study(
     Raises:
         DataError: too few calibration windows for the false-alarm rate, an input of another length or one that does
             not move a suspected actuator.
-        StructureError: a window that is too short, impossible probabilities, no candidate with a signature.
+        StructureError: a window that is too short or too long, impossible probabilities or numbers of draws, no
+            candidate with a signature.
     """
+    for word, value in (("draws", draws), ("calibration", calibration)):
+        if value != int(value) or value < 1:
+            raise StructureError(f"{word}={value!r}; a whole number of simulated windows, from 1, is needed.")
+    if window * found.model.l * draws > NUMBERS:
+        raise StructureError(
+            f"window={window}: {draws} simulated windows of so many samples do not fit in memory; "
+            f"{NUMBERS // (found.model.l * draws)} samples do, or fewer draws."
+        )
     if not 0.5 <= prob < 1:
         raise StructureError(f"prob={prob!r}; a probability from 0.5 to below 1 is needed.")
     if isinstance(onset, str) and onset != "unknown":

@@ -105,7 +105,8 @@ class Job:
         note = " ".join(words for words in (unproved, note) if words)
         if not ranking.fits:
             return seen, Way(ranking, NOTHING, note), True
-        kind = "exhaustive" if ranking.exhaustive else "grid"
+        on_grid = any(c.kind == "noise" for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
+        kind = "exhaustive" if ranking.exhaustive and not on_grid else "grid"
         return seen, Way(ranking, Certificate(kind, ranking.fits[0].gain, ranking.odds), note), True
 
     def explained(self, seen: Seen, part: Experiment) -> tuple[Seen, Ranking, str]:

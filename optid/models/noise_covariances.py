@@ -10,6 +10,10 @@ from optid.bases.basis import Array
 from optid.errors import StructureError
 
 
+ROUNDING = -1e-4
+"""Smallest eigenvalue of a correlation matrix that may be a rounding error of an estimate."""
+
+
 @dataclass(frozen=True, eq=False)
 class NoiseCovariances:
     """E[w; v][w; v]^T = [Q S; S^T R] of x+ = A x + ... + w, y = C x + ... + v.
@@ -21,7 +25,8 @@ class NoiseCovariances:
         innovation: (l, l) covariance of the innovations, the errors of the best one-step prediction.
 
     Raises:
-        StructureError: shapes that do not agree, values that are not finite, or a covariance that is not symmetric.
+        StructureError: shapes that do not agree, values that are not finite, or a covariance that is not symmetric or
+            has a negative variance along some direction.
     """
 
     Q: Array
@@ -43,6 +48,8 @@ class NoiseCovariances:
                 raise StructureError(f"{name} has shape {matrix.shape}; S, {self.S.shape}, needs {(size, size)}.")
             if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-8 * np.abs(matrix).max(initial=0.0):
                 raise StructureError(f"{name} is not symmetric.")
+        _check_positive("[Q S; S' R]", np.block([[self.Q, self.S], [self.S.T, self.R]]))
+        _check_positive("innovation", self.innovation)
 
     @classmethod
     def of_innovations(cls, gain: Array, covariance: Array) -> "NoiseCovariances":
@@ -79,6 +86,18 @@ class NoiseCovariances:
             np.array(content["Q"], dtype=float).reshape(n, n), outputs,
             np.array(content["S"], dtype=float).reshape(n, len(outputs)), np.array(content["innovation"], dtype=float),
         )
+
+
+def _check_positive(name: str, matrix: Array) -> None:
+    """Refuse a negative variance along any direction, rounding aside.
+
+    Raises:
+        StructureError: naming the matrix.
+    """
+    variances = np.diag(matrix)
+    size = np.sqrt(np.where(variances > 0, variances, 1.0))
+    if variances.size and np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < ROUNDING:
+        raise StructureError(f"{name} is no covariance: it has a negative variance along some direction.")
 
 
 def _congruent(turn: Array, matrix: Array) -> Array:

@@ -1,0 +1,64 @@
+"""Absurd options and damaged files of the faults: one sentence that names what is wrong; honest onsets of noise."""
+
+import json
+
+import numpy as np
+import pytest
+from fault_plants import levels
+from test_fault_injection import small
+from typer.testing import CliRunner
+
+from optid.cli.app import app
+from optid.errors import StructureError
+from optid.faults import Fault, diagnose, dictionary, inject
+from optid.models import NoiseCovariances
+
+
+@pytest.mark.parametrize(("words", "named"), [({"draws": 0}, "draws=0"), ({"calibration": 0.5}, "calibration=0.5"),
+                                              ({"window": 10**8}, "fit in memory")])
+def test_a_study_of_absurd_size_is_refused(words, named):
+    with pytest.raises(StructureError, match=named):
+        dictionary(small()).isolability(**words)
+
+
+@pytest.mark.parametrize("name", ["Q", "R"])
+def test_a_model_file_with_negative_variances_is_damaged(name, tmp_path):
+    path = small().save(tmp_path / "model.json")
+    content = json.loads(path.read_text())
+    content["noise"][name][0][0] = -1.0
+    path.write_text(json.dumps(content))
+    result = CliRunner().invoke(app, ["isolability", str(path)])
+    assert result.exit_code == 2 and "negative variance" in result.output and "damaged" in result.output
+
+
+def test_noise_of_innovations_is_a_covariance_though_singular():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        root = rng.standard_normal((3, 3)) * 10.0 ** rng.integers(-4, 4, 3)[:, None]
+        NoiseCovariances.of_innovations(rng.standard_normal((5, 3)), root @ root.T)
+    with pytest.raises(StructureError, match="innovation"):
+        NoiseCovariances(np.eye(2), np.eye(2), np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 1.0]]))
+
+
+def test_the_onset_of_grown_noise_has_an_interval_that_holds_it():
+    model, held = small(), 0
+    found = dictionary(model, kinds=["bias", "noise"], state_jump=False)
+    onsets = (70, 95, 113, 128)
+    for seed, onset in enumerate(onsets):
+        u = levels(200, seed)
+        y = inject(model, u, [Fault.sensor_noise("sensor:y2", onset, scale=6)], seed=seed)
+        answer = diagnose(model, (u, y), found)
+        assert answer.verdict == "faulty" and answer.certificate.kind == "grid"
+        (fault,) = answer.best.faults
+        assert fault.kind == "noise" and abs(fault.onset - onset) < 15
+        low, high = fault.onset_interval
+        held += low - 2 <= onset <= high + 2
+    assert held >= len(onsets) - 1
+
+
+def test_a_record_that_stands_still_at_its_end_is_searched_for_noise():
+    model, u = small(), levels(160, 3)
+    y = np.array(inject(model, u, [], seed=3))
+    y[80:] = y[79]
+    answer = diagnose(model, (u, y), dictionary(model, kinds=["bias", "noise"], state_jump=False))
+    assert answer.verdict == "faulty" and {fault.kind for fault in answer.best.faults} == {"frozen"}
