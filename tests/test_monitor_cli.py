@@ -202,3 +202,9 @@ def test_reading_goes_on_where_it_stopped():
     assert found.error == "" and found.lines.tolist() == [4]
     with pytest.raises(DataError, match="not the delimiter"):
         reader(delimiter=",", decimal=",")
+
+
+def test_thresholds_of_another_arl0_are_refused_and_an_empty_stream_is_said_to_be(folder):
+    text = run(folder, "--thresholds", "thresholds.json", "--arl0", "123456", code=2)[1]
+    assert "--arl0 asks for 123456" in text
+    assert "no sample was read" in run(folder, "--thresholds", "thresholds.json", text="t,u1,u2,y1,y2\n")[1]

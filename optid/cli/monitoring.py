@@ -33,6 +33,9 @@ POLL = 0.1
 BLOCK = 1 << 16
 """Bytes read at a time."""
 
+ARL0 = 10_000
+"""Mean samples between false alarms that are asked for where nothing is said."""
+
 KEPT = 10_000
 """Samples after which the state is saved, events or not."""
 
@@ -73,8 +76,12 @@ def monitor(
     load: Load = None,
     state_jump: StateJump = True,
     arl0: Annotated[
-        float, typer.Option("--arl0", metavar="N", rich_help_panel=MODEL, help="Mean samples between false alarms.")
-    ] = 10_000,
+        float | None,
+        typer.Option(
+            "--arl0", metavar="N", rich_help_panel=MODEL,
+            help="Mean samples between false alarms. [dim]10000, or that of --thresholds[/]",
+        ),
+    ] = None,
     window: Annotated[
         int, typer.Option("--window", "-w", metavar="N", rich_help_panel=MODEL, help="Samples of the window.")
     ] = 100,
@@ -149,8 +156,10 @@ def monitor(
     _watch(watcher, reader, follow, until_end, state, strict=strict, as_json=lines)
 
 
-def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, **how: Any) -> Any:
-    from optid.errors import ModelFileError
+def _new(
+    plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, arl0: float | None, **how: Any
+) -> Any:
+    from optid.errors import ModelFileError, StructureError
     from optid.faults import Calibration, Monitor, dictionary
     from optid.faults.monitoring import KINDS_BY_DEFAULT
 
@@ -160,8 +169,13 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
             known = Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ModelFileError(f"{path} does not hold thresholds ({error}): name another file") from None
+        if arl0 is not None and arl0 != known.arl0:
+            raise StructureError(
+                f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks for {arl0:g}: "
+                "leave --arl0 out, or name another file"
+            )
         return Monitor(plant, found, thresholds=known, **how)
-    made = Monitor(plant, found, **how)
+    made = Monitor(plant, found, ARL0 if arl0 is None else arl0, **how)
     if path is not None:
         path.write_text(json.dumps(made.calibration.to_dict(), indent=1), encoding="utf-8")
     return made
@@ -227,6 +241,8 @@ def _watch(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         keep()
+    if not watcher.samples:
+        note("no sample was read: there was nothing behind the header")
     if bad:
         note(f"{bad} of {watcher.samples} rows could not be read in full")
 

@@ -150,8 +150,8 @@ def _noises(seen: "Seen", found: "Dictionary", noises: list[Candidate]) -> list[
         kept = logs > logs.max() - NEGLIGIBLE
         means, spreads, highest = means[near], spreads[near], highest[near]
 
-        def rest(onset: int, label: str = candidate.label, tried: np.ndarray = k[near].astype(int)) -> Explained:
-            place, rho = prepared[label, int(tried[onset])]
+        def rest(onset: int, label: str = candidate.label, tried: np.ndarray = k, of: np.ndarray = near) -> Explained:
+            place, rho = prepared[label, int(tried[of[onset]])]
             along = place.axes.T @ white.r.ravel()
             shrunk = place.axes @ ((1 - 1 / np.sqrt(1 + rho * place.s)) * along)
             return Explained(np.zeros_like(white.r), white.r - shrunk.reshape(white.r.shape), 1)

@@ -9,7 +9,6 @@ import numpy as np
 from optid.bases.basis import Array
 from optid.errors import StructureError
 
-
 ROUNDING = -1e-4
 """Smallest eigenvalue of a correlation matrix that may be a rounding error of an estimate."""
 
