@@ -9,8 +9,9 @@ from test_fault_injection import small
 from typer.testing import CliRunner
 
 from optid.cli.app import app
-from optid.errors import StructureError
-from optid.faults import Fault, diagnose, dictionary, inject
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.faults import Fault, check_channels, diagnose, dictionary, inject
 from optid.models import NoiseCovariances
 
 
@@ -62,3 +63,13 @@ def test_a_record_that_stands_still_at_its_end_is_searched_for_noise():
     y[80:] = y[79]
     answer = diagnose(model, (u, y), dictionary(model, kinds=["bias", "noise"], state_jump=False))
     assert answer.verdict == "faulty" and {fault.kind for fault in answer.best.faults} == {"frozen"}
+
+
+@pytest.mark.parametrize(("spoil", "named"), [
+    (lambda u: u[:, ::-1], "inputs u1, u2 look swapped"), (lambda u: u * [1.0, 25.4], "'u2' .* divided by 25.4")])
+def test_inputs_that_are_swapped_or_in_another_unit_are_named(spoil, named):
+    model, u = small(), levels(300, 4)
+    data = Data(u, inject(model, u, [], seed=4), model.dt, list(model.inputs), list(model.outputs))
+    check_channels(model, data)
+    with pytest.raises(DataError, match=named):
+        check_channels(model, Data(spoil(u), data.y, model.dt, list(model.inputs), list(model.outputs)))

@@ -1,5 +1,6 @@
 """What is wrong with a record before any statistics: flat lines, swapped channels, jumps of the unit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations
 from typing import TYPE_CHECKING
@@ -77,34 +78,39 @@ def flat_lines(data: Data, at_least: int = FLAT) -> tuple[FlatLine, ...]:
 
 
 def check_channels(model: "HammersteinSS", data: Data) -> None:
-    """Refuse a healthy record whose outputs are swapped or whose unit jumps.
+    """Refuse a healthy record whose outputs or inputs are swapped or whose unit jumps.
 
-    Both are told by the innovations: another order of the outputs, or another factor from some sample on, makes them
-    ten times smaller in energy, and the size that the model says.
+    All are told by the innovations: another order of the channels, or another factor of an output from some sample on,
+    makes them ten times smaller in energy, and the size that the model says. Of an input a factor of the whole record
+    is tried.
 
     Args:
         model: with noise covariances.
         data: the record.
 
     Raises:
-        DataError: outputs that look swapped, named; a change of the unit of an output, with the sample and the factor.
+        DataError: outputs or inputs that look swapped, named; a change of the unit of an output, with the sample and
+            the factor; an input in another unit, with the factor.
     """
     raw = in_units_of(model, data)
     energy = _energy(model, raw)
     readings = sum(int(np.sum(~np.isnan(part.y))) for part in raw.experiments)
     if energy < 2 * readings:
         return
-    if 1 < data.l <= 5:
-        orders = [order for order in permutations(range(data.l)) if order != tuple(range(data.l))]
-        trials = [_energy(model, raw.mapped(lambda u: u, lambda y, o=order: y[:, list(o)])) for order in orders]
-        best = int(np.argmin(trials))
-        if trials[best] < BETTER * energy:
-            moved = [data.outputs[i] for i, j in enumerate(orders[best]) if i != j]
-            order = ", ".join(data.outputs[j] for j in orders[best])
-            raise DataError(
-                f"The outputs {', '.join(moved)} look swapped: in the order {order} the model predicts them "
-                f"{energy / trials[best]:.0f} times better. Check the names of the columns."
-            )
+    _check_order("outputs", data.outputs, energy,
+                 lambda order: _energy(model, raw.mapped(lambda u: u, lambda y: y[:, order])))
+    _check_order("inputs", data.inputs, energy,
+                 lambda order: _energy(model, raw.mapped(lambda u: u[:, order], lambda y: y)))
+    for c, name in enumerate(data.inputs):
+        for factor in [*UNITS, *(1 / unit for unit in UNITS)]:
+            scale = np.ones(data.m)
+            scale[c] = 1 / factor
+            trial = _energy(model, raw.mapped(lambda u, s=scale: u * s, lambda y: y))
+            if trial < BETTER * energy and trial < 2 * readings:
+                raise DataError(
+                    f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "
+                    f"{factor:g}. Convert it."
+                )
     for number in range(raw.n_experiments):
         for o, name in enumerate(data.outputs):
             found = _unit_jump(model, raw, number, o)
@@ -114,6 +120,28 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
                     f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the "
                     f"readings fit the model when divided by {found[1]:g}. Convert them."
                 )
+
+
+def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[[list[int]], float]) -> None:
+    """Refuse channels that the model predicts ten times better in another order.
+
+    Args:
+        what: "inputs" or "outputs".
+        names: of the channels.
+        energy: of the innovations as they are.
+        of: energy in another order.
+    """
+    if not 1 < len(names) <= 5:
+        return
+    orders = [order for order in permutations(range(len(names))) if order != tuple(range(len(names)))]
+    trials = [of(list(order)) for order in orders]
+    best = int(np.argmin(trials))
+    if trials[best] < BETTER * energy:
+        moved = [names[i] for i, j in enumerate(orders[best]) if i != j]
+        raise DataError(
+            f"The {what} {', '.join(moved)} look swapped: in the order {', '.join(names[j] for j in orders[best])} the "
+            f"model predicts the outputs {energy / trials[best]:.0f} times better. Check the names of the columns."
+        )
 
 
 def _unit_jump(model: "HammersteinSS", raw: Data, number: int, o: int) -> tuple[int, float] | None:
@@ -134,7 +162,11 @@ def _unit_jump(model: "HammersteinSS", raw: Data, number: int, o: int) -> tuple[
 
 
 def _energy(model: "HammersteinSS", data: Data) -> float:
-    found = whiten(model, data)
+    """Energy of the innovations; infinite where the model is not defined for such inputs."""
+    try:
+        found = whiten(model, data)
+    except DataError:
+        return float("inf")
     parts = [found] if isinstance(found, Whitened) else list(found)
     return float(sum(np.sum(part.r**2) for part in parts))
 
