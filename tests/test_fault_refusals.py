@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.data import Data
 from optid.errors import DataError, StructureError
-from optid.faults import Fault, check_channels, diagnose, dictionary, inject
+from optid.faults import Fault, check_channels, diagnose, dictionary, inject, reformulate
 from optid.models import NoiseCovariances
 
 
@@ -73,3 +73,18 @@ def test_inputs_that_are_swapped_or_in_another_unit_are_named(spoil, named):
     check_channels(model, data)
     with pytest.raises(DataError, match=named):
         check_channels(model, Data(spoil(u), data.y, model.dt, list(model.inputs), list(model.outputs)))
+
+
+def test_two_faults_of_one_actuator_at_different_times_are_refitted():
+    model, u = small(), levels(400, 6)
+    y = inject(model, u, [Fault.loss("actuator:u1", 200, 0.6), Fault.step("actuator:u1", 240, 0.8)], seed=6)
+    data = Data(u, y, model.dt, list(model.inputs), list(model.outputs))
+    answer = diagnose(model, data, dictionary(model, kinds=["bias", "loss"]), max_faults=2)
+    assert answer.verdict == "faulty" and len(answer.best.faults) == 2
+    damaged = reformulate(model, answer, data).model
+    after = Data(u[240:], y[240:], model.dt, list(model.inputs), list(model.outputs))
+
+    def squares(m):
+        return float(np.nansum((m.predict(after) - y[240:]) ** 2))
+
+    assert squares(damaged) < 0.9 * squares(model)

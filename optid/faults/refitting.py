@@ -253,7 +253,9 @@ class Refitting:
         rows, wanted = np.vstack([rows, shares]), np.concatenate([wanted, np.ones(len(shares))])
         full = np.column_stack([s, np.zeros((len(s), len(self.curves)))])
         before, after = rows.T @ rows, rows.T @ rows + full.T @ full
-        mean = np.linalg.solve(before, rows.T @ wanted)
+        told = rows.any(axis=0)  # the others, as an unknown initial state, have a flat prior
+        before, mean = before[np.ix_(told, told)], np.zeros(len(before))
+        mean[told] = np.linalg.solve(before, (rows.T @ wanted)[told])
         point = np.linalg.solve(after, rows.T @ wanted + full.T @ (s @ self.start - r))
         left = float(np.sum((full @ point - (s @ self.start - r)) ** 2) + np.sum((rows @ point - wanted) ** 2))
         left -= float(np.sum((rows @ mean - wanted) ** 2))
