@@ -88,3 +88,12 @@ def test_two_faults_of_one_actuator_at_different_times_are_refitted():
         return float(np.nansum((m.predict(after) - y[240:]) ** 2))
 
     assert squares(damaged) < 0.9 * squares(model)
+
+
+def test_what_is_left_names_the_test_behind_its_p_value_and_standing_readings_are_no_readings():
+    model, u = small(), levels(160, 7)
+    y = np.array(inject(model, u, [Fault.step("sensor:y1", 80, 2.0)], seed=7))
+    answer = diagnose(model, (u, y))
+    assert f"the worst of four tests ({answer.remaining.test})" in " ".join(str(answer).split())
+    with pytest.raises(DataError, match="stand still to the bit do not count"):
+        diagnose(model, (u, np.zeros_like(y)))

@@ -134,12 +134,10 @@ def remaining_words(found: "Diagnosis") -> str:
     rest = found.remaining
     assert rest is not None
     words = (
-        f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings, p-value "
-        f"{probability_words(rest.p_value)}"
+        f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings; the worst of four tests "
+        f"({rest.test}) has p-value {probability_words(rest.p_value)}"
     )
-    if found.verdict != "unknown":
-        return words
-    return f"{words} ({rest.test}); {course_words(found)}"
+    return words if found.verdict != "unknown" else f"{words}; {course_words(found)}"
 
 
 def course_words(found: "Diagnosis") -> str:

@@ -183,4 +183,7 @@ def enough(whitened: Whitened, nx: int) -> None:
     least = 2 * nx + 2
     seen = int(whitened.present.any(axis=1).sum())
     if seen < least:
-        raise DataError(f"The record has {seen} samples with a reading: {least} are needed for {nx} states.")
+        raise DataError(
+            f"The record has {seen} samples with a reading (those that stand still to the bit do not count): {least} "
+            f"are needed for {nx} states."
+        )

@@ -62,9 +62,9 @@ class Values:
 
     def __str__(self) -> str:
         """Print the values as a table."""
-        head = f"  {'u':>9}{'before':>10}{'now':>10}{'+-':>9}"
+        head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
         rows = [
-            f"  {u:>9.3g}{old:>10.4g}{new:>10.4g}{std:>9.2g}{'  prior only' if unseen else ''}"
+            f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"
             for u, old, new, std, unseen in zip(self.u, self.healthy, self.values, self.std, self.prior_only)
         ]
         return "\n".join([f"f of {self.name}", head, *rows])
