@@ -82,6 +82,9 @@ def test_two_faults_of_one_actuator_at_different_times_are_refitted():
     answer = diagnose(model, data, dictionary(model, kinds=["bias", "loss"]), max_faults=2)
     assert answer.verdict == "faulty" and len(answer.best.faults) == 2
     damaged = reformulate(model, answer, data).model
+    same = reformulate(model, answer, (u, y)).model
+    np.testing.assert_array_equal(same.B, damaged.B)
+    np.testing.assert_array_equal(same.offset_x, damaged.offset_x)
     after = Data(u[240:], y[240:], model.dt, list(model.inputs), list(model.outputs))
 
     def squares(m):

@@ -311,7 +311,7 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         reformulate(healthy, "d.json", data)
     with pytest.raises(StructureError, match="Several diagnoses"):
         reformulate(healthy, (good, good), data)
-    with pytest.raises(DataError, match="optid.Data"):
+    with pytest.raises(DataError, match="no column 'u1'"):
         reformulate(healthy, good, data.y)
     with pytest.raises(DataError, match="beyond the record"):
         reformulate(healthy, good, Data(data.u[:50], data.y[:50]))

@@ -17,6 +17,7 @@ from optid.faults.allocation import Allocation, Target, allocate
 from optid.faults.ambiguity import Ambiguity, advise, robust_allocation
 from optid.faults.damage import Damage, check_answers, damages, merged
 from optid.faults.inversion import inverse
+from optid.faults.records import record_of
 from optid.faults.refitting import NODES, Prior
 from optid.faults.schedule import Schedule, refit
 from optid.faults.virtual_sensor import Observer, observer
@@ -117,7 +118,7 @@ class Reformulation:
 
 
 def reformulate(
-    model: "HammersteinSS", diagnosis: "Diagnosis", data: Data | None = None, *,
+    model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
     constraints: Sequence[Any] | str = "default", prior: Prior | None = None, nodes: int = NODES, stage: str = "auto",
     low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
     route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0,
@@ -131,7 +132,8 @@ def reformulate(
     Args:
         model: the healthy model, with noise covariances.
         diagnosis: of the record.
-        data: the record with the fault; without it the plant is what the diagnosis alone says.
+        data: the record with the fault: Data, a pair (u, y) of arrays, or a frame or file with the channels of the
+            model as columns; without it the plant is what the diagnosis alone says.
         constraints: of a damaged nonlinearity: rules of `formulations.shape` or their words; "default": monotone as
             before and nowhere steeper.
         prior: what is believed beforehand; by default with the curvature that makes the record most probable.
@@ -154,7 +156,9 @@ def reformulate(
     Warns:
         DataWarning: too few samples for a refit; values that no sample supports; a nonlinearity without an inverse.
     """
-    _check(model, diagnosis, data)
+    _check(model, diagnosis)
+    if data is not None and not isinstance(data, Data):
+        data = record_of(model, data)
     _check_words(stage, nodes, if_ambiguous)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "route": route, "solver": solver}
     if diagnosis.verdict == "healthy":
@@ -187,7 +191,7 @@ def reformulate(
     )
 
 
-def _check(model: Any, diagnosis: Any, data: Any) -> None:
+def _check(model: Any, diagnosis: Any) -> None:
     if getattr(model, "kind", "") != "HammersteinSS":
         raise StructureError(
             f"A {getattr(model, 'title', type(model).__name__)} cannot be reformulated: a state-space model with noise "
@@ -201,8 +205,6 @@ def _check(model: Any, diagnosis: Any, data: Any) -> None:
         raise DataError(
             f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
         )
-    if data is not None and not isinstance(data, Data):
-        raise DataError("data is not a record: pass optid.Data(u, y, dt).")
 
 
 def _check_words(stage: str, nodes: int, if_ambiguous: str) -> None:
