@@ -20,8 +20,8 @@ import numpy as np
 
 from formulations.group_bound import certify
 from optid.errors import StructureError, nearest
-from optid.faults.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
-from optid.faults.scanning import Scan
+from optid.faults.consistency.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
+from optid.faults.search.scanning import Scan
 from optid.group_sparse import GroupProblem
 from optid.program import GroupForm, Program, View
 from optid.solution import Bound, Solution, Status
@@ -56,7 +56,7 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
         constraints: further constraints on ``f`` and ``changes``.
 
     Returns:
-        An `optid.faults.profiles.Profile`.
+        An `optid.faults.consistency.profiles.Profile`.
 
     Raises:
         DataError: the window sees nothing of the fault.
@@ -131,7 +131,7 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
     """Pose the programme with a penalty on the changes of the course ("tv") or of its slope ("trend").
 
     Args:
-        problem: from `optid.faults.profiles.course_problem`.
+        problem: from `optid.faults.consistency.profiles.course_problem`.
         prior: "tv" or "trend".
     """
     count, shapes = problem.count, problem.shapes(prior)

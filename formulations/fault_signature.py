@@ -19,10 +19,10 @@ import numpy as np
 
 from formulations.group_bound import certify
 from optid.errors import StructureError
-from optid.faults.atoms import Atoms, atoms_of
-from optid.faults.calibration import Thresholds
-from optid.faults.scanning import Scan
-from optid.faults.sparse import ActiveGroup, SparseResult
+from optid.faults.search.atoms import Atoms, atoms_of
+from optid.faults.search.calibration import Thresholds
+from optid.faults.search.scanning import Scan
+from optid.faults.search.sparse import ActiveGroup, SparseResult
 from optid.group_sparse import GroupProblem
 from optid.program import GroupForm, Program, View
 from optid.solution import Bound, Solution, Status
@@ -39,7 +39,7 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
         constraints: further constraints on ``a[label]`` and ``size[label]``.
 
     Returns:
-        An `optid.faults.sparse.SparseResult`.
+        An `optid.faults.search.sparse.SparseResult`.
 
     Raises:
         StructureError: a penalty that is not positive, thresholds that do not fit, a window that is too long.

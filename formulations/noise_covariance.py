@@ -19,7 +19,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.errors import StructureError, nearest
-from optid.faults.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
+from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.program import Program, View
@@ -45,7 +45,7 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
         constraints: further constraints on the named variables.
 
     Returns:
-        An `optid.faults.noise_matching.CovarianceMatch`.
+        An `optid.faults.consistency.noise_matching.CovarianceMatch`.
 
     Raises:
         DataError: too few readings.

@@ -21,7 +21,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.faults.allocation_problem import AllocationProblem, Member
+from optid.faults.repair.allocation_problem import AllocationProblem, Member
 from optid.program import Program, Values, View
 
 TIE = 1e-8

@@ -20,7 +20,7 @@ import numpy as np
 
 from formulations.rule import Rule
 from optid.errors import StructureError
-from optid.faults.refitting import Refitting
+from optid.faults.repair.refitting import Refitting
 from optid.program import Program, Values, View
 from optid.registry import named_constraint
 from optid.solution import Bound, Status
@@ -41,7 +41,7 @@ def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default"
     """Pose the refit of what broke alone.
 
     Args:
-        problem: from `optid.faults.refitting.refitting`.
+        problem: from `optid.faults.repair.refitting.refitting`.
         constraints: rules of `formulations.shape` or their words; "default": monotone, and nowhere steeper than before.
     """
     r, s = problem.linearised(problem.start)

@@ -4,7 +4,8 @@
 
 with x the deviation of the states from a simulation from zero, and e the readings less that simulation. t > 1 proves
 that no healthy plant has made the window; the multipliers of the measurements are near the parity vector that shows it
-(`optid.faults.bounded_noise`). With a fault of unknown size the same programme tells whether a candidate is possible.
+(`optid.faults.consistency.bounded_noise`). With a fault of unknown size the same programme tells whether a candidate is
+possible.
 Its onset is searched by branch and bound: what a step with any onset between two samples can do, a free course between
 them followed by a step can do, too. Bounds of t are recomputed from parity vectors, never copied from a solver.
 
@@ -21,7 +22,14 @@ import scipy.sparse as sp
 
 from optid.data import Data
 from optid.errors import StructureError
-from optid.faults.bounded_noise import SIGMAS, BoundedWindow, Membership, ParityProof, bounded_window, parity_proof
+from optid.faults.consistency.bounded_noise import (
+    SIGMAS,
+    BoundedWindow,
+    Membership,
+    ParityProof,
+    bounded_window,
+    parity_proof,
+)
 from optid.faults.signatures import Candidate, Dictionary
 from optid.program import Program, Values, View
 from optid.solution import Bound, Solution, Status, relative_gap
@@ -61,10 +69,11 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
         constraints: further constraints on ``x`` and ``t`` of the healthy programme.
 
     Returns:
-        An `optid.faults.bounded_noise.Membership`.
+        An `optid.faults.consistency.bounded_noise.Membership`.
 
     Raises:
-        DataError, StructureError: see `optid.faults.bounded_noise.bounded_window`; onsets outside the window.
+        DataError, StructureError: see `optid.faults.consistency.bounded_noise.bounded_window`; onsets outside the
+            window.
     """
     window = bounded_window(model, data, bounds)
     tried = _onsets(onsets, window.count)

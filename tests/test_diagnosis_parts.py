@@ -25,11 +25,11 @@ from optid.faults import (
     thresholds,
     whiten,
 )
-from optid.faults.answers import Remaining
-from optid.faults.intervals import mixture_intervals, onset_range
-from optid.faults.leftover import alarm_probability, left_over
-from optid.faults.pair_search import pairs
-from optid.faults.posterior import SPREADS, marginal, several, single, smallest_set
+from optid.faults.consistency.leftover import alarm_probability, left_over
+from optid.faults.diagnosis.answers import Remaining
+from optid.faults.diagnosis.intervals import mixture_intervals, onset_range
+from optid.faults.diagnosis.posterior import SPREADS, marginal, several, single, smallest_set
+from optid.faults.search.pair_search import pairs
 from optid.faults.signature_space import signature_space
 from optid.faults.whitening import Whitened, predictor
 

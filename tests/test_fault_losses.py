@@ -11,8 +11,8 @@ from test_fault_scan import record
 from optid import Data
 from optid.errors import StructureError
 from optid.faults import Fault, bounded, dictionary, inject, scan, severity, whiten
-from optid.faults.box_kernels import boxed
-from optid.faults.losses import bounds_of
+from optid.faults.search.box_kernels import boxed
+from optid.faults.search.losses import bounds_of
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])

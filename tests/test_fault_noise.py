@@ -13,9 +13,9 @@ from optid import Data
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, noise_covariance, noise_search, noise_test, whiten
-from optid.faults.noise_changes import noise_places
-from optid.faults.noise_matching import covariance_problem
-from optid.faults.waveforms import start_matrix, waveform_matrix
+from optid.faults.consistency.noise_changes import noise_places
+from optid.faults.consistency.noise_matching import covariance_problem
+from optid.faults.consistency.waveforms import start_matrix, waveform_matrix
 from optid.solution import Status
 
 LOAD = np.array([0.3, -0.2, 0.5])

@@ -11,7 +11,7 @@ from optid import Data
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, SolverFailed, StructureError
 from optid.faults import Fault, dictionary, inject, profile, scan, whiten
-from optid.faults.profiles import course_problem
+from optid.faults.consistency.profiles import course_problem
 from optid.solution import Status
 from optid.solving import solve
 

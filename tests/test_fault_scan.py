@@ -12,8 +12,8 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, model_uncertainty, scan, thresholds, whiten
+from optid.faults.search.sweeps import sweep
 from optid.faults.signature_space import signature_space
-from optid.faults.sweeps import sweep
 
 LOAD = np.array([0.3, -0.2, 0.5])
 KINDS = ["bias", "drift", "loss", "stuck"]

@@ -24,7 +24,7 @@ from optid.faults import (
     thresholds,
     whiten,
 )
-from optid.faults.atoms import atoms_of, signatures
+from optid.faults.search.atoms import atoms_of, signatures
 from optid.registry import fault_formulation
 from optid.solution import Status
 from optid.solving import solve

@@ -11,7 +11,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, model_uncertainty, waveform_test, whiten
-from optid.faults.waveforms import waveform_matrix
+from optid.faults.consistency.waveforms import waveform_matrix
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 50

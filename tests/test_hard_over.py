@@ -14,9 +14,9 @@ import optid
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
-from optid.faults.hard_over import HardOver, WindowVerdict
-from optid.faults.order_power import MARGIN, coefficients, least_order
-from optid.faults.zero_tests import ZeroTest, zero_test
+from optid.faults.rank.hard_over import HardOver, WindowVerdict
+from optid.faults.rank.order_power import MARGIN, coefficients, least_order
+from optid.faults.rank.zero_tests import ZeroTest, zero_test
 from optid.model_order.ranks import rank_test
 from optid.plants import two_mode_plant
 from optid.subspace.hankel import hankel_statistics, windows_of

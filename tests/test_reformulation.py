@@ -32,7 +32,7 @@ from optid.faults import (
     subspace_projection,
     trajectory,
 )
-from optid.faults.refitting import refitting
+from optid.faults.repair.refitting import refitting
 from optid.models import Nonlinearity
 from optid.registry import fault_formulation
 from optid.solving import run, solve
@@ -609,7 +609,7 @@ def test_a_probe_separates_more_than_chance_and_less_than_its_bound(healthy, fau
 
 
 def test_printing_drawing_and_the_page(healthy, faults, tmp_path):
-    from optid.faults.reformulation_report import write
+    from optid.faults.repair.page import write
 
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5))
     both = answer(estimate(faults, "actuator:u2 loss", 0.5), estimate(faults, "sensor:y1", 0.3))

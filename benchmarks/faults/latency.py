@@ -29,7 +29,7 @@ from streams import standard_dictionary, stream
 
 from optid.bases import BSpline, Polynomial
 from optid.faults import Dictionary, Monitor, inject
-from optid.faults.sweeps import inverse_roots
+from optid.faults.search.sweeps import inverse_roots
 from optid.models import HammersteinSS, Nonlinearity
 
 THRESHOLD = 60.0

@@ -14,8 +14,8 @@ import numpy as np
 from plants import PLANT, rate, standard_plant, windows
 
 from optid.faults import dictionary, noise_covariance, noise_search, noise_test
-from optid.faults.noise_changes import noise_places
-from optid.faults.waveforms import waveform_matrix
+from optid.faults.consistency.noise_changes import noise_places
+from optid.faults.consistency.waveforms import waveform_matrix
 
 WINDOW = 200
 SHOWN = {30: (".984", ".907", ".882", ".992 1.49", ".25", ".34"), 60: ("1", ".984", ".952", "1 1.06", "", ""),

@@ -13,7 +13,7 @@ import numpy as np
 from plants import PLANT, standard_plant, windows
 
 from optid.faults import dictionary, profile, scan
-from optid.faults.waveforms import waveform_matrix
+from optid.faults.consistency.waveforms import waveform_matrix
 
 WINDOW, DEFLECTION = 200, 20
 K = np.arange(WINDOW)

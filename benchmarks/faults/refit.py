@@ -27,9 +27,9 @@ from optid import Data
 from optid.bases import Triangular, UserFunctions
 from optid.errors import OptidError
 from optid.faults import trajectory
-from optid.faults.damage import Damage
-from optid.faults.refitting import Prior, Refitting, refitting
-from optid.faults.schedule import refit
+from optid.faults.repair.damage import Damage
+from optid.faults.repair.refitting import Prior, Refitting, refitting
+from optid.faults.repair.schedule import refit
 from optid.models import HammersteinSS, Nonlinearity
 from optid.solving import run
 

@@ -19,7 +19,7 @@ from plants import PLANT, levels, standard_plant
 
 from optid import Data
 from optid.faults import dictionary, inject, scan, whiten
-from optid.faults.sweeps import sweep
+from optid.faults.search.sweeps import sweep
 
 
 def seconds(work: Callable[[], Any], least: float = 0.3) -> float:

@@ -17,8 +17,8 @@ from plants import BEFORE, PLANT, cut, levels, rate, standard_plant, windows
 
 from optid import Data
 from optid.faults import Fault, dictionary, inject, scan, thresholds, waveform_test, whiten
+from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.screening import flat_lines
-from optid.faults.waveforms import waveform_matrix
 
 WINDOW = 200
 SHOWN = {6: 3.98, 10: 2.29, 15: 1.34, 20: 1.15, 30: 1.01}

@@ -97,7 +97,7 @@ def diagnose(
     from optid.errors import DataError
     from optid.faults import diagnose as judge
     from optid.faults import dictionary, model_uncertainty
-    from optid.faults.diagnosis import KINDS
+    from optid.faults.diagnosis.diagnosing import KINDS
 
     words.check_folders(out, report, picture)
     with hearing() as heard, Waiting() as waiting:
@@ -126,7 +126,7 @@ def diagnose(
         if out is not None:
             answer.save(out)
         if report is not None:
-            from optid.faults.diagnosis_report import write
+            from optid.faults.diagnosis.page import write
 
             waiting.step("report")
             write(answer, report, record=record.name, command=command_line())

@@ -161,7 +161,7 @@ def _new(
 ) -> Any:
     from optid.errors import ModelFileError, StructureError
     from optid.faults import Calibration, Monitor, dictionary
-    from optid.faults.monitoring import KINDS_BY_DEFAULT
+    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
 
     found = dictionary(plant, kinds=kinds or list(KINDS_BY_DEFAULT), process=process, state_jump=state_jump)
     if path is not None and path.exists():

@@ -86,7 +86,7 @@ def reformulate(
         if out is not None:
             built.model.save(out)
         if report is not None:
-            from optid.faults.reformulation_report import write
+            from optid.faults.repair.page import write
 
             waiting.step("report")
             write(built, report, record=record.name or data[0].name, command=command_line())

@@ -1,0 +1,105 @@
+"""Whether an answer explains the record: is what it leaves the noise of a healthy plant?
+
+Three tests that know nothing of the dictionary (energy, a line in the spectrum, a burst in time) and one that searches
+the rest for a further fault of it.
+"""
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.faults.diagnosis.answers import Remaining
+from optid.faults.whitening import Whitened
+
+UNFIT = 1e-3
+"""An answer whose rest is less probable than this does not explain the record."""
+
+BURSTS = 1, 3, 10, 30
+"""Lengths of the stretches that are searched for a burst."""
+
+
+def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:
+    """Judge what is left of a window.
+
+    Args:
+        whitened: the window.
+        rest: (N, l) whitened innovations less what the answer explains.
+        magnitudes: numbers that were estimated from the window, the initial state among them.
+        further: p-value of the search of the rest for a further fault.
+    """
+    from scipy.special import chdtrc
+
+    readings = max(int(whitened.present.sum()) - magnitudes, 1)
+    energy = float(np.sum(rest**2))
+    frequency, share, line = _spectrum(rest, whitened.present)
+    tests = {"energy": float(chdtrc(readings, energy)), "period": line, "burst": _burst(rest, whitened.present),
+             "candidate": further}
+    worst = min(tests, key=lambda name: tests[name])
+    return Remaining(
+        energy, readings, min(1.0, len(tests) * tests[worst]), worst, _direction(whitened, rest), frequency, share
+    )
+
+
+def alarm_probability(gain: float, false_alarm: float) -> float:
+    """Return the probability that a healthy window exceeds its thresholds by as much.
+
+    The maximum of many statistics with exponential tails exp(-x / 2) has a Gumbel law; its place follows from the
+    false-alarm rate of the thresholds. Below p = 0.1 it is exact to a tenth, above it errs on the side of larger ones.
+
+    Args:
+        gain: largest statistic less its threshold.
+        false_alarm: probability that a healthy window exceeds the thresholds.
+    """
+    return float(-np.expm1(np.log1p(-false_alarm) * np.exp(-gain / 2)))
+
+
+def further_fault(gains: Array, false_alarm: float) -> float:
+    """Return the p-value of the largest gain (C, N) of a search of the rest."""
+    return 1.0 if np.isnan(gains).all() else alarm_probability(float(np.nanmax(gains)), false_alarm)
+
+
+def _spectrum(rest: Array, present: np.ndarray) -> tuple[float, float, float]:
+    """Frequency of the largest line, its share of the energy, and the p-value of so large a line in white noise."""
+    from scipy.special import gammaincc
+
+    count, outputs = rest.shape
+    lines = np.abs(np.fft.rfft(rest, axis=0)) ** 2
+    power = np.sum(lines / np.maximum(present.sum(axis=0), 1), axis=1)
+    if count < 4 or not power.any():
+        return 0.0, 0.0, 1.0
+    largest = int(np.argmax(power))
+    twice = np.full(power.size, 2.0)  # every line but the first and, for an even length, the last stands for two
+    twice[0] = 1.0
+    twice[-1] -= float(count % 2 == 0)
+    near = slice(max(largest - 1, 0), largest + 2)
+    share = float((twice * power)[near].sum() / (twice @ power))
+    inner = power[1 : (count + 1) // 2]
+    exceeding = float(gammaincc(outputs, inner.max())) if inner.size else 1.0
+    mean = float(gammaincc(outputs / 2, power[0] / 2))
+    p_value = min(-np.expm1(inner.size * np.log1p(-exceeding)) if exceeding < 1 else 1.0, 1.0)
+    return largest / count, share, float(min(1.0, 2 * min(p_value, mean)))
+
+
+def _burst(rest: Array, present: np.ndarray) -> float:
+    """Bound of the p-value of the largest energy in any stretch of a few samples."""
+    from scipy.special import chdtrc
+
+    energy = np.concatenate([[0.0], np.cumsum(np.sum(rest**2, axis=1))])
+    readings = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    lowest, tried = 1.0, 0
+    for length in BURSTS:
+        if length >= len(rest):
+            break
+        window, seen = energy[length:] - energy[:-length], readings[length:] - readings[:-length]
+        there = seen > 0
+        if there.any():
+            lowest = min(lowest, float(np.min(chdtrc(seen[there], window[there]))))
+            tried += int(there.sum()) // max(length // 2, 1) + 1
+    return min(1.0, tried * lowest)
+
+
+def _direction(whitened: Whitened, rest: Array) -> Array:
+    """Unit vector in units of the outputs along which most of the rest lies, its largest part positive."""
+    _, _, axes = np.linalg.svd(rest, full_matrices=False)
+    vector = np.linalg.solve(whitened.predictor.root, axes[0])
+    vector = vector / np.linalg.norm(vector)
+    return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))

@@ -1,0 +1,320 @@
+"""Has the noise grown, and where? The exact likelihood of more white noise at one place, for every place (F8).
+
+White noise of variance rho at a place adds rho H H' to the covariance of the whitened innovations, H being the
+responses to impulses there at all samples of the window. With the eigenvalues s of H H' and the coordinates z of the
+window along its eigenvectors the log-likelihood is a function of one number,
+
+    l(rho) = -1/2 sum( log(1 + rho s_i) + z_i² / (1 + rho s_i) ),
+
+which is maximised for every place; the largest gain names the place, and those within three nats are the set.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened
+
+NATS = 3.0
+"""Places whose log-likelihood is at most this much below the best are in the set."""
+
+GRID = np.concatenate([[0.0], np.geomspace(1e-3, 1e6, 91)])
+"""Variances at which the likelihood is looked at first, over the inverse mean eigenvalue."""
+
+STEPS = 25
+
+WIDE = 1.9207
+"""Half the 95 % quantile of chi-square with one degree of freedom: how far the likelihood falls over an interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoisePlace:
+    """One place where noise may have grown, ready for windows of one length.
+
+    Attributes:
+        label: what an answer calls it.
+        name: of the place, as in `Fault`.
+        axes: (N l, q) eigenvectors of H H'.
+        s: (q,) its eigenvalues.
+        present: variance of the noise that the model has there; zero where it has none.
+    """
+
+    label: str
+    name: str
+    axes: Array = field(repr=False)
+    s: Array = field(repr=False)
+    present: float
+
+    def likelihood(self, rho: Array, z2: Array) -> Array:
+        """Return l(rho) - l(0) for squared coordinates z2 (M, q).
+
+        Args:
+            rho: (K,) variances, tried in all windows, or (M, 1), one for each.
+            z2: (M, q).
+
+        Returns:
+            (M, K), or (M,).
+        """
+        grown = 1 + rho[..., None] * self.s if rho.ndim == 1 else 1 + rho * self.s
+        spread = np.sum(np.log(grown), axis=-1)
+        if rho.ndim == 1:
+            return np.asarray(-0.5 * (spread + z2 @ (1 / grown - 1).T))
+        return np.asarray(-0.5 * (spread + np.einsum("mq,mq->m", z2, 1 / grown - 1)))
+
+    def maximise(self, windows: Array) -> tuple[Array, Array]:
+        """Return the variance (M,) and the gain in log-likelihood (M,) of windows (M, N l)."""
+        z2 = (windows @ self.axes) ** 2
+        grid = GRID / float(np.mean(self.s))
+        values = self.likelihood(grid, z2)
+        at = values.argmax(axis=1)
+        low, high = grid[np.maximum(at - 1, 0)], grid[np.minimum(at + 1, grid.size - 1)]
+        ratio = (np.sqrt(5) - 1) / 2  # golden section between the neighbours on the grid
+        for _ in range(STEPS):
+            first, second = high - ratio * (high - low), low + ratio * (high - low)
+            a, b = (self.likelihood(rho[:, None], z2) for rho in (first, second))
+            high, low = np.where(a >= b, second, high), np.where(a >= b, low, first)
+        rho = (low + high) / 2
+        gain = self.likelihood(rho[:, None], z2)
+        return np.where(gain > 0, rho, 0.0), np.maximum(gain, 0.0)
+
+    def interval(self, window: Array, rho: float, gain: float) -> tuple[float, float]:
+        """Return the 95 % profile interval of the variance, given the estimate and its gain."""
+        from scipy.optimize import root_scalar
+
+        z2 = (window[None] @ self.axes) ** 2
+
+        def above(value: float) -> float:
+            return float(self.likelihood(np.array([[value]]), z2)[0]) - gain + WIDE
+
+        low = 0.0 if rho == 0 or above(0.0) >= 0 else float(root_scalar(above, bracket=(0.0, rho)).root)
+        high = max(rho, 1e-3 / float(np.mean(self.s)))
+        while above(high) > 0:
+            high *= 2
+        return low, float(root_scalar(above, bracket=(rho, high)).root) if above(rho) > 0 else high
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSearch:
+    """All places where noise may have grown, ready for windows of one length; `noise_search` makes it.
+
+    Attributes:
+        places: the places.
+        start: (N l, n') orthonormal: what an error of the initial state leaves, which is taken out of windows.
+        count: readings of a window.
+    """
+
+    places: tuple[NoisePlace, ...]
+    start: Array = field(repr=False)
+    count: int
+
+    def gains(self, windows: Array) -> tuple[Array, Array]:
+        """Return variances (M, C) and gains in log-likelihood (M, C) of windows (M, N l)."""
+        clean = windows - (windows @ self.start) @ self.start.T
+        found = [place.maximise(clean) for place in self.places]
+        return np.stack([rho for rho, _ in found], axis=1), np.stack([gain for _, gain in found], axis=1)
+
+    def healthy(self, draws: int, seed: int | None) -> Array:
+        """Return the largest gain (draws,) of simulated healthy windows, in order."""
+        rng = np.random.default_rng(seed)
+        size = max(1, 4_000_000 // len(self.start))
+        parts = [self.gains(rng.standard_normal((min(size, draws - first), len(self.start))))[1].max(axis=1)
+                 for first in range(0, draws, size)]
+        return np.sort(np.concatenate(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseChange:
+    """More noise at one place.
+
+    Attributes:
+        label: what it is called.
+        name: of the place, as in `Fault`.
+        variance: of the added noise, in the units of the place.
+        interval: its 95 % interval by the likelihood ratio.
+        gain: log-likelihood above that of a healthy plant.
+        scale: factor of the standard deviation of the noise that was there; NaN where the model has none.
+    """
+
+    label: str
+    name: str
+    variance: float
+    interval: tuple[float, float]
+    gain: float
+    scale: float
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the added noise."""
+        return float(np.sqrt(self.variance))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseTest:
+    """Every place, tested for more noise.
+
+    Attributes:
+        changes: the results, most probable first.
+        p_value: probability of so large a gain when healthy, by simulation; NaN without one.
+        false_alarm: probability of an alarm of a healthy plant.
+        draws: simulated healthy windows.
+        onset: sample from which the noise is supposed to have grown.
+    """
+
+    changes: tuple[NoiseChange, ...]
+    p_value: float
+    false_alarm: float
+    draws: int
+    onset: int = 0
+
+    @property
+    def detected(self) -> bool:
+        """Whether the noise has grown somewhere."""
+        return self.p_value <= self.false_alarm
+
+    @property
+    def best(self) -> NoiseChange:
+        """The most probable place."""
+        return self.changes[0]
+
+    @property
+    def consistent(self) -> tuple[str, ...]:
+        """Places within three nats of the best."""
+        return tuple(change.label for change in self.changes if change.gain >= self.changes[0].gain - NATS)
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """Posterior of the places, all equally probable before, each with its best variance."""
+        gains = np.array([change.gain for change in self.changes])
+        weights = np.exp(gains - gains.max())
+        return dict(zip((c.label for c in self.changes), (weights / weights.sum()).tolist()))
+
+    def __getitem__(self, name: str) -> NoiseChange:
+        """Return the result of a place.
+
+        Raises:
+            LookupFailed: not tested.
+        """
+        for change in self.changes:
+            if name in (change.label, change.name):
+                return change
+        raise LookupFailed(f"{name!r} was not tested. {nearest(name, [c.label for c in self.changes])}")
+
+    def __str__(self) -> str:
+        """Print the places."""
+        lines = [f"more noise from sample {self.onset} on: p-value {self.p_value:.3g} ({self.draws} simulated windows)",
+                 f"  {'place':<36}{'std added':>11}{'scale':>8}{'nats':>9}"]
+        for change in self.changes:
+            scale = "" if np.isnan(change.scale) else f"{change.scale:.2f}"
+            mark = "  in the set" if change.label in self.consistent else ""
+            lines.append(f"  {change.label[:35]:<36}{change.std:>11.3g}{scale:>8}{change.gain:>9.2f}{mark}")
+        return "\n".join(lines)
+
+
+def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_start: bool = True) -> NoiseSearch:
+    """Prepare the test for windows like one: its length, missing readings and uncertain model.
+
+    Args:
+        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
+        whitened: the window; one experiment.
+        onset: sample from which the noise is supposed to have grown.
+        free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
+
+    Raises:
+        DataError: other outputs than the model's.
+        StructureError: several experiments, an onset outside the window, a window that is too long.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError("The noise test takes the whitened innovations of one experiment: test them one by one.")
+    if whitened.r.shape[1] != found.model.l:
+        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
+    if onset != int(onset) or not 0 <= onset < len(whitened.r):
+        raise StructureError(f"onset={onset!r} lies outside the window of {len(whitened.r)} samples.")
+    if whitened.r.size > LONGEST:
+        raise StructureError(
+            f"{whitened.r.size} readings are too many for this test ({LONGEST}): use a shorter window.")
+    start = start_matrix(found, whitened) if free_start else np.zeros((whitened.r.size, 0))
+    left, sizes, _ = np.linalg.svd(start, full_matrices=False)
+    start = left[:, sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1e-300)]
+    places = []
+    for label, candidate in noise_places(found):
+        matrix = waveform_matrix(found, candidate, whitened, onset)
+        matrix = matrix - start @ (start.T @ matrix)
+        axes, values, _ = np.linalg.svd(matrix, full_matrices=False)
+        kept = values > RANK * max(float(values.max(initial=0.0)), 1e-300)
+        if kept.any() and values[0] > 0:
+            places.append(NoisePlace(label, " | ".join(candidate.places), axes[:, kept], values[kept] ** 2,
+                                     _variance(found, candidate)))
+    if not places:
+        raise StructureError("No reading of the window sees noise in any of the places.")
+    return NoiseSearch(tuple(places), start, int(whitened.present.sum()))
+
+
+def noise_test(
+    found: Dictionary, whitened: Whitened, *, onset: int = 0, false_alarm: float = 0.01, draws: int = 2000,
+    seed: int | None = 0, free_start: bool = True, search: NoiseSearch | None = None, healthy: Array | None = None,
+) -> NoiseTest:
+    """Test every place for more noise by the exact likelihood.
+
+    Args:
+        found: the candidates, as in `noise_search`.
+        whitened: the window; one experiment.
+        onset: sample from which the noise is supposed to have grown.
+        false_alarm: probability of an alarm of a healthy plant.
+        draws: simulated healthy windows behind the p-value.
+        seed: of the simulation.
+        free_start: as in `noise_search`.
+        search: what `noise_search` returned for a window like this one.
+        healthy: what its `healthy` returned, instead of a simulation.
+
+    Raises:
+        DataError: innovations that are not finite, or too few draws for so rare an alarm.
+        StructureError: as `noise_search`.
+    """
+    if not 0 < false_alarm < 1:
+        raise StructureError(f"false_alarm={false_alarm!r}; a probability between 0 and 1 is needed.")
+    if false_alarm * (draws if healthy is None else healthy.size) < 10:
+        raise DataError(
+            f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
+            f"{int(np.ceil(10 / false_alarm))}, or a higher probability.")
+    prepared = noise_search(found, whitened, onset=onset, free_start=free_start) if search is None else search
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
+    levels = prepared.healthy(draws, seed) if healthy is None else healthy
+    window = whitened.r.reshape(1, -1)
+    rho, gains = prepared.gains(window)
+    clean = (window - (window @ prepared.start) @ prepared.start.T)[0]
+    changes = [
+        NoiseChange(place.label, place.name, float(variance), place.interval(clean, float(variance), float(gain)),
+                    float(gain), float(np.sqrt(1 + variance / place.present)) if place.present > 0 else float("nan"))
+        for place, variance, gain in zip(prepared.places, rho[0], gains[0])
+    ]
+    changes.sort(key=lambda change: -change.gain)
+    above = levels.size - int(np.searchsorted(levels, gains.max(), side="left"))
+    return NoiseTest(tuple(changes), (1 + above) / (1 + levels.size), false_alarm, levels.size, onset)
+
+
+def noise_places(found: Dictionary) -> list[tuple[str, Candidate]]:
+    """Return the places where noise may grow, and what an answer calls it there."""
+    named = [c for c in found.candidates if c.kind == "noise"]
+    chosen: list[Candidate] = []
+    for candidate in named or [c for c in found.candidates if not c.name.startswith("state")]:
+        if not any(same_place(candidate, other) for other in chosen):
+            chosen.append(candidate)
+    return [(c.label if c.kind == "noise" else " | ".join(f"{place} noise" for place in c.places), c) for c in chosen]
+
+
+def _variance(found: Dictionary, candidate: Candidate) -> float:
+    """Variance of the noise of the model at a place, mean over its directions; zero where it has none there."""
+    noise = found.model.noise
+    assert noise is not None
+    state, output = np.any(candidate.into_state), np.any(candidate.into_output)
+    if state and output:
+        return 0.0  # an actuator: no noise of the model enters like it
+    where, present = (candidate.into_state, noise.Q) if state else (candidate.into_output, noise.R)
+    along = np.linalg.pinv(where)
+    return max(float(np.trace(along @ present @ along.T)) / where.shape[1], 0.0)

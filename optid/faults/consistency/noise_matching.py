@@ -1,0 +1,173 @@
+"""Covariances of a window by lag, and what more noise at a place adds to them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.consistency.noise_changes import noise_places
+from optid.faults.signatures import Dictionary
+from optid.faults.whitening import Predictor, Whitened
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceProblem:
+    """Lagged covariances of a window less those of a healthy plant, in units of their standard deviations.
+
+    Attributes:
+        labels: the C places.
+        target: (M,).
+        signatures: (M, C) what unit variances add.
+        by_process: (M, n n) what the entries of the covariance of added process noise add, column by column.
+        by_sensor: (M, l l) the same for sensor noise.
+        nx: number of states n.
+        l: number of outputs.
+        state_units: (n,) variances of the process noise of the model, the units of Q.
+        output_units: (l,) variances of its sensor noise.
+        lags: largest lag.
+    """
+
+    labels: tuple[str, ...]
+    target: Array
+    signatures: Array
+    by_process: Array
+    by_sensor: Array
+    nx: int
+    l: int  # noqa: E741
+    state_units: Array
+    output_units: Array
+    lags: int
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceMatch:
+    """The variances or covariances that match those of a window.
+
+    Attributes:
+        labels: the C places.
+        rho: (C,) variance of the added noise in every place; NaN with full covariances.
+        gains: (C,) size of the covariances explained, in standard deviations.
+        Q: (n, n) covariance of the added process noise; None with places.
+        R: (l, l) covariance of the added sensor noise; None with places.
+        objective: half the squares left.
+        gap: relative duality gap.
+        certified: whether it is proved optimal.
+        lags: largest lag.
+        status: why not, where it is not certified.
+    """
+
+    labels: tuple[str, ...]
+    rho: Array
+    gains: Array
+    Q: Array | None
+    R: Array | None
+    objective: float
+    gap: float
+    certified: bool
+    lags: int
+    status: str = field(default="")
+
+    @property
+    def best(self) -> str:
+        """The place that explains most.
+
+        Raises:
+            StructureError: full covariances name no place.
+        """
+        if np.isnan(self.gains).all():
+            raise StructureError("Full covariances name no place: match the candidates (form='places').")
+        return self.labels[int(np.nanargmax(self.gains))]
+
+    def __str__(self) -> str:
+        """Print what was matched."""
+        lines = [f"covariances up to lag {self.lags} matched; relative gap {self.gap:.1e}"]
+        if self.Q is None:
+            lines += [f"  {label[:32]:<34}std added {np.sqrt(rho):>9.3g}   explains {gain:>7.2f} sigma"
+                      for label, rho, gain in zip(self.labels, self.rho, self.gains)]
+        else:
+            assert self.R is not None
+            lines += [f"  added process noise, std along the states: {np.round(np.sqrt(np.diag(self.Q)), 4)}"[:80],
+                      f"  added sensor noise, std: {np.round(np.sqrt(np.diag(self.R)), 4)}"[:80]]
+        return "\n".join(lines if self.certified else [*lines, f"  not certified: {self.status}"[:80]])
+
+
+def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | None = None, onset: int = 0
+                       ) -> CovarianceProblem:
+    """Return the lagged covariances of a window and the signatures of noise.
+
+    Pairs of samples with a missing reading are left out; signatures are those of a plant with all readings.
+
+    Args:
+        found: the candidates, as in `optid.faults.consistency.noise_changes.noise_search`.
+        whitened: the window; one experiment.
+        lags: largest lag; None for the settling of the predictor, at most a tenth of the window.
+        onset: first sample that is used.
+
+    Raises:
+        DataError: fewer than ten complete samples for every lag, innovations that are not finite.
+        StructureError: lags or an onset that do not fit the window, several experiments, no place.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError("Covariances are matched in the innovations of one experiment: take them one by one.")
+    count, l = whitened.r.shape  # noqa: E741
+    if onset != int(onset) or not 0 <= onset < count:
+        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
+    used = count - int(onset)
+    most = max(1, used // 10)
+    if lags is None:
+        lags = min(whitened.predictor.settling, most)
+    if lags != int(lags) or not 0 <= lags < used:
+        raise StructureError(f"lags={lags!r}; a whole number from 0 to {used - 1} is needed.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
+    places = noise_places(found)
+    if not places:
+        raise StructureError("The dictionary has no place where noise may grow.")
+    r, complete = whitened.r[onset:], np.asarray(whitened.present[onset:].all(axis=1))
+    target, weights = [], []
+    upper = np.triu_indices(l)
+    for lag in range(int(lags) + 1):
+        there = complete[lag:] & complete[: used - lag]
+        pairs = int(there.sum())
+        if pairs < 10:
+            raise DataError(
+                f"{pairs} pairs of complete samples at lag {lag} are too few: use a longer window or fewer lags.")
+        S = r[lag:][there].T @ r[: used - lag][there] / pairs
+        if lag == 0:  # a variance scatters twice as much as a covariance
+            target.append((S - np.eye(l))[upper])
+            weights.append(np.sqrt(pairs / np.where(upper[0] == upper[1], 2.0, 1.0)))
+        else:
+            target.append(S.ravel())
+            weights.append(np.full(l * l, np.sqrt(pairs)))
+    weight = np.concatenate(weights)
+    n, steady = found.model.nx, whitened.predictor
+    by_process = _entries(steady, np.eye(n), np.zeros((l, n)), int(lags))
+    by_sensor = _entries(steady, np.zeros((n, l)), np.eye(l), int(lags))
+    columns = []
+    for _, candidate in places:
+        own = _entries(steady, candidate.into_state, candidate.into_output, int(lags))
+        d = candidate.into_state.shape[1]
+        columns.append(own @ np.eye(d).ravel())
+    noise = found.model.noise
+    assert noise is not None
+    units = [np.maximum(np.diag(c), 1e-6 * max(float(np.trace(c)), 1e-300)) for c in (noise.Q, noise.R)]
+    return CovarianceProblem(
+        tuple(label for label, _ in places), weight * np.concatenate(target),
+        weight[:, None] * np.stack(columns, axis=1), weight[:, None] * by_process, weight[:, None] * by_sensor, n, l,
+        units[0], units[1], int(lags))
+
+
+def _entries(steady: Predictor, into_state: Array, into_output: Array, lags: int) -> Array:
+    """What the entries of a covariance (d, d) of white noise at a place add to the covariances, (M, d d)."""
+    n, d = into_state.shape
+    l, length = len(into_output), lags + 2 * steady.settling + 2  # noqa: E741
+    state, output = np.zeros((length, n, d)), np.zeros((length, l, d))
+    state[0], output[0] = into_state, into_output
+    h = steady.whitened(steady.respond(state, output))
+    upper, rows = np.triu_indices(l), []
+    for lag in range(lags + 1):
+        both = np.einsum("kia,kjb->ijab", h[lag:], h[: length - lag]).reshape(l, l, d * d)
+        rows.append(both[upper] if lag == 0 else both.reshape(l * l, d * d))
+    return np.concatenate(rows)

@@ -1,0 +1,195 @@
+"""The course of one fault over time, and how it was chosen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.consistency.waveforms import waveform_matrix
+from optid.faults.signatures import Candidate
+
+if TYPE_CHECKING:
+    from optid.faults.search.scanning import Scan
+
+PRIORS = {
+    "tv": "steps: constant between changes",
+    "trend": "ramps: straight between bends",
+    "smooth": "a random walk",
+}
+"""What is believed of the course."""
+
+EACH = 2
+"""Degrees of freedom of a change: its size and its place."""
+
+ROUNDS = 20
+"""Passes over the changes in which they are moved, at most."""
+
+ALIKE = 2e-6
+"""Share of a change of its own below which the others explain it."""
+
+LONGEST = 2000
+"""Samples of a window at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The course of a fault.
+
+    Attributes:
+        label: of the candidate.
+        course: (N,) in the units of its magnitude (share lost for a loss); zero before its first change.
+        std: (N,) standard deviation of the course, given where it changes.
+        prior: "tv", "trend" or "smooth".
+        changes: {sample: step of the course, or of its slope}; empty for "smooth".
+        bic: {prior: smallest value of the Bayesian information criterion}, of those that were tried.
+        freedom: degrees of freedom of the course.
+        gap: largest relative duality gap among the programmes behind it.
+        certified: whether all of them were solved with a proof.
+        constraints: names of the constraints it obeys.
+        status: why not, where it is not certified.
+    """
+
+    label: str
+    course: Array = field(repr=False)
+    std: Array = field(repr=False)
+    prior: str
+    changes: Mapping[int, float]
+    bic: Mapping[str, float]
+    freedom: float
+    gap: float
+    certified: bool
+    constraints: tuple[str, ...] = ()
+    status: str = ""
+
+    def __str__(self) -> str:
+        """Print the changes and how the prior was chosen."""
+        values = ", ".join(f"{prior} {value:.1f}" for prior, value in self.bic.items())
+        lines = [f"course of {self.label[:60]}: {PRIORS[self.prior]}",
+                 f"  BIC {values}; {self.freedom:.3g} degrees of freedom; largest gap {self.gap:.1e}"]
+        word = "changes by" if self.prior == "tv" else "slope changes by"
+        lines += [f"  sample {k:>6}: {word} {amount:.4g}, to {self.course[k]:.4g} there"
+                  for k, amount in list(self.changes.items())[:12]]
+        if not self.certified:
+            lines.append(f"  not certified: {self.status}"[:80])
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class CourseProblem:
+    """What a window says of the course of one fault; `course_problem` makes it.
+
+    Attributes:
+        label: of the candidate.
+        matrix: (N l, N) what unit courses in single samples leave in the window.
+        r: (N l,) the window.
+        readings: number of readings.
+    """
+
+    label: str
+    matrix: Array
+    r: Array
+    readings: int
+
+    @property
+    def count(self) -> int:
+        """Samples N."""
+        return self.matrix.shape[1]
+
+    def shapes(self, prior: str) -> Array:
+        """Return the courses (N, N) that a unit change at every sample makes: steps, or ramps over the window."""
+        steps = np.tril(np.ones((self.count, self.count)))
+        return steps if prior == "tv" else steps @ steps / self.count
+
+    def refitted(self, columns: Array) -> tuple[Array, float]:
+        """Return the least-squares coefficients of columns (N l, K) and the energy left."""
+        solved = np.linalg.lstsq(columns, self.r, rcond=1e-10)[0]
+        rest = self.r - columns @ solved
+        return np.asarray(solved, dtype=float), float(rest @ rest)
+
+    def criterion(self, energy: float, freedom: float) -> float:
+        """Return the Bayesian information criterion for innovations of known variance."""
+        return energy + freedom * float(np.log(self.readings))
+
+    def pruned(self, columns: Array, support: np.ndarray) -> np.ndarray:
+        """Drop changes one by one as long as the criterion falls: neighbours that share one change become one.
+
+        Args:
+            columns: (N l, N) of all changes.
+            support: changes to begin with.
+        """
+        kept = list(support)
+        best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
+        while len(kept) > 1:
+            q, triangle = np.linalg.qr(columns[:, kept])
+            try:
+                inverse = np.linalg.inv(triangle)
+            except np.linalg.LinAlgError:  # two changes that the window cannot tell apart: either will do
+                kept.pop(int(np.argmin(np.abs(np.diag(triangle)))))
+                continue
+            solved = inverse @ (q.T @ self.r)
+            loss = solved**2 / np.sum(inverse**2, axis=1)  # by which the energy rises without each of them
+            weakest = int(np.argmin(loss))
+            trial = kept[:weakest] + kept[weakest + 1 :]
+            value = self.criterion(self.refitted(columns[:, trial])[1], EACH * len(trial))
+            if value > best:
+                break
+            kept, best = trial, value
+        return np.array(kept, dtype=int)
+
+
+    def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
+        """Move every change to the sample where it explains most beside the others, until none moves.
+
+        Args:
+            columns: (N l, N) of all changes.
+            kept: changes to begin with.
+        """
+        places = [int(k) for k in kept]
+        for _ in range(ROUNDS):
+            before = list(places)
+            for i in range(len(places)):
+                others = places[:i] + places[i + 1 :]
+                basis = np.linalg.qr(columns[:, others])[0] if others else np.zeros((len(columns), 0))
+                rest = self.r - basis @ (basis.T @ self.r)
+                own = np.einsum("ij,ij->j", columns, columns)
+                left = own - np.sum((basis.T @ columns) ** 2, axis=0)
+                there = left > ALIKE * own
+                energy = np.where(there, (columns.T @ rest) ** 2 / np.where(there, left, 1.0), -np.inf)
+                best = int(np.argmax(energy))
+                if energy[best] > energy[places[i]] * (1 + 1e-9):
+                    places[i] = best
+            if places == before:
+                break
+        return np.unique(places)
+
+
+def course_problem(found: "Scan", label: str) -> CourseProblem:
+    """Return what a window says of the course of one candidate.
+
+    Args:
+        found: the search of the window.
+        label: of a candidate with one magnitude.
+
+    Raises:
+        DataError: the window sees nothing of it.
+        StructureError: a candidate with several magnitudes or of noise, a window that is too long.
+    """
+    candidate: Candidate = found.dictionary[label]
+    if candidate.kind == "noise":
+        raise StructureError(f"{candidate.label}: noise has no course; test its covariance (noise_test).")
+    if candidate.kind == "stuck" or candidate.into_state.shape[1] != 1:
+        raise StructureError(
+            f"{candidate.label} has several magnitudes: a profile is the course of one. Take the bias or the loss of "
+            "the channel, or a direction process={...} of the state.")
+    count = len(found.whitened.r)
+    if count > LONGEST:
+        raise StructureError(f"{count} samples are too many for a profile ({LONGEST}): use a shorter window.")
+    if candidate.kind == "loss" and found.u is None:
+        raise StructureError(f"{candidate.label}: its course depends on the input: scan the window with u.")
+    matrix = waveform_matrix(found.dictionary, candidate, found.whitened, u=found.u)
+    if not np.abs(matrix).max(initial=0.0) > 0:
+        raise DataError(f"{candidate.label}: untestable, nothing in this window would show it.")
+    return CourseProblem(candidate.label, matrix, found.whitened.r.ravel(), int(found.whitened.present.sum()))

@@ -1,0 +1,131 @@
+"""Diagnosis of a record: is something wrong, what is it, since when, how large, and how sure is all that?"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.errors import StructureError, nearest
+from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
+from optid.faults.nuisance import uncertain_start
+from optid.faults.search.calibration import Thresholds
+from optid.faults.signatures import Dictionary, dictionary
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+METHODS = "exact", "sparse", "sparse+polish", "set"
+
+KINDS = "bias", "loss", "spike"
+"""Kinds of faults that are thought possible where no dictionary is given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What is asked of a record.
+
+    Attributes:
+        false_alarm: probability of an alarm of a healthy plant.
+        max_faults: faults that may be in one record.
+        method: one of `METHODS`.
+        coverage: of the set and of the intervals.
+        robust: whether outliers are bounded.
+        thresholds: from `thresholds`, or None.
+        seed: of their simulation.
+        solver: for the methods that need one.
+    """
+
+    false_alarm: float
+    max_faults: int
+    method: str
+    coverage: float
+    robust: bool
+    thresholds: Thresholds | None
+    seed: int | None
+    solver: Any
+
+    def __post_init__(self) -> None:
+        for word, value in (("false_alarm", self.false_alarm), ("coverage", self.coverage)):
+            if not 0 < value < 1:
+                raise StructureError(f"{word}={value!r}; a probability between 0 and 1 is needed.")
+        if self.method not in METHODS:
+            raise StructureError(f"method={self.method!r}. {nearest(str(self.method), METHODS)}")
+        if self.max_faults != int(self.max_faults) or self.max_faults < 1:
+            raise StructureError(f"max_faults={self.max_faults!r}; a whole number from 1 is needed.")
+        if self.method == "exact" and self.max_faults > 2:
+            raise StructureError(
+                f"max_faults={self.max_faults}: the exact search covers one or two faults; the number of triples is "
+                "out of reach. Use method='sparse+polish'."
+            )
+
+
+def diagnose(
+    model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
+    method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,
+    healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
+    solver: Any = "auto",
+) -> Any:
+    """Find out what a record says about the health of a plant.
+
+    Every candidate of the dictionary is tried at every onset; the answer is a set of candidates that holds the true one
+    with the probability `coverage`, with intervals of onset and size that account for the search.
+
+    Args:
+        model: the healthy state-space model with noise covariances, or the fit it comes from.
+        data: the record: Data, a pair (u, y) of arrays, or a frame or file with the channels of the model as columns.
+        faults: what may have happened; offsets of every channel, losses of every actuator, outliers of every sensor and
+            a jump of the state by default.
+        false_alarm: probability of an alarm of a healthy plant, over all candidates and onsets.
+        max_faults: faults that may be in one record. Where no single fault fits, outliers and two faults are tried in
+            any case.
+        method: "exact" (exhaustive search, one or two faults), "sparse" (group-sparse programme), "sparse+polish" (the
+            same as a screen before an exact search; three faults and more), or "set" (proof by bounds of the noise).
+        model_uncertainty: "use" (of an identified model: give the fit in place of the model), "ignore", or what
+            `optid.faults.model_uncertainty` returned; by default it is used where a fit is given.
+        coverage: nominal probability of the set and of the intervals.
+        robust: bound the influence of outliers (Huber), and take single wild readings out.
+        healthy: a healthy record; the answer is refused where its innovations are not white or not of the size that the
+            model says.
+        rescale: take the scale of the noise from the healthy record.
+        thresholds: from `optid.faults.thresholds` for this dictionary and length; simulated by default.
+        seed: of the simulation.
+        solver: for the methods that need one.
+
+    Returns:
+        A `Diagnosis`; a tuple for several experiments.
+
+    Raises:
+        DataError: a record that does not fit the model, a missing input, outputs that look swapped or change their
+            unit, a healthy record with other noise, too few samples.
+        StructureError: no noise covariances, impossible arguments, "use" without the covariance of the model.
+    """
+    from optid.faults.diagnosis.judgement import Job
+
+    asked = Question(false_alarm, max_faults, method, coverage, robust, thresholds, seed, solver)
+    plant = plant_of(model)
+    record = record_of(plant.model, data)
+    found = _dictionary(plant.model, faults)
+    steady = steady_predictor(plant.model, healthy, rescale)
+    if steady is not None:
+        found = replace(found, predictor=steady)
+    uncertainty, remark = uncertainty_of(plant, model_uncertainty)
+    if uncertainty is None:
+        uncertainty = uncertain_start(plant.model, found.predictor)
+    noise = {"uncertainty": replace(uncertainty, predictor=found.predictor), "scale": found.predictor}
+    results = [Job(record, k, found, asked, noise, remark).run() for k in range(record.n_experiments)]
+    return results[0] if len(results) == 1 else tuple(results)
+
+
+def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary:
+    if faults is None:
+        return dictionary(model, kinds=KINDS)
+    if not isinstance(faults, Dictionary):
+        raise StructureError(
+            f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...])."
+        )
+    same = faults.model is model or all(
+        np.array_equal(getattr(faults.model, name), getattr(model, name)) for name in ("A", "B", "C", "D")
+    )
+    if not same or faults.model.inputs != model.inputs or faults.model.outputs != model.outputs:
+        raise StructureError("The dictionary is of another model: build it with optid.faults.dictionary(model, ...).")
+    return faults

@@ -1,0 +1,121 @@
+"""A diagnosis as one HTML page that carries its figure with it."""
+
+from pathlib import Path
+from typing import Any
+
+from optid import __version__
+from optid.faults.diagnosis.answers import Diagnosis
+from optid.faults.diagnosis.words import (
+    certificate_words,
+    explained,
+    headline,
+    onset_words,
+    probability_words,
+    remaining_words,
+    size_words,
+)
+from optid.showing.page import figure, template, versions
+from optid.showing.wording import Table, number
+
+TONES = {"healthy": "good", "faulty": "bad"}
+"""How a verdict looks; the others are neither good nor bad."""
+
+
+def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str = "") -> Path:
+    """Write a diagnosis as a self-contained HTML page.
+
+    Args:
+        found: the diagnosis, not one that was read from a file.
+        path: the file, replaced when it exists.
+        record: name of the record.
+        command: the command line behind it.
+
+    Raises:
+        StructureError: a diagnosis read from a file: the record is not in it.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    path.write_text(render(found, record=record, command=command), encoding="utf-8")
+    return path
+
+
+def render(found: Diagnosis, *, record: str = "", command: str = "") -> str:
+    """Return the page that `write` writes."""
+    best = ", what the best answer leaves in them, and its onset with the interval" if found.best is not None else ""
+    several = "; the probability of every answer in the set" if len(found.candidates) > 1 else ""
+    caption = (
+        f"Whitened innovations of every output{best}; the energy that every candidate explains by its onset, beyond "
+        f"the threshold at which a healthy plant alarms{several}."
+    )
+    content: dict[str, Any] = {
+        "version": __version__,
+        "title": f"Diagnosis: {found.verdict}",
+        "lead": " · ".join(part for part in (record, found.model, f"{found.window} samples") if part),
+        "tone": TONES.get(found.verdict, "fair"),
+        "word": headline(found),
+        "sentences": explained(found, notes=False),
+        "cards": _cards(found),
+        "notes": [*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
+        "answers": _answers(found) if found.candidates else None,
+        "figures": [figure("diagnosis", found.plot, caption)],
+        "evidence": _evidence(found),
+        "call": command or "optid.faults.diagnose(model, data)",
+        "versions": versions(),
+        "text": str(found),
+        "sections": [
+            (id, name) for id, name, present in (
+                ("verdict", "Verdict", True),
+                ("answers", "Answers", bool(found.candidates)),
+                ("figures", "Figure", True),
+                ("evidence", "Evidence", True),
+                ("reproduce", "Reproduce", True),
+            ) if present
+        ],
+    }
+    return template("diagnosis.html.j2").render(content)
+
+
+def _cards(found: Diagnosis) -> list[dict[str, str]]:
+    cards = [("p-value of health", probability_words(found.p_value))]
+    if found.best is not None:
+        fault = found.best.faults[0]
+        cards += [
+            ("probability of the best answer", f"{found.best.posterior:.3f}"),
+            (f"answers in the set of {100 * found.coverage:g} %", str(len(found.candidates))),
+            ("deflection", number(fault.deflection, 3)),
+        ]
+    if found.remaining is not None:
+        cards.append(("p-value of what is left", probability_words(found.remaining.p_value)))
+    return [{"label": label, "value": value} for label, value in cards]
+
+
+def _answers(found: Diagnosis) -> Table:
+    rows = []
+    for place, answer in enumerate(found.candidates, start=1):
+        for i, fault in enumerate(answer.faults):
+            first, *more = size_words(fault)
+            rows.append((
+                f"{place}. {fault.label}" if i == 0 else f"and {fault.label}",
+                f"{answer.posterior:.3f}" if i == 0 else "", onset_words(fault).removeprefix("onset "),
+                number(fault.deflection, 3), first,
+            ))
+            rows += [("", "", "", "", words) for words in more]
+    note = (
+        f"The smallest set that holds {100 * found.coverage:g} % of the probability. Intervals in brackets hold "
+        f"{100 * found.coverage:g} %, the search for the onset included."
+    )
+    return Table("Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows, note)
+
+
+def _evidence(found: Diagnosis) -> list[tuple[str, str]]:
+    facts = [
+        ("Method", found.method),
+        ("False alarms", f"{found.false_alarm:g} of healthy records"),
+        ("p-value of health", probability_words(found.p_value)),
+    ]
+    if found.certificate.kind != "none":
+        facts.append(("Proof", certificate_words(found).removeprefix("proof: ")))
+    if found.remaining is not None:
+        facts.append(("Left unexplained", remaining_words(found).removeprefix("left unexplained: ")))
+    return facts
+

@@ -1,0 +1,210 @@
+"""How probable every explanation is, with its magnitudes and its onsets summed out.
+
+The prior of the magnitudes nu of an explanation with Gram matrix G is N(0, g G^-1), in words: its deflection in every
+direction is of the size sqrt(g). Then the marginal likelihood has the closed form (1 + g)^(-d/2) exp(g / (1 + g) l / 2)
+beside that of health, with l the energy explained (marginalised likelihood ratio, Gustafsson 1995). No size is known
+beforehand, so that it is averaged over several g. More magnitudes are paid for by themselves: a loss is preferred to a
+stuck actuator that explains as much.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.faults.signatures import Candidate
+
+if TYPE_CHECKING:
+    from optid.faults.search.scanning import Scan
+
+SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0
+"""Squared deflections of the prior."""
+
+NEGLIGIBLE = 18.0
+"""Onsets whose probability is e to this power below the largest are left out."""
+
+MODEL_ERROR = 0.02
+"""Probability that a share lost outside [0, 1] is an error of the model, and not a reason against the loss."""
+
+
+class Explained(NamedTuple):
+    """What an explanation makes of a window.
+
+    Attributes:
+        fitted: (N, l) what it leaves in the innovations.
+        rest: (N, l) what is then left: white noise, where it is right.
+        magnitudes: numbers that were estimated for it.
+    """
+
+    fitted: Array
+    rest: Array
+    magnitudes: int
+
+
+class Explanation(NamedTuple):
+    """One set of candidates over the onsets that may be.
+
+    Attributes:
+        candidates: one or several.
+        onsets: (K, s) of each candidate.
+        logs: (K,) logarithms of the marginal likelihoods, the prior of the onsets included.
+        sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
+        covariances: (K, d, d) for the onsets of the row.
+        energies: (K,) energy explained, or twice the gain in log-likelihood.
+        course: of candidates without a signature, what they make of the window for an onset.
+    """
+
+    candidates: tuple[Candidate, ...]
+    onsets: np.ndarray
+    logs: Array
+    sizes: Array
+    covariances: Array
+    energies: Array
+    course: Callable[[int], Explained] | None = None
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the marginal likelihood, onsets summed out."""
+        from scipy.special import logsumexp
+
+        return float(np.asarray(logsumexp(self.logs)))
+
+    @property
+    def weights(self) -> Array:
+        """Probabilities (K,) of the onsets."""
+        return np.exp(self.logs - self.log_evidence)
+
+    @property
+    def best(self) -> int:
+        """The row of the most probable onsets."""
+        return int(np.argmax(self.logs))
+
+
+def marginal(energies: Array, dimension: int) -> Array:
+    """Return the logarithm of the likelihood beside that of health, magnitudes integrated out.
+
+    Args:
+        energies: energy explained, any shape.
+        dimension: number of magnitudes.
+    """
+    from scipy.special import logsumexp
+
+    g = np.array(SPREADS)
+    terms = np.multiply.outer(energies, g / (1 + g) / 2) - dimension / 2 * np.log1p(g)
+    return np.asarray(logsumexp(terms, axis=-1) - np.log(g.size))
+
+
+def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
+    """Return one candidate at all its onsets; None where it is tested at none.
+
+    Args:
+        scan: the search.
+        candidate: of its dictionary.
+    """
+    row = scan.statistic[scan.index(candidate)]
+    tested = np.flatnonzero(~np.isnan(row))
+    if not tested.size:
+        return None
+    logs = marginal(row[tested], candidate.dimension) - np.log(tested.size)
+    near = logs > logs.max() - NEGLIGIBLE
+    kept, logs = tested[near], logs[near]
+    found = [scan.estimate(candidate, int(k)) for k in kept]
+    sizes, covariances = np.array([m.nu for m in found]), np.array([m.covariance for m in found])
+    return Explanation(
+        (candidate,), kept[:, None], logs + _bounded((candidate,), sizes, covariances), sizes, covariances, row[kept]
+    )
+
+
+def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
+    """Return several candidates over the onsets around those given.
+
+    Args:
+        scan: the search.
+        candidates: of its dictionary.
+        onsets: where they explain most together.
+        reach: onsets on both sides of each that are summed.
+    """
+    ranges = []
+    for candidate, onset in zip(candidates, onsets):
+        row = scan.statistic[scan.index(candidate)]
+        there = np.arange(max(onset - reach, 0), min(onset + reach + 1, row.size))
+        ranges.append(there[~np.isnan(row[there])])
+    blocks = [
+        np.stack([scan.signature(c, int(k)).reshape(scan.whitened.r.size, -1) for k in there])
+        for c, there in zip(candidates, ranges)
+    ]
+    dims = [block.shape[2] for block in blocks]
+    edges = np.cumsum([0, *dims])
+    axes = np.meshgrid(*[np.arange(len(there)) for there in ranges], indexing="ij")
+    rows = [axis.ravel() for axis in axes]
+    count, total = rows[0].size, int(edges[-1])
+    gram, correlation = np.empty((count, total, total)), np.empty((count, total))
+    r = scan.whitened.r.ravel()
+    for i, first in enumerate(blocks):
+        a = slice(edges[i], edges[i + 1])
+        correlation[:, a] = np.einsum("knd,n->kd", first, r)[rows[i]]
+        for j, second in enumerate(blocks[: i + 1]):
+            b = slice(edges[j], edges[j + 1])
+            cross = np.tensordot(first, second, ([1], [1]))[rows[i], :, rows[j], :]
+            gram[:, a, b], gram[:, b, a] = cross, np.swapaxes(cross, 1, 2)
+    covariances, sizes, energies, ranks = _solved(gram, correlation)
+    prior = sum(np.log(max(np.sum(~np.isnan(scan.statistic[scan.index(c)])), 1)) for c in candidates)
+    logs = marginal(energies, total) - prior
+    apart = ranks == total  # elsewhere one of them explains as much
+    for i, first in enumerate(candidates):
+        for j, second in enumerate(candidates[:i]):
+            if first is second:  # counted once
+                apart &= ranges[j][rows[j]] < ranges[i][rows[i]]
+    logs = np.where(apart, logs, -np.inf) if apart.any() else logs
+    logs = logs + _bounded(candidates, sizes, covariances)
+    kept = logs > logs.max() - NEGLIGIBLE
+    where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)
+    return Explanation(
+        tuple(candidates), where[kept], logs[kept], sizes[kept], covariances[kept], energies[kept]
+    )
+
+
+def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.ndarray]:
+    """Covariances, least-squares magnitudes, energies and ranks of many small systems."""
+    scale = np.sqrt(np.maximum(np.einsum("kii->ki", gram), 1e-300))
+    values, axes = np.linalg.eigh(gram / (scale[:, :, None] * scale[:, None, :]))
+    there = values > 1e-6
+    inverse = np.where(there, 1 / np.where(there, values, 1.0), 0.0)
+    covariances = np.einsum("kij,kj,klj->kil", axes, inverse, axes) / (scale[:, :, None] * scale[:, None, :])
+    sizes = np.einsum("kij,kj->ki", covariances, correlation)
+    return covariances, sizes, np.einsum("ki,ki->k", sizes, correlation), there.sum(axis=1)
+
+
+def _bounded(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
+    """Logarithm (K,) of what it changes that a share lost lies between 0 and 1."""
+    from scipy.special import ndtr
+
+    change = np.zeros(len(sizes))
+    first = 0
+    for candidate in candidates:
+        if candidate.kind in ("loss", "stuck"):
+            mean, std = sizes[:, first], np.sqrt(np.maximum(covariances[:, first, first], 1e-300))
+            inside = ndtr((1 - mean) / std) - ndtr(-mean / std)
+            wide = std * np.sqrt(np.mean(SPREADS))
+            before = ndtr(1 / wide) - 0.5
+            change += np.log((1 - MODEL_ERROR) * inside / before + MODEL_ERROR)
+        first += candidate.dimension
+    return change
+
+
+def probabilities(logs: Array) -> Array:
+    """Return the probability of each explanation.
+
+    Args:
+        logs: logarithms of the marginal likelihood times the prior of each.
+    """
+    weights = np.exp(logs - logs.max())
+    return np.asarray(weights / weights.sum())
+
+
+def smallest_set(posterior: Array, coverage: float) -> np.ndarray:
+    """Return the fewest entries that hold the probability asked for, the most probable first."""
+    order = np.argsort(-posterior, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(posterior[order]), coverage * (1 - 1e-12))) + 1
+    return order[:enough]

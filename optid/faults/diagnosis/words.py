@@ -1,0 +1,234 @@
+"""A diagnosis in words."""
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from optid.faults.diagnosis.answers import Answer, Diagnosis, Estimate
+
+WIDTH = 80
+
+WORDS = {
+    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading",
+    "schedule": "share of the change",
+}
+"""What the magnitude of a kind is called."""
+
+
+def estimate_line(fault: "Estimate") -> str:
+    """Say in one or more lines what a fault is, since when and how large."""
+    return "\n".join([fault.label, *("  " + line for line in (onset_words(fault), *size_words(fault)))])
+
+
+def onset_words(fault: "Estimate") -> str:
+    """Say when it began."""
+    low, high = fault.onset_interval
+    if fault.onset_censored:
+        return f"onset at or before sample {high}" if low == 0 else f"onset at or after sample {low}"
+    return f"onset at sample {fault.onset}" + (f" ({low} to {high})" if low < high else "")
+
+
+def size_words(fault: "Estimate") -> list[str]:
+    """Say how large each magnitude is, with its interval."""
+    lines = []
+    for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
+        if word == "share lost":
+            value, low, high = (float(np.clip(number, 0.0, 1.0)) for number in (value, low, high))
+        if word == "reading":
+            lines.append(f"{word} {value:.6g}")
+            continue
+        interval = f"{low:.3g} to {high:.3g}"
+        if not np.isfinite([low, high]).all():
+            lines.append(f"{word} unknown")
+        elif np.isfinite(value):
+            lines.append(f"{word} {value:.3g} ({interval})")
+        else:
+            lines.append(f"{word} between {low:.3g} and {high:.3g}")
+    return lines
+
+
+def magnitude_names(fault: "Estimate") -> list[str]:
+    """Return what the entries of the size are."""
+    d = len(fault.size)
+    if fault.kind in ("loss", "stuck"):
+        constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
+        return ["share lost", *constants]
+    word = WORDS.get(fault.kind, "size")
+    if d == 1:
+        return [word]
+    part = "state" if fault.name.startswith(("state", "process")) else "part"
+    return [f"{word} of {part} {i}" for i in range(1, d + 1)]
+
+
+def printed(found: "Diagnosis") -> str:
+    """Print a diagnosis in 80 columns."""
+    lines = [f"{found.verdict}: {headline(found)}"]
+    lines.append(
+        f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
+        f"method {found.method}"
+    )
+    for answer in found.candidates:
+        mark = "  <- best" * (answer is found.best)
+        lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
+        lines += [f"  {line}" for line in str(answer).splitlines()]
+    if found.detected:
+        lines += ["", certificate_words(found)] if found.certificate.kind != "none" else [""]
+    if found.remaining is not None:
+        lines += [remaining_words(found)]
+    lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
+    lines += [found.status] * bool(found.status)
+    return "\n".join(wrapped(lines))
+
+
+def wrapped(lines: list[str]) -> list[str]:
+    """Break lines that are too wide, keeping their indent."""
+    result: list[str] = []
+    for line in lines:
+        indent = " " * (len(line) - len(line.lstrip()) + 2)
+        result += textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
+    return result
+
+
+def headline(found: "Diagnosis") -> str:
+    """Say the outcome in one clause."""
+    if found.verdict == "healthy":
+        return "no alarm"
+    if found.verdict == "untestable":
+        return "the input excites nothing that is suspected"
+    if found.verdict == "not isolable":
+        return "something is wrong, and one output cannot tell what"
+    if found.verdict == "unknown":
+        return "something is wrong, and it is none of the candidates"
+    if found.best is None:
+        return f"one of {len(found.candidates)} answers, none of them proved the best"
+    if found.unique:
+        return found.best.label
+    return f"one of {len(found.candidates)} answers, most probably {found.best.label}"
+
+
+def certificate_words(found: "Diagnosis") -> str:
+    """Say what the answer rests on."""
+    proof = found.certificate
+    if proof.kind in ("exhaustive", "grid"):
+        tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
+        words = f"proof: {tried}; energy explained beyond its threshold {proof.value:.1f}"
+        if np.isfinite(proof.runner_up_margin):
+            words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
+        return words
+    if proof.kind == "flat line":
+        return f"proof: {proof.value:.0f} readings in a row are identical to the bit"
+    if proof.kind == "duality gap":
+        return f"proof: duality gap {proof.value:.1e}"
+    if proof.kind == "infeasible healthy":
+        return (
+            f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
+            "wide; the parity vector is kept"
+        )
+    return "no proof"
+
+
+def remaining_words(found: "Diagnosis") -> str:
+    """Say what is left unexplained."""
+    rest = found.remaining
+    assert rest is not None
+    words = (
+        f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings; the worst of four tests "
+        f"({rest.test}) has p-value {probability_words(rest.p_value)}"
+    )
+    return words if found.verdict != "unknown" else f"{words}; {course_words(found)}"
+
+
+def course_words(found: "Diagnosis") -> str:
+    """Say in which direction the rest lies and how fast it changes."""
+    rest = found.remaining
+    assert rest is not None
+    names = found.outputs or tuple(f"y{i + 1}" for i in range(len(rest.direction)))
+    direction = ", ".join(f"{name} {part:+.2f}" for name, part in zip(names, rest.direction))
+    if rest.frequency <= 1 / max(found.window, 1):
+        speed = "slow or constant"
+    else:
+        speed = f"strongest at {rest.frequency:.3g} cycles per sample (period {1 / rest.frequency:.3g} samples)"
+    return f"direction {direction}; {speed}, {100 * rest.share:.0f} % of its energy there"
+
+
+def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
+    """Say in three sentences what was found, how sure that is, and what it rests on.
+
+    Args:
+        found: the diagnosis.
+        notes: add what could not be judged, and the status.
+    """
+    if found.verdict == "healthy":
+        sentences = [
+            f"The record of {found.window} samples is what the healthy {_model(found)} predicts.",
+            f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
+            f"{found.false_alarm:g} that would be an alarm.",
+        ]
+    elif found.verdict == "untestable":
+        sentences = [_nothing_said(found)]
+    elif found.verdict in ("unknown", "not isolable"):
+        sentences = [
+            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
+            + ("no fault of the dictionary fits it." if found.verdict == "unknown" else
+               "with one output a fault of any course explains it, in any place."),
+        ]
+        if found.remaining is not None:
+            sentences.append(f"What is left of it: {course_words(found)}.")
+    else:
+        sentences = _faulty(found)
+    if notes:
+        if found.untestable and found.verdict != "untestable":
+            sentences.append(f"This record cannot judge {_list(list(found.untestable))}.")
+        sentences += [found.status] * bool(found.status)
+    return sentences
+
+
+def _nothing_said(found: "Diagnosis") -> str:
+    names = _list(list(found.untestable))
+    if found.detected:
+        return (
+            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
+            f"the input does not excite what is suspected: {names}."
+        )
+    return f"Nothing can be said about {names}: the input does not excite it."
+
+
+def _faulty(found: "Diagnosis") -> list[str]:
+    answers = found.candidates
+    best, others = answers[0], answers[1:]
+    most = "most probably " * bool(others)
+    first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{_phrase(best)}."
+    if others:
+        shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
+        second = (
+            f"The record cannot tell it (probability {best.posterior:.2f}) from {shares} at {100 * found.coverage:g} %."
+        )
+    else:
+        sure = f"No other candidate is left at {100 * found.coverage:g} %"
+        second = f"{sure} (probability {best.posterior:.3f})."
+    proof = certificate_words(found)
+    return [first, second, proof[0].upper() + proof[1:] + "."]
+
+
+def _phrase(answer: "Answer") -> str:
+    return " and ".join(
+        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in answer.faults
+    )
+
+
+def _model(found: "Diagnosis") -> str:
+    """The title of the model inside a sentence; Hammerstein is a name."""
+    return found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
+
+
+def _list(words: list[str], joint: str = "and") -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+
+
+def probability_words(value: float) -> str:
+    """Write a probability, however small."""
+    if value < 1e-300:
+        return "< 1e-300"
+    return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"

@@ -1,0 +1,1 @@
+"""The search on a stream, sample by sample."""

@@ -1,0 +1,189 @@
+"""Thresholds of a running search from the mean time between false alarms that is asked for, by simulation.
+
+The whitened innovations of a healthy plant are white with unit covariance, so that the search itself can be run on
+random numbers, without the plant. The largest statistics of blocks as long as the window are kept. An alarm is a block
+that exceeds a threshold after one that did not, and the rate of alarms while there is none is
+
+    1 / ARL0 = -log(1 - alarms / blocks without an alarm before) / length of a block.
+
+Every candidate gets the same rate of its own, which is found such that all of them together have the rate asked for.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.monitor import layout as at
+from optid.faults.monitor.layout import Tables
+from optid.faults.monitor.tables import blank
+
+ALARMS = 400
+"""False alarms that a simulation must see, so that their rate is known to 5 %."""
+
+FEWEST = 50
+"""With fewer alarms than this the threshold is extrapolated, or refused."""
+
+LONGEST = 4_000_000
+"""Samples simulated at most, unless more are asked for."""
+
+CHUNK = 20_000
+"""Samples simulated at a time; every one of them has random numbers of its own."""
+
+RUNS = 4
+"""Simulations that may run at the same time; the result does not depend on how many do."""
+
+HOLD = 5
+"""Samples over which the simulated input keeps its level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Thresholds and what they rest on.
+
+    Attributes:
+        labels: the candidates.
+        q: (C,) their thresholds.
+        arl0: samples between false alarms, asked for.
+        window: samples of the window.
+        samples: samples simulated.
+        alarms: false alarms among them at these thresholds.
+        seed: of the simulation.
+        extrapolated: whether the simulation was too short for so rare an alarm and the tail was extrapolated.
+    """
+
+    labels: tuple[str, ...]
+    q: Array
+    arl0: float
+    window: int
+    samples: int
+    alarms: int
+    seed: int | None
+    extrapolated: bool = False
+
+    def __str__(self) -> str:
+        """Say what the thresholds rest on."""
+        tail = ", the tail extrapolated" if self.extrapolated else ""
+        lines = [f"false alarm every {self.arl0:g} samples: {self.alarms} alarms in {self.samples} simulated{tail}"]
+        if not self.samples:
+            lines = ["thresholds as given"]
+        return "\n".join(lines + [f"  {label:<40} {q:7.2f}" for label, q in zip(self.labels, self.q)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe it in JSON types."""
+        return {**self.__dict__, "labels": list(self.labels), "q": [float(q) for q in self.q]}
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> "Calibration":
+        """Build what `to_dict` described."""
+        return cls(**{**content, "labels": tuple(content["labels"]), "q": np.array(content["q"], dtype=float)})
+
+
+def calibrate(
+    t: Tables, labels: tuple[str, ...], f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
+    extrapolate: bool = False,
+) -> Calibration:
+    """Find the thresholds of a search.
+
+    Args:
+        t: its tables.
+        labels: of the candidates.
+        f: (T, r) functions of the input of a healthy plant, repeated as often as needed; it matters for losses and
+            stuck actuators only.
+        arl0: samples between false alarms.
+        samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
+        seed: of the simulation.
+        extrapolate: whether the tail may be extrapolated where the simulation is too short.
+
+    Raises:
+        StructureError: an ARL0 below the length of the window.
+        DataError: a simulation that cannot support so rare an alarm.
+    """
+    window = int(t.i[0, at.WINDOW])
+    if not (np.isfinite(arl0) and arl0 >= window):
+        raise StructureError(
+            f"arl0={arl0!r}: a mean time between false alarms of at least the window, {window} samples, is needed."
+        )
+    wanted = int(min(ALARMS * arl0, LONGEST)) if samples is None else int(samples)
+    extrapolated = wanted < FEWEST * arl0
+    if extrapolated and not extrapolate:
+        raise DataError(
+            f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {FEWEST} alarms are needed. "
+            f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), ask for a lower arl0, or let the tail be "
+            "extrapolated (extrapolate=True)."
+        )
+    largest = maxima(t, f, wanted, seed)
+    q, alarms = equalised(largest, window, arl0)
+    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
+
+
+def maxima(t: Tables, f: Array, samples: int, seed: int | None) -> Array:
+    """Return the largest statistics (B, C) of blocks of W samples of a healthy search."""
+    from optid.faults.monitor.search_kernels import rehearse
+
+    window, l, candidates = (int(t.i[0, d]) for d in (at.WINDOW, at.NY, at.CANDIDATES))  # noqa: E741
+    blocks = max(CHUNK // window, 1)
+    length = blocks * window
+    count = max(1, -(-samples // (RUNS * length)))
+    inputs = np.resize(f, (length, f.shape[1])) if f.size else np.zeros((length, f.shape[1]))
+
+    def run(seeds: np.random.SeedSequence) -> Array:
+        s, streams = blank(t), [np.random.default_rng(part) for part in seeds.spawn(count + 1)]
+        found = np.empty((count, blocks, candidates))
+        # the first window fills up
+        rehearse(t, s, inputs, streams[0].standard_normal((window, l)), np.empty((1, candidates)))
+        for number, stream in enumerate(streams[1:]):
+            shifted = np.roll(inputs, -number * length % max(len(f), 1), axis=0)
+            rehearse(t, s, shifted, stream.standard_normal((length, l)), found[number])
+        return found.reshape(-1, candidates)
+
+    with ThreadPoolExecutor(min(RUNS, os.cpu_count() or 1)) as pool:
+        return np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
+
+
+def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
+    """Return thresholds (C,) at one rate of their own, all together at the rate 1 / ARL0, and the alarms counted.
+
+    Args:
+        largest: (B, C) statistics of blocks.
+        length: samples of a block.
+        arl0: samples between alarms.
+    """
+    goal = -np.expm1(-length / arl0)
+    level = goal / largest.shape[1]  # as if the candidates had nothing in common
+    for _ in range(30):
+        q = np.array([tail(column, level) for column in largest.T])
+        alarms, quiet = onsets(np.any(largest > q, axis=1))
+        share = alarms / max(quiet, 1)
+        if alarms < FEWEST or abs(share / goal - 1) < 0.005:
+            break
+        level *= goal / share
+    return q, alarms
+
+
+def onsets(above: Any) -> tuple[int, int]:
+    """Return how many blocks begin an alarm, and how many follow one without."""
+    return int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
+
+
+def tail(column: Array, level: float) -> float:
+    """Return the statistic that a share `level` of the blocks exceeds, from an exponential tail where they are few."""
+    count = len(column)
+    ordered = np.sort(column)
+    exceed = level * count
+    base = min(count // 10, max(500, int(4 * exceed)))
+    if exceed >= 500 or base < 20:
+        return float(np.quantile(ordered, 1 - level))
+    start = ordered[count - base - 1]
+    scale = float(np.mean(ordered[count - base :] - start))
+    return float(start + scale * np.log(base / exceed))
+
+
+def held_levels(low: Array, high: Array, count: int, seed: int | None) -> Array:
+    """Return inputs (N, m), uniform between two bounds, every level held."""
+    drawn = np.random.default_rng(seed).uniform(low, high, (-(-count // HOLD), len(low)))
+    return np.repeat(drawn, HOLD, axis=0)[:count]

@@ -1,0 +1,1 @@
+"""Complete failures by rank deficiency (chapter 7)."""

@@ -1,0 +1,1 @@
+"""The damaged system as a new problem: refit, virtual sensor, re-allocation."""

@@ -1,0 +1,211 @@
+"""From an answer of a diagnosis to the damaged plant: what is open, what is lost, what is added."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases import Triangular
+from optid.bases.basis import Array
+from optid.errors import StructureError
+from optid.faults.faults import channel_of
+from optid.faults.signatures import Candidate
+from optid.models.nonlinearity import Nonlinearity
+
+if TYPE_CHECKING:
+    from optid.faults.diagnosis.answers import Answer, Estimate
+    from optid.models import HammersteinSS
+
+DEAD_SHARE = 0.8
+"""An actuator whose interval of the share lost holds one counts as dead from this estimate on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Damage:
+    """What one explanation of a record says is broken.
+
+    Attributes:
+        label: the explanation.
+        posterior: its probability.
+        onset: first sample that the last of its faults changes.
+        same_onset: whether all of its faults began there.
+        columns: functions of the inputs that are damaged.
+        dead: those of them that no longer move.
+        sensors: names of outputs that are not to be trusted.
+        offsets: faults that add something to the plant.
+        louder_sensors: {output: standard deviation added}.
+        louder_states: covariance (n, n) added to the process noise; zeros where there is none.
+        gains: (r,) share of each f that is left.
+        constants: (r,) added to it.
+        added: (n,) constant added in the state equation.
+        notes: what is to be known of it.
+    """
+
+    label: str
+    posterior: float
+    onset: int
+    same_onset: bool
+    columns: tuple[int, ...]
+    dead: tuple[int, ...]
+    sensors: tuple[str, ...]
+    offsets: tuple[Candidate, ...]
+    louder_sensors: Mapping[str, float]
+    louder_states: Array
+    gains: Array
+    constants: Array
+    added: Array
+    notes: tuple[str, ...]
+
+    @property
+    def needs_refit(self) -> bool:
+        """Whether something about the plant itself is to be estimated."""
+        return bool(self.columns or self.offsets)
+
+    def with_noise(self, model: "HammersteinSS") -> "HammersteinSS":
+        """Return a model with the noise that the faults add."""
+        if model.noise is None or not (self.louder_sensors or self.louder_states.any()):
+            return model
+        R = np.array(model.noise.R)
+        for name, std in self.louder_sensors.items():
+            R[model.outputs.index(name), model.outputs.index(name)] += std**2
+        from optid.models.kalman import kalman_gain
+
+        Q = model.noise.Q + self.louder_states
+        steady = kalman_gain(model.A, model.C, Q, R, model.noise.S)
+        return replace(model, K=steady.K, noise=replace(model.noise, Q=Q, R=R, innovation=steady.innovation))
+
+    def believed(self, model: "HammersteinSS") -> "HammersteinSS":
+        """Return the model that the diagnosis alone describes: gains and constants, without a refit."""
+        functions = list(model.nonlinearities)
+        constants = np.array(self.constants)
+        for i in self.columns:
+            one = functions[i]
+            if i in self.dead or self.gains[i] == 0:
+                interval = one.basis.interval or (-1.0, 1.0)
+                functions[i] = Nonlinearity(Triangular(1, interval), np.zeros(1))
+            else:
+                offset = None if one.offset is None else self.gains[i] * one.offset
+                functions[i] = replace(one, mu=self.gains[i] * one.mu, offset=offset)
+        return replace(
+            model, nonlinearities=tuple(functions), offset_x=model.offset_x + model.B @ constants + self.added,
+            offset_y=model.offset_y + model.D @ constants, gauge="none",
+        )
+
+
+def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
+    """Return what an answer may mean: one explanation, or one for each part of a group that no record tells apart."""
+    variants: list[list[tuple[str, Estimate]]] = [[]]
+    for fault in answer.faults:
+        places = fault.candidate.places or (fault.name,)
+        variants = [[*before, (place, fault)] for before in variants for place in places]
+    return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
+
+
+def merged(broken: list[Damage]) -> list[Damage]:
+    """Return one explanation for those that break the same parts, as a loss and a stuck actuator do.
+
+    They are refitted alike; the most probable speaks for them, and their probabilities add up.
+    """
+    groups: dict[Any, list[Damage]] = {}
+    for one in broken:
+        key = (frozenset(one.columns), frozenset(one.sensors), frozenset(c.label for c in one.offsets),
+               frozenset(one.louder_sensors), bool(one.louder_states.any()))
+        groups.setdefault(key, []).append(one)
+    found = []
+    for group in groups.values():
+        best = max(group, key=lambda one: one.posterior)
+        found.append(replace(best, posterior=sum(one.posterior for one in group)))
+    return sorted(found, key=lambda one: -one.posterior)
+
+
+def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posterior: float) -> Damage:
+    r, n = len(model.nonlinearities), model.nx
+    columns: list[int] = []
+    dead: list[int] = []
+    sensors: list[str] = []
+    offsets: list[Candidate] = []
+    louder: dict[str, float] = {}
+    states, gains, constants, added = np.zeros((n, n)), np.ones(r), np.zeros(r), np.zeros(n)
+    notes: list[str] = []
+    for place, fault in parts:
+        part, _, channel = place.partition(":")
+        size = np.asarray(fault.size, dtype=float)
+        known = bool(np.all(np.isfinite(size)))
+        if fault.kind == "spike":
+            notes.append(f"{channel}: single readings were wrong; nothing is broken")
+        elif part == "actuator":
+            c = channel_of(model.inputs, place)
+            mine = [i for i, of in enumerate(model.input_of) if of == c]
+            columns += mine
+            _actuator(fault, mine, size, known, gains, constants, dead, notes, channel)
+        elif part == "sensor":
+            o = channel_of(model.outputs, place)
+            if fault.kind == "noise" and known:
+                louder[model.outputs[o]] = float(np.max(np.abs(size)))
+            else:
+                sensors.append(model.outputs[o])
+                if fault.kind == "bias" and known:
+                    notes.append(f"{channel}: its readings were off by {size[0]:.4g}; they are not used")
+        elif fault.kind == "noise":
+            where = fault.candidate.into_state
+            if known:
+                states = states + where * size**2 @ where.T
+        elif fault.kind == "jump":
+            notes.append("the state jumped once: the plant is as it was, the observer starts anew")
+        else:
+            own = replace(
+                fault.candidate, kind=fault.kind, members=(fault.candidate.members or (place,)), name=place
+            )
+            offsets.append(own)
+            if fault.kind == "drift":
+                notes.append(f"{place}: a drift goes on growing; the model holds its last value")
+            elif known:
+                added = added + fault.candidate.into_state @ size
+    onsets = [fault.onset for _, fault in parts]
+    label = " + ".join(place if fault.kind in ("bias", "jump") else f"{place} {fault.kind}" for place, fault in parts)
+    return Damage(
+        label, posterior, max(onsets), min(onsets) == max(onsets), tuple(dict.fromkeys(columns)),
+        tuple(dict.fromkeys(dead)), tuple(dict.fromkeys(sensors)), tuple(offsets), louder, states, gains, constants,
+        added, tuple(notes),
+    )
+
+
+def _actuator(fault: Any, mine: list[int], size: Array, known: bool, gains: Array, constants: Array, dead: list[int],
+              notes: list[str], channel: str) -> None:
+    """Write down what a fault of an actuator does to its functions."""
+    if fault.kind in ("bias", "drift"):
+        if known:
+            constants[mine] += size
+        if fault.kind == "drift":
+            notes.append(f"{channel}: a drift goes on growing; the model holds the mean since its onset")
+        return
+    if not known:
+        return
+    gains[mine] = float(np.clip(1 - size[0], 0.0, 1.0))
+    if len(size) == 1 + len(mine):
+        constants[mine] += size[1:]
+    low, high = np.asarray(fault.size_interval, dtype=float)[0]
+    if size[0] >= DEAD_SHARE and low <= 1 <= high or fault.kind in ("frozen",):
+        dead.extend(mine)
+        gains[mine] = 0.0
+        notes.append(f"{channel}: nothing of its effect is left within the interval of the share lost: hard-over")
+
+
+def check_answers(diagnosis: Any) -> None:
+    """Refuse a diagnosis that names nothing.
+
+    Raises:
+        StructureError: verdicts "unknown", "untestable" and "not isolable" without candidates.
+    """
+    if diagnosis.candidates:
+        return
+    why = {
+        "unknown": "no fault of the dictionary fits, so that there is nothing to put into the model. Add candidates to "
+                   "the dictionary, or fit a new model to the record after the alarm",
+        "untestable": "the record cannot say: its input does not move what is suspected. Record with a moving input, "
+                      "or apply optid.faults.probe_input",
+        "not isolable": "the record cannot say which part it is: with one output every fault with a free course fits. "
+                        "Add a sensor, or use kinds of faults with a course of their own",
+    }.get(diagnosis.verdict, "it has no candidates")
+    raise StructureError(f"The diagnosis is {diagnosis.verdict!r}: {why}.")

@@ -1,0 +1,118 @@
+"""A reformulation as one HTML page that carries its figure with it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optid import __version__
+from optid.faults.repair.reformulation import Reformulation
+from optid.faults.repair.words import HEADS, member_lines
+from optid.showing.page import figure, template, versions
+from optid.showing.wording import Table, number
+
+TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "ambiguous": "bad"}
+
+
+def write(found: Reformulation, path: str | Path, *, record: str = "", command: str = "") -> Path:
+    """Write a reformulation as a self-contained HTML page.
+
+    Args:
+        found: the reformulation.
+        path: the file, replaced when it exists.
+        record: name of the record.
+        command: the command line behind it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    path.write_text(render(found, record=record, command=command), encoding="utf-8")
+    return path
+
+
+def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
+    """Return the page that `write` writes."""
+    caption = (
+        "Effect of every actuator before and now, with twice its standard error (open dots: no sample lies there); "
+        "outputs that can be held at rest; predicted errors of the outputs without their noise."
+    )
+    content: dict[str, Any] = {
+        "version": __version__,
+        "title": f"Reformulation: {found.status}",
+        "lead": " · ".join(part for part in (record, found.healthy.title) if part),
+        "tone": TONES[found.status],
+        "word": HEADS[found.status],
+        "sentences": _sentences(found),
+        "cards": _cards(found),
+        "notes": list(dict.fromkeys(note for note in found.notes)),
+        "tables": _tables(found),
+        "figures": [figure("reformulation", found.plot, caption)],
+        "members": [
+            {"title": member.label, "text": "\n".join(member_lines(member)[1:])} for member in found.members
+        ],
+        "call": command or "optid.faults.reformulate(model, diagnosis, data)",
+        "versions": versions(),
+        "text": str(found),
+        "sections": [("verdict", "Result"), ("tables", "Values"), ("figures", "Figure"), ("members", "Explanations"),
+                     ("reproduce", "Reproduce")],
+    }
+    if not found.members:
+        content["sections"] = [pair for pair in content["sections"] if pair[0] != "members"]
+    return template("reformulation.html.j2").render(content)
+
+
+def _sentences(found: Reformulation) -> list[str]:
+    labels = " or ".join(member.label for member in found.members)
+    if found.if_ambiguous is not None:
+        advice = found.if_ambiguous
+        return [f"What broke is {labels}.", f"Advice: {advice.action}; {advice.reason}."]
+    lines = [f"What broke is {labels}."] if labels else ["Nothing is to be changed."]
+    if found.schedule is not None:
+        lines.append(
+            f"The model was refitted from {found.schedule.samples} samples after the fault: {found.schedule.stage} "
+            f"({found.schedule.reason})."
+        )
+    if found.observer.lost:
+        lines.append(f"Without {', '.join(found.observer.lost)} the other sensors say what they would read.")
+    return lines
+
+
+def _cards(found: Reformulation) -> list[dict[str, str]]:
+    cards = []
+    if found.schedule is not None:
+        cards.append(("samples after the fault", str(found.schedule.samples)))
+        low, high = found.fit_interval
+        if np.isfinite(low):
+            cards.append(("expected simulation fit", f"{low:.1f} to {high:.1f} %"))
+    cards += [(f"predicted RMSE of {name}", number(found.observer.rmse[name], 3)) for name in found.observer.lost]
+    if found.allocation is not None:
+        cards.append(("actuators that move", ", ".join(found.allocation.moving) or "none"))
+        cards.append(("route of the allocation", found.allocation.route))
+    return [{"label": label, "value": value} for label, value in cards]
+
+
+def _tables(found: Reformulation) -> list[Table]:
+    tables = []
+    for one in () if found.schedule is None else found.schedule.values:
+        rows = [
+            (number(u, 4), number(old, 4), number(new, 4), number(std, 2), "prior only" if unseen else "")
+            for u, old, new, std, unseen in zip(one.u, one.healthy, one.values, one.std, one.prior_only)
+        ]
+        note = (
+            f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of what the "
+            f"record says of the values it visits {one.excitation:.3g}. Standard errors do not count the rules."
+        )
+        tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
+    noise = found.healthy.noise
+    assert noise is not None
+    rows = [
+        (name, "not used" if name in found.observer.lost else "used", number(value, 3),
+         number(float(np.sqrt(noise.R[o, o])), 3), number(found.observer.open_loop[name], 3))
+        for o, (name, value) in enumerate(found.observer.rmse.items())
+    ]
+    tables.append(Table(
+        "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
+        "Of the outputs without their noise, from the Riccati equation of the filter on the sensors that are used.",
+    ))
+    return tables

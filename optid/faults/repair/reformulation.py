@@ -1,0 +1,268 @@
+"""The damaged system as a new problem: its model, what observes it, what can be done with it.
+
+Everything here is a pure function of a healthy model and a diagnosis; the healthy model is never changed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.faults.diagnosis.records import record_of
+from optid.faults.repair.allocation import Allocation, Target, allocate
+from optid.faults.repair.ambiguity import Ambiguity, advise, robust_allocation
+from optid.faults.repair.damage import Damage, check_answers, damages, merged
+from optid.faults.repair.inversion import inverse
+from optid.faults.repair.refitting import NODES, Prior
+from optid.faults.repair.schedule import Schedule, refit
+from optid.faults.repair.virtual_sensor import Observer, observer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from optid.faults.diagnosis.answers import Diagnosis
+    from optid.models import HammersteinSS
+
+
+@dataclass(frozen=True, eq=False)
+class MemberModel:
+    """The plant if one explanation is the right one.
+
+    Attributes:
+        damage: the explanation.
+        model: the plant then.
+        observer: filter on the sensors that are left.
+        allocation: what the actuators that are left can do; None where `notes` say why.
+        schedule: how the model was refitted; None where nothing of the plant itself changed.
+        notes: what is to be known.
+    """
+
+    damage: Damage
+    model: "HammersteinSS"
+    observer: Observer
+    allocation: Allocation | None
+    schedule: Schedule | None
+    notes: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """What it is called."""
+        return self.damage.label
+
+
+@dataclass(frozen=True, eq=False)
+class Reformulation:
+    """The damaged system; `print` it, or ask `attainable`.
+
+    Attributes:
+        status: "healthy" (everything is as it was), "refitted", "as diagnosed" (the plant itself is as the diagnosis
+            says, without a refit) or "ambiguous".
+        healthy: the model before.
+        model: the model to use: the healthy one while the diagnosis is ambiguous.
+        observer: filter on the sensors that are left; of an ambiguous diagnosis the ones no member distrusts.
+        allocation: what the actuators that are left can do; None where it cannot be said.
+        schedule: how the model was refitted; None without a refit.
+        members: one per explanation, the most probable first.
+        if_ambiguous: what to do while there are several; None where there is one.
+        notes: what is to be known.
+    """
+
+    status: str
+    healthy: "HammersteinSS"
+    model: "HammersteinSS"
+    observer: Observer
+    allocation: Allocation | None
+    schedule: Schedule | None
+    members: tuple[MemberModel, ...]
+    if_ambiguous: Ambiguity | None
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def fit_interval(self) -> tuple[float, float]:
+        """90 % interval (%) of the simulation fit that the uncertainty of the refit leaves; NaN without a refit."""
+        return (float("nan"), float("nan")) if self.schedule is None else self.schedule.fit_interval
+
+    def attainable(self, reference: ArrayLike) -> Target:
+        """Return the resting point nearest to a reference, its distance, and the actuators that limit it.
+
+        While the diagnosis is ambiguous, the one whose worst member is nearest.
+
+        Args:
+            reference: (l,) outputs wanted.
+
+        Raises:
+            StructureError: no allocation, with the reason.
+        """
+        if self.if_ambiguous is not None and self.if_ambiguous.robust is not None:
+            return self.if_ambiguous.robust.attainable(reference)
+        if self.allocation is None:
+            raise StructureError(f"What can be reached is not known: {'; '.join(self.notes) or 'no allocation'}.")
+        return self.allocation.attainable(reference)
+
+    def plot(self) -> "Figure":
+        """Draw what changed: nonlinearities, what can be reached, and what is not measured any more."""
+        from optid.faults.repair.picture import draw
+
+        return draw(self)
+
+    def __str__(self) -> str:
+        """Say what is left of the plant, in 80 columns."""
+        from optid.faults.repair.words import printed
+
+        return printed(self)
+
+
+def reformulate(
+    model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
+    constraints: Sequence[Any] | str = "default", prior: Prior | None = None, nodes: int = NODES, stage: str = "auto",
+    low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
+    route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0,
+) -> Reformulation:
+    """Turn a healthy model and a diagnosis into the damaged system.
+
+    A broken actuator is refitted from the record after its onset; a broken sensor is replaced by a filter on the
+    others; noise that grew is put into the filter. Several explanations give several members, and the model stays the
+    healthy one until one of them is left.
+
+    Args:
+        model: the healthy model, with noise covariances.
+        diagnosis: of the record.
+        data: the record with the fault: Data, a pair (u, y) of arrays, or a frame or file with the channels of the
+            model as columns; without it the plant is what the diagnosis alone says.
+        constraints: of a damaged nonlinearity: rules of `formulations.shape` or their words; "default": monotone as
+            before and nowhere steeper.
+        prior: what is believed beforehand; by default with the curvature that makes the record most probable.
+        nodes: values of a damaged nonlinearity that has no nodes of its own.
+        stage: "affected only", "all with prior", or "auto": by hold-out.
+        low: (m,) least inputs; the intervals of the bases by default.
+        high: (m,) largest inputs.
+        weights: (l,) of the outputs in distances and costs.
+        route: of the allocation: "qp", "nlp" or "auto".
+        if_ambiguous: "wait", "probe", "robust", or "auto".
+        solver: back end.
+        seed: of draws and probes.
+
+    Raises:
+        DataError: a record that does not go with the model or the diagnosis.
+        StructureError: an unknown word; a diagnosis that names nothing; a damaged plant that is not detectable or not
+            stabilisable, with the mode; no noise covariances.
+        SolverFailed: a refit whose point does not hold.
+
+    Warns:
+        DataWarning: too few samples for a refit; values that no sample supports; a nonlinearity without an inverse.
+    """
+    _check(model, diagnosis)
+    if data is not None and not isinstance(data, Data):
+        data = record_of(model, data)
+    _check_words(stage, nodes, if_ambiguous)
+    bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "route": route, "solver": solver}
+    if diagnosis.verdict == "healthy":
+        allocation, notes = _allocated(model, bounds)
+        return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
+    check_answers(diagnosis)
+    broken = merged([one for answer in diagnosis.candidates for one in damages(model, answer)])
+    how: dict[str, Any] = {
+        "constraints": constraints, "prior": prior, "nodes": nodes, "stage": stage, "solver": solver, "seed": seed,
+    }
+    members = tuple(_member(model, one, data, how, bounds) for one in broken)
+    if len(members) == 1:
+        only = members[0]
+        refitted = only.schedule is not None and only.schedule.stage != "prior"
+        return Reformulation(
+            "refitted" if refitted else "as diagnosed", model, only.model, only.observer, only.allocation,
+            only.schedule, members, None, only.notes,
+        )
+    distrusted = sorted({name for one in broken for name in one.sensors})
+    kept = distrusted if len(distrusted) < model.l else []
+    notes = []
+    if distrusted and not kept:
+        notes.append("every sensor is suspected by some member: all are used until one is left")
+    allocation, more = _allocated(model, bounds)
+    robust, why_not = _robust(model, broken, low, high, weights, solver)
+    u = None if data is None else np.asarray(data.raw().experiments[0].u)
+    advice = advise(model, broken, u, robust, why_not, action=if_ambiguous, seed=seed)
+    return Reformulation(
+        "ambiguous", model, model, observer(model, kept), allocation, None, members, advice, (*notes, *more)
+    )
+
+
+def _check(model: Any, diagnosis: Any) -> None:
+    if getattr(model, "kind", "") != "HammersteinSS":
+        raise StructureError(
+            f"A {getattr(model, 'title', type(model).__name__)} cannot be reformulated: a state-space model with noise "
+            "covariances is needed (formulation hammerstein_ss.asivid)."
+        )
+    if isinstance(diagnosis, tuple | list):
+        raise StructureError("Several diagnoses: reformulate takes one, of one experiment.")
+    if not hasattr(diagnosis, "verdict"):
+        raise StructureError(f"{type(diagnosis).__name__} is no diagnosis: pass what optid.faults.diagnose returned.")
+    if diagnosis.outputs and tuple(diagnosis.outputs) != model.outputs:
+        raise DataError(
+            f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
+        )
+
+
+def _check_words(stage: str, nodes: int, if_ambiguous: str) -> None:
+    for word, given, known in (("stage", stage, ("auto", "affected only", "all with prior")),
+                               ("if_ambiguous", if_ambiguous, ("auto", "wait", "probe", "robust"))):
+        if given not in known:
+            raise StructureError(f"{word}={given!r}: use one of {', '.join(map(repr, known))}.")
+    if isinstance(nodes, bool) or nodes != int(nodes) or nodes < 3:
+        raise StructureError(f"nodes={nodes!r}: a whole number from 3 is needed.")
+
+
+def _member(model: "HammersteinSS", damage: Damage, data: Data | None, how: dict[str, Any], bounds: dict[str, Any]
+            ) -> MemberModel:
+    watched = damage.with_noise(model)
+    schedule = None
+    plant = damage.believed(watched)
+    if damage.needs_refit and data is not None:
+        plant, schedule = refit(watched, _trusted(data, damage.sensors), damage, **how)
+    seen = observer(plant, damage.sensors)
+    allocation, notes = _allocated(plant, bounds)
+    if damage.needs_refit and data is None:
+        notes.append("no record: the plant is what the diagnosis says")
+    return MemberModel(damage, plant, seen, allocation, schedule, (*damage.notes, *notes))
+
+
+def _trusted(data: Data, sensors: Sequence[str]) -> Data:
+    """Return the record without the readings of broken sensors."""
+    gone = [o for o, name in enumerate(data.outputs) if name in sensors]
+    if not gone:
+        return data
+
+    def without(y: Array) -> Array:
+        left = np.array(y, dtype=float)
+        left[:, gone] = np.nan
+        return left
+
+    return data.mapped(lambda u: u, without)
+
+
+def _allocated(model: "HammersteinSS", bounds: dict[str, Any]) -> tuple[Allocation | None, list[str]]:
+    """Return the allocation, or why there is none: inputs without an interval, when no bounds are given."""
+    unbounded = [
+        model.inputs[c] for f, c in zip(model.nonlinearities, model.input_of) if f.basis.interval is None
+    ]
+    if unbounded and (bounds["low"] is None or bounds["high"] is None):
+        return None, [f"no allocation: input {unbounded[0]} has no range; give low= and high="]
+    found = allocate(model, **bounds)
+    return found, list(found.messages)
+
+
+def _robust(model: "HammersteinSS", broken: list[Damage], low: Any, high: Any, weights: Any, solver: Any
+            ) -> tuple[Any, str]:
+    from optid.faults.repair.allocation import _bounds
+
+    try:
+        least, most = _bounds(model, low, high)
+        w = np.ones(model.l) if weights is None else np.broadcast_to(np.asarray(weights, dtype=float), (model.l,))
+        inverses = tuple(inverse(f, least[c], most[c]) for f, c in zip(model.nonlinearities, model.input_of))
+        return robust_allocation(model, inverses, broken, least, most, np.array(w), solver), ""
+    except StructureError as error:
+        return None, str(error)

@@ -1,0 +1,103 @@
+"""The atoms of a window: an orthonormal set for every candidate at every onset that is tested.
+
+The exact search needs none of them; programmes that choose several faults at once do.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import StructureError
+from optid.faults.search.sweeps import inverse_roots
+from optid.faults.signatures import response
+
+if TYPE_CHECKING:
+    from optid.faults.search.calibration import Thresholds
+    from optid.faults.search.scanning import Scan
+
+MOST = 40_000_000
+"""Numbers that the atoms of a window may have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Atoms:
+    """The atoms of one candidate.
+
+    Attributes:
+        label: of the candidate.
+        onsets: (T,) those that are tested.
+        axes: (T, N l, d) orthonormal columns; zero ones for directions of which nothing is seen.
+        back: (T, d, d) magnitudes = back @ coefficients of the axes.
+        threshold: energy q above which the search accuses the candidate.
+    """
+
+    label: str
+    onsets: np.ndarray
+    axes: Array
+    back: Array
+    threshold: float
+
+    @property
+    def dimension(self) -> int:
+        """Number of magnitudes."""
+        return self.axes.shape[2]
+
+    def only(self, chosen: np.ndarray) -> "Atoms":
+        """Return the atoms at some of the onsets, given by a mask or by their places."""
+        return Atoms(self.label, self.onsets[chosen], self.axes[chosen], self.back[chosen], self.threshold)
+
+
+def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = None) -> tuple[Atoms, ...]:
+    """Return the atoms of every candidate that is tested somewhere.
+
+    Args:
+        found: the search of the window.
+        limits: its thresholds.
+        onsets: a mask (N,) of the onsets that are wanted; all by default.
+
+    Raises:
+        StructureError: thresholds of other candidates or missing for one that is tested; a window that is too long.
+    """
+    q = limits.of(found.labels)
+    wanted = np.ones(found.statistic.shape[1], dtype=bool) if onsets is None else onsets
+    places = [np.flatnonzero(~np.isnan(row) & wanted) for row in found.statistic]
+    columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))
+    if columns * found.whitened.r.size > MOST:
+        raise StructureError(
+            f"{columns} columns of {found.whitened.r.size} readings are too many for a programme over all onsets: use "
+            "a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
+    made = []
+    for candidate, where, threshold in zip(found.dictionary.candidates, places, q):
+        if not where.size:
+            continue
+        if not threshold > 0:
+            raise StructureError(
+                f"{candidate.label} has no threshold: calibrate with the input u of the window, too.")
+        bank = signatures(found, candidate.label, where)
+        flat = bank.reshape(where.size, found.whitened.r.size, -1)
+        products = np.einsum("tkp,tkq->tpq", flat, flat)
+        largest = np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float)
+        back = np.swapaxes(inverse_roots(products, largest), 1, 2)
+        made.append(Atoms(candidate.label, where, flat @ back, back, float(threshold)))
+    return tuple(made)
+
+
+def signatures(found: "Scan", label: str, onsets: np.ndarray) -> Array:
+    """Return the signatures (T, N, l, d) of a candidate at some onsets.
+
+    Args:
+        found: the search of the window.
+        label: of the candidate.
+        onsets: (T,).
+    """
+    candidate, white = found.dictionary[label], found.whitened
+    if not (candidate.additive and white.nuisance is None and white.present.all()):
+        return np.stack([found.signature(candidate, int(onset)) for onset in onsets])
+    count = len(white.r)  # a later onset shifts the trace
+    trace = response(white.predictor, candidate, count)
+    bank = np.zeros((onsets.size, *trace.shape))
+    for t, onset in enumerate(onsets):
+        bank[t, onset:] = trace[: count - onset]
+    return bank

@@ -1,0 +1,217 @@
+"""Thresholds from healthy records, for plants whose innovations are not white: the search is run along them.
+
+What a model does not know of its plant (a wrong order, slow disturbances, weak nonlinearities) makes the energies that
+the candidates explain of a healthy record larger than those of white noise. Their thresholds are the simulated ones of
+white noise times one factor, the smallest with which the record keeps the rate of false alarms. One number is learned
+from the record, whatever the number of candidates: a threshold of its own for each would be the largest energy of a
+few independent windows each, and with many candidates one of them is soon exceeded on the next record.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.search.calibration import EXCEEDING, Thresholds, simulated, thresholds
+from optid.faults.search.sweeps import sweep
+from optid.faults.signatures import Dictionary
+from optid.faults.whitening import Whitened
+from optid.models.experiments import samples_of
+
+LEAST = 1.0
+"""Windows without a sample in common that must exceed the threshold of a record, on average."""
+
+SURE = 5
+"""With fewer alarms than this the rate of false alarms of the next record may be twice that of this one."""
+
+COMMON = 0.25
+"""Largest share of windows from whose energies rarer ones are extrapolated."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlidingScan:
+    """The search along a record, window after window; `sliding_scan` makes it.
+
+    Attributes:
+        labels: the C candidates.
+        window: samples of a window.
+        samples: samples of the record.
+        stops: (M,) sample after the last of every window: when its answer is known.
+        statistic: (M, C) largest energy over the onsets; NaN for a candidate that is not tested.
+    """
+
+    labels: tuple[str, ...]
+    window: int
+    samples: int
+    stops: np.ndarray
+    statistic: Array
+
+    def excess(self, limits: Thresholds) -> Array:
+        """Return the largest energy over its threshold, (M,): a window alarms above one.
+
+        Raises:
+            StructureError: thresholds of other candidates or of another length.
+        """
+        if limits.window != self.window:
+            raise StructureError(f"These thresholds are of windows of {limits.window} samples, not {self.window}.")
+        return np.nanmax(self.statistic / limits.of(self.labels), axis=1)
+
+    def alarms(self, limits: Thresholds) -> np.ndarray:
+        """Return which windows alarm, (M,)."""
+        return self.excess(limits) > 1
+
+    def accused(self, limits: Thresholds) -> np.ndarray:
+        """Return the index of the candidate with the largest energy less its threshold, (M,): the likeliest fault."""
+        return np.nanargmax(self.statistic - limits.of(self.labels), axis=1)
+
+
+def sliding_scan(
+    found: Dictionary, whitened: Whitened, window: int, *, u: ArrayLike | None = None, hop: int = 1
+) -> SlidingScan:
+    """Search every window of a record.
+
+    Args:
+        found: the candidates.
+        whitened: the record; one experiment.
+        window: samples of a window.
+        u: (N, m) inputs in raw units, for losses and stuck actuators, which are not tested without them.
+        hop: samples from one window to the next.
+
+    Raises:
+        DataError: a record shorter than a window, inputs of another length.
+        StructureError: a window that is too short, a hop below one, the innovations of an uncertain model.
+    """
+    if whitened.nuisance is not None:
+        raise StructureError(
+            "The uncertainty of the model has been taken out of the record as a whole: whiten it without uncertainty."
+        )
+    if hop < 1:
+        raise StructureError(f"hop={hop}: a whole number from 1 is needed.")
+    count = len(whitened.r)
+    if count < window:
+        raise DataError(f"The record has {count} samples: a window of {window} does not fit.")
+    inputs = None if u is None else samples_of(u, "u", found.model.m)
+    if inputs is not None and len(inputs) != count:
+        raise DataError(f"u has {len(inputs)} samples; the record has {count}.")
+    starts = np.arange(0, count - window + 1, hop)
+    moving = inputs is not None and any(c.columns for c in found.candidates)
+    incomplete = np.concatenate([[0], np.cumsum(~whitened.present.all(axis=1))])
+    single = np.full(starts.size, True) if moving else incomplete[starts + window] > incomplete[starts]
+    statistic = np.empty((starts.size, len(found.candidates)))
+    if not single.all():
+        shared = sweep(found, window, steady=whitened.predictor)
+        views = np.lib.stride_tricks.sliding_window_view(whitened.r, window, axis=0).swapaxes(1, 2)
+        statistic[~single] = shared.largest(views[starts[~single]])
+    for i in np.flatnonzero(single):
+        part = slice(starts[i], starts[i] + window)
+        own = sweep(found, window, steady=whitened.predictor, present=whitened.present[part],
+                    u=inputs[part] if inputs is not None else None)
+        statistic[i] = own.largest(whitened.r[None, part])[0]
+    return SlidingScan(found.labels, window, count, starts + window, statistic)
+
+
+@dataclass(frozen=True, eq=False)
+class EmpiricalThresholds(Thresholds):
+    """Thresholds that a healthy record keeps; `empirical_thresholds` makes them.
+
+    Attributes:
+        factor: by which those of white innovations were multiplied.
+        share: share of the windows of the healthy record that exceed them.
+        excursions: how many alarms that makes, those within one window counted once.
+        windows: number of windows.
+        independent: number of windows without a sample in common.
+        extrapolated: whether the record is too short for so rare an alarm, and the factor that of a more frequent one.
+    """
+
+    factor: float = 1.0
+    share: float = 0.0
+    excursions: int = 0
+    windows: int = 0
+    independent: float = 0.0
+    extrapolated: bool = False
+
+    def __str__(self) -> str:
+        """Print the thresholds and what they rest on."""
+        tail = ", factor of more frequent alarms" if self.extrapolated else ""
+        return (
+            f"healthy record of {self.independent:.0f} windows: {self.factor:.3g} times those of white innovations"
+            f"{tail}\n{self.share:.2%} of its windows alarm, in {self.excursions} excursions\n" + super().__str__()
+        )
+
+
+def empirical_thresholds(
+    found: Dictionary, healthy: Whitened | Sequence[Whitened], window: int, false_alarm: float = 0.01, *,
+    u: Any = None, hop: int = 1, draws: int = 20_000, seed: int | None = 0,
+    extrapolate: bool = False,
+) -> EmpiricalThresholds:
+    """Calibrate the search on a healthy record, where its innovations are not white or not of the size predicted.
+
+    Args:
+        found: the candidates.
+        healthy: whitened innovations of a record without faults, better not the one the model was identified from;
+            one or several experiments.
+        window: samples of a window.
+        false_alarm: share of the healthy windows that exceed any threshold.
+        u: (N, m) its inputs, a sequence of them where `healthy` is one, for losses and stuck actuators.
+        hop: samples from one window to the next.
+        draws: simulated windows behind the thresholds of white innovations.
+        seed: of the simulation.
+        extrapolate: whether a short record may give the factor of a more frequent alarm; its own where that is larger.
+
+    Returns:
+        Thresholds for `diagnose`, `Scan.gains` and `SlidingScan`.
+
+    Raises:
+        DataError: a record too short for so rare an alarm.
+        StructureError: as `thresholds` and `sliding_scan`.
+
+    Warns:
+        DataWarning: few excursions of the record behind the factor.
+    """
+    parts = [healthy] if isinstance(healthy, Whitened) else list(healthy)
+    inputs = [u] * len(parts) if u is None or isinstance(healthy, Whitened) else list(u)
+    if len(inputs) != len(parts):
+        raise DataError(f"u is of {len(inputs)} experiments, the record of {len(parts)}.")
+    independent = sum(len(part.r) for part in parts) / window
+    level = false_alarm
+    if false_alarm * independent < LEAST:
+        if not extrapolate:
+            raise DataError(
+                f"{independent:.0f} windows of a healthy record cannot support a false alarm in "
+                f"{1 / false_alarm:.3g}: {int(np.ceil(LEAST / false_alarm * window))} samples are needed. Take a "
+                "longer record, a shorter window or a higher probability, or let the factor be that of a more frequent "
+                "alarm (extrapolate=True)."
+            )
+        level = min(SURE / independent, COMMON)
+    longest = None if u is None else max((np.asarray(one) for one in inputs), key=len)
+    draws = max(draws, int(np.ceil(EXCEEDING / false_alarm)))
+    white = thresholds(found, window, false_alarm, u=longest, draws=draws, seed=seed)
+    scans = [sliding_scan(found, part, window, u=one, hop=hop) for part, one in zip(parts, inputs)]
+    ratios = np.concatenate([one.excess(white) for one in scans])
+    factor = float(np.quantile(ratios, 1 - false_alarm, method="higher"))
+    if level != false_alarm:
+        usual = np.nanmax(simulated(found, window, u=longest, draws=draws, seed=seed) / white.q, axis=1)
+        factor = max(factor, float(np.quantile(ratios, 1 - level) / np.quantile(usual, 1 - level)))
+    above = [one.excess(white) > factor for one in scans]
+    excursions = sum(_apart(one.stops[alarms], window) for one, alarms in zip(scans, above))
+    if level == false_alarm and excursions < SURE:
+        warnings.warn(
+            f"The thresholds rest on {excursions} excursions of the healthy record: its rate of false alarms is kept, "
+            "that of the next record may be twice as large or more. Use a longer healthy record.",
+            DataWarning, stacklevel=2,
+        )
+    return EmpiricalThresholds(
+        white.labels, factor * white.q, false_alarm, window, white.draws, seed, factor=factor,
+        share=float(np.mean(np.concatenate(above))), excursions=excursions, windows=ratios.size,
+        independent=independent, extrapolated=level != false_alarm,
+    )
+
+
+def _apart(stops: np.ndarray, window: int) -> int:
+    """Count alarms; one that begins within a window of the alarm before is the same."""
+    return 0 if not stops.size else 1 + int(np.sum(np.diff(stops) > window))

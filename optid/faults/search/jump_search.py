@@ -1,0 +1,177 @@
+"""Several jumps of the whole state, exactly: a jump in any direction starts the state anew, so that segments decouple.
+
+After a jump of unknown size in all n states nothing before it matters: the best fit of a segment depends on its ends
+alone, and the best segmentation follows by dynamic programming, V_K(j) = min over i of V_(K-1)(i) + cost(i, j), in
+O(K N^2) (exact for K jumps, where sums of norms and mixed-integer programmes are relaxations or do not end).
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.search.sweeps import inverse_roots
+from optid.faults.signatures import Dictionary
+from optid.faults.whitening import Whitened
+
+if TYPE_CHECKING:
+    from optid.faults.search.calibration import Thresholds
+
+LONGEST = 3000
+"""Samples of a window at most: the costs of all segments are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateJumps:
+    """The best segmentation of a window.
+
+    Attributes:
+        onsets: samples of the jumps.
+        sizes: (K, n) jumps of the state.
+        energies: (most + 1,) energy that is left with the best 0, 1, ..., most jumps.
+        best: for each number of jumps, the onsets.
+        penalty: energy that a jump must explain.
+        count: samples of the window.
+    """
+
+    onsets: tuple[int, ...]
+    sizes: Array
+    energies: Array
+    best: tuple[tuple[int, ...], ...] = field(repr=False)
+    penalty: float
+    count: int
+
+    @property
+    def gain(self) -> float:
+        """Energy explained less the penalties."""
+        return float(self.energies[0] - self.energies[len(self.onsets)] - self.penalty * len(self.onsets))
+
+    @property
+    def margin(self) -> float:
+        """By how much the best other number of jumps is worse."""
+        values = self.energies + self.penalty * np.arange(self.energies.size)
+        others = np.delete(values, len(self.onsets))
+        return float(others.min() - values[len(self.onsets)]) if others.size else np.inf
+
+    def __str__(self) -> str:
+        """Print the jumps and what every number of them leaves."""
+        left = ", ".join(f"{k}: {energy:.1f}" for k, energy in enumerate(self.energies))
+        lines = [f"{len(self.onsets)} jumps of the state (energy left by number {left})"[:80],
+                 f"  each must explain {self.penalty:.1f}; margin {self.margin:.2f}; exhaustive"]
+        for onset, size in zip(self.onsets, self.sizes):
+            lines.append(f"  sample {onset:>6}: {np.array2string(size, precision=3, separator=' ')}"[:80])
+        return "\n".join(lines)
+
+
+def state_jumps(
+    found: Dictionary, whitened: Whitened, most: int = 3, *, penalty: "float | Thresholds | None" = None,
+) -> StateJumps:
+    """Find up to `most` jumps of the whole state in a window, exactly.
+
+    Args:
+        found: the dictionary.
+        whitened: the window; one experiment. Missing readings are left out.
+        most: jumps at most.
+        penalty: energy that a jump must explain: a number, or thresholds whose candidate "state" says it; by default
+            that of the Bayesian information criterion, n log(N l) + 2 log N.
+
+    Raises:
+        DataError: other outputs than the model's, innovations that are not finite.
+        StructureError: an uncertain model (its nuisance ties all segments together), several experiments, a window
+            that is too long, impossible numbers.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError("state_jumps takes the whitened innovations of one experiment: take them one by one.")
+    count, l = whitened.r.shape  # noqa: E741
+    if l != found.model.l:
+        raise DataError(f"The window has {l} outputs; the dictionary is of {found.model.l}.")
+    if whitened.nuisance is not None:
+        raise StructureError("An uncertain model ties all segments together: whiten without it for this search.")
+    if most != int(most) or most < 0:
+        raise StructureError(f"most={most!r}; a whole number from 0 is needed.")
+    if count > LONGEST:
+        raise StructureError(f"{count} samples are too many for all segments ({LONGEST}): use a shorter window.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
+    price = _price(found, whitened, penalty)
+    energies, best = _segmented(segment_costs(found, whitened), np.sum(whitened.r**2, axis=1), int(most))
+    chosen = best[int(np.argmin(energies + price * np.arange(energies.size)))]
+    return StateJumps(chosen, _sizes(found, whitened, chosen), energies, best, price, count)
+
+
+def segment_costs(found: Dictionary, whitened: Whitened) -> Array:
+    """Return the energy (N, N + 1) left of the samples i to j - 1 after a jump at i; inf for empty segments."""
+    count = len(whitened.r)
+    costs = np.full((count, count + 1), np.inf)
+    energy = np.concatenate([[0.0], np.cumsum(np.sum(whitened.r**2, axis=1))])
+    complete = bool(whitened.present.all())
+    trace = _response(found, whitened, 0)
+    roots = _roots(trace) if complete else None
+    for i in range(count):
+        own = trace[: count - i] if complete else _response(found, whitened, i)[i:]
+        along = np.cumsum(np.einsum("kop,ko->kp", own, whitened.r[i:]), axis=0)
+        whole = _roots(own) if roots is None else roots[: count - i]
+        explained = np.sum(np.einsum("kqp,kp->kq", whole, along) ** 2, axis=1)
+        costs[i, i + 1 :] = np.maximum(energy[i + 1 :] - energy[i] - explained, 0.0)
+    return costs
+
+
+def _response(found: Dictionary, whitened: Whitened, onset: int) -> Array:
+    """What unit jumps of the state leave, (N, l, n)."""
+    count, n = len(whitened.r), found.model.nx
+    into_state = np.zeros((count, n, n))
+    into_state[onset] = np.eye(n)
+    into_output = np.zeros((count, found.model.l, n))
+    return whitened.seen(whitened.predictor.respond(into_state, into_output, whitened.present))
+
+
+def _roots(trace: Array) -> Array:
+    products = np.cumsum(np.einsum("kop,koq->kpq", trace, trace), axis=0)
+    return inverse_roots(products, np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float))
+
+
+def _segmented(costs: Array, squares: Array, most: int) -> tuple[Array, tuple[tuple[int, ...], ...]]:
+    count = len(costs)
+    value = np.concatenate([[0.0], np.cumsum(squares)])  # up to j without a jump
+    before: list[np.ndarray] = []
+    energies = [float(value[-1])]
+    best: list[tuple[int, ...]] = [()]
+    for _ in range(most):
+        table = value[:count, None] + costs
+        before.append(table.argmin(axis=0))
+        value = table[before[-1], np.arange(count + 1)]
+        if not np.isfinite(value[-1]):
+            break
+        energies.append(float(value[-1]))
+        ends, at = [], count
+        for chosen in reversed(before):
+            at = int(chosen[at])
+            ends.append(at)
+        best.append(tuple(reversed(ends)))
+    return np.array(energies), tuple(best)
+
+
+def _sizes(found: Dictionary, whitened: Whitened, onsets: tuple[int, ...]) -> Array:
+    """The jumps by least squares, all together."""
+    if not onsets:
+        return np.zeros((0, found.model.nx))
+    flat = np.concatenate([_response(found, whitened, k).reshape(whitened.r.size, -1) for k in onsets], axis=1)
+    solved = np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0]
+    return np.asarray(solved, dtype=float).reshape(len(onsets), -1)
+
+
+def _price(found: Dictionary, whitened: Whitened, penalty: "float | Thresholds | None") -> float:
+    if penalty is None:
+        return float(found.model.nx * np.log(whitened.present.sum()) + 2 * np.log(len(whitened.r)))
+    if isinstance(penalty, int | float | np.floating | np.integer):
+        if not (np.isfinite(penalty) and penalty >= 0):
+            raise StructureError(f"penalty={penalty!r}; a number from 0 is needed.")
+        return float(penalty)
+    q = penalty.of(found.labels)
+    for label, value in zip(found.labels, q):
+        if label.startswith("state") and np.isfinite(value):
+            return float(value)
+    raise StructureError("These thresholds have none for a jump of the state: give the penalty as a number.")

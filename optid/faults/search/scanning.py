@@ -1,0 +1,188 @@
+"""The exact search for one fault (GLR): every candidate at every onset, the best magnitude by least squares."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.bases.basis import Array
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.faults.search.sweeps import Sweep, sweep
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened
+
+if TYPE_CHECKING:
+    from optid.faults.search.calibration import Thresholds
+
+
+class Magnitude(NamedTuple):
+    """The magnitudes of a fault by least squares.
+
+    Attributes:
+        nu: (d,) magnitudes; zero along directions that the window does not see.
+        covariance: (d, d) for this candidate and onset; the search of the onset is not counted.
+    """
+
+    nu: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The energy that every candidate explains of a window, at every onset; `scan` makes it.
+
+    Attributes:
+        dictionary: the candidates.
+        whitened: the window.
+        u: (N, m) inputs, None where they were not given.
+        statistic: (C, N) energy explained, NaN where a candidate is not tested: it has no signature (frozen sensor,
+            noise, a loss without u), nothing is seen of it, or too few readings follow the onset.
+        sweep: the prepared search.
+        correlations: (N, D) of the window with the columns of the signatures.
+    """
+
+    dictionary: Dictionary
+    whitened: Whitened
+    u: Array | None
+    statistic: Array
+    sweep: Sweep = field(repr=False)
+    correlations: Array = field(repr=False)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What the candidates are called."""
+        return self.dictionary.labels
+
+    @property
+    def energy(self) -> float:
+        """Energy of the window, what is expected of a healthy one being its number of readings."""
+        return float(np.sum(self.whitened.r**2))
+
+    def index(self, candidate: Candidate | str) -> int:
+        """Return the row of a candidate.
+
+        Raises:
+            LookupFailed: no such candidate.
+        """
+        c = self.dictionary[candidate] if isinstance(candidate, str) else candidate
+        for i, other in enumerate(self.dictionary.candidates):
+            if other is c:
+                return i
+        raise LookupFailed(f"{c.label!r} is not in the dictionary. {nearest(c.label, self.labels)}")
+
+    def peak(self, candidate: Candidate | str) -> int:
+        """Return the onset at which a candidate explains most.
+
+        Raises:
+            StructureError: a candidate that is tested nowhere.
+        """
+        row = self.statistic[self.index(candidate)]
+        if np.isnan(row).all():
+            raise StructureError(f"{self._label(candidate)} is tested at no onset of this window: it has no peak.")
+        return int(np.nanargmax(row))
+
+    def estimate(self, candidate: Candidate | str, onset: int) -> Magnitude:
+        """Return the magnitudes of a candidate at an onset.
+
+        Raises:
+            StructureError: an onset at which it is not tested.
+        """
+        c = self.index(candidate)
+        self._check(c, onset)
+        root = self.sweep.root(c, onset)
+        inverse = root.T @ root
+        return Magnitude(inverse @ self.correlations[onset, self.sweep.columns(c)], inverse)
+
+    def signature(self, candidate: Candidate | str, onset: int) -> Array:
+        """Return what one unit of each magnitude leaves in the window, (N, l, d).
+
+        Raises:
+            StructureError: a candidate without a signature.
+        """
+        c, count = self.index(candidate), len(self.whitened.r)
+        if not self.sweep.blocks.sizes[c]:
+            self.dictionary.additions(self.dictionary.candidates[c], count, 0, self.u)  # which says why there is none
+            raise StructureError(f"{self.labels[c]} has no signature in this window.")
+        if not 0 <= onset < count:
+            raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
+        return self.sweep.signature(c, onset)
+
+    def gains(self, thresholds: "Thresholds") -> Array:
+        """Return the statistics less their thresholds, (C, N): the fault at the largest is the exact optimum.
+
+        Raises:
+            StructureError: thresholds of another dictionary.
+        """
+        return self.statistic - thresholds.of(self.labels)[:, None]
+
+    def _label(self, candidate: Candidate | str) -> str:
+        return self.labels[self.index(candidate)]
+
+    def _check(self, c: int, onset: int) -> None:
+        if not 0 <= onset < self.statistic.shape[1] or np.isnan(self.statistic[c, onset]):
+            raise StructureError(f"{self.labels[c]} is not tested at onset {onset} of this window.")
+
+    def __str__(self) -> str:
+        """Print the peak of every candidate."""
+        lines = [f"window of {len(self.whitened.r)} samples, energy {self.energy:.1f}",
+                 f"  {'candidate':<40}{'energy':>9}{'onset':>7}  magnitude"]
+        for c, label in enumerate(self.labels):
+            if np.isnan(self.statistic[c]).all():
+                lines.append(f"  {_cut(label, 39):<40}{'not tested':>16}")
+                continue
+            onset = self.peak(self.dictionary.candidates[c])
+            sizes = " ".join(f"{v:.3g}" for v in self.estimate(self.dictionary.candidates[c], onset).nu)
+            lines.append(f"  {_cut(label, 39):<40}{self.statistic[c, onset]:>9.1f}{onset:>7}  {_cut(sizes, 20)}")
+        return "\n".join(lines)
+
+
+def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, onsets: Any = None) -> Scan:
+    """Search a window for one fault, exactly: all candidates, all onsets, the magnitudes by least squares.
+
+    The sweep backwards in time is that of Willsky and Jones (1976) written for all candidates at once (F1).
+
+    Args:
+        found: the candidates.
+        whitened: the window; one experiment.
+        u: (N, m) inputs of the window in raw units, for losses, stuck actuators and scheduled changes.
+        onsets: the onsets that are searched, whole numbers from 0; all by default.
+
+    Raises:
+        DataError: inputs of another length or with a missing sample, innovations that are not finite.
+        StructureError: several experiments at once, onsets outside the window, a window that is too short, no candidate
+            with a signature.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError(
+            "scan takes the whitened innovations of one experiment, as optid.faults.whiten returns them: scan the "
+            "experiments of a record one by one."
+        )
+    if whitened.r.shape[1] != found.model.l:
+        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
+    prepared = sweep(
+        found, len(whitened.r), steady=whitened.predictor, present=whitened.present, u=u, nuisance=whitened.nuisance,
+        states=whitened.states,
+    )
+    correlations = prepared.correlations(whitened.r)
+    statistic = prepared.statistic(correlations)
+    if onsets is not None:
+        others = np.ones(len(whitened.r), dtype=bool)
+        others[_onsets(onsets, len(whitened.r))] = False
+        statistic[:, others] = np.nan
+    inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
+    return Scan(found, whitened, inputs, statistic, prepared, correlations)
+
+
+def _onsets(onsets: Any, count: int) -> np.ndarray:
+    chosen = np.atleast_1d(np.arange(count)[onsets] if isinstance(onsets, slice) else np.asarray(onsets))
+    if not np.issubdtype(chosen.dtype, np.integer) or not chosen.size or chosen.min() < 0 or chosen.max() >= count:
+        raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
+    return chosen
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"

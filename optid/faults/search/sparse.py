@@ -1,0 +1,118 @@
+"""What the group-sparse programme says of a window: which faults may be there, which are certainly not.
+
+Its magnitudes are shrunk and neighbouring onsets stand in for one another: it chooses where to look, the exact search
+over what it chose (`optid.faults.search.subsets`) answers.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optid.bases.basis import Array
+
+REACH = 10
+"""Onsets on either side of an active one at which the exact search looks, for every candidate."""
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveGroup:
+    """One candidate at one onset that the programme makes use of.
+
+    Attributes:
+        label: of the candidate.
+        onset: first sample that it changes.
+        size: (d,) magnitudes, shrunk by the penalty: not an estimate.
+        deflection: sigma per sample times root of samples, shrunk too.
+    """
+
+    label: str
+    onset: int
+    size: Array
+    deflection: float
+
+
+@dataclass(frozen=True, eq=False)
+class SparseResult:
+    """The optimum of the group-sparse programme.
+
+    Attributes:
+        active: what is not zero, largest deflection first.
+        count: samples of the window.
+        objective: value reached.
+        bound: lower bound on it, recomputed from a feasible dual point.
+        gap: their relative distance.
+        certified: whether the gap is below 1e-6; without it nothing is to be concluded.
+        largest: smallest penalty at which nothing is active; above one exactly when the search raises an alarm.
+        penalty: the one used; one by default, at which "something is active" is the alarm.
+        provably_zero: {label: (N,) whether the candidate at that onset is zero in every optimum}; False where it is
+            not tested.
+        status: status of the solver in words.
+        solver: its name.
+        constrained: names of further constraints.
+    """
+
+    active: tuple[ActiveGroup, ...]
+    count: int
+    objective: float
+    bound: float
+    gap: float
+    certified: bool
+    largest: float
+    penalty: float
+    provably_zero: Mapping[str, np.ndarray] = field(repr=False)
+    status: str = ""
+    solver: str = ""
+    constrained: tuple[str, ...] = ()
+
+    @property
+    def alarm(self) -> bool:
+        """Whether zero is not the optimum: exactly where the search alarms, whatever the tolerance of the solver."""
+        return bool(self.active) if self.constrained else self.largest > self.penalty
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Candidates that are active somewhere."""
+        return tuple(dict.fromkeys(group.label for group in self.active))
+
+    @property
+    def onsets(self) -> np.ndarray:
+        """Active onsets, in order."""
+        return np.unique([group.onset for group in self.active]).astype(int)
+
+    @property
+    def magnitudes(self) -> dict[tuple[str, int], Array]:
+        """Magnitudes by candidate and onset, shrunk by the penalty."""
+        return {(group.label, group.onset): group.size for group in self.active}
+
+    @property
+    def clusters(self) -> tuple[tuple[int, int], ...]:
+        """First and last onset of every run of active onsets not more than twice `REACH` apart."""
+        onsets = self.onsets
+        if not onsets.size:
+            return ()
+        cuts = np.flatnonzero(np.diff(onsets) > 2 * REACH)
+        firsts, lasts = onsets[np.concatenate([[0], cuts + 1])], onsets[np.concatenate([cuts, [onsets.size - 1]])]
+        return tuple((int(a), int(b)) for a, b in zip(firsts, lasts))
+
+    def near(self, reach: int = REACH) -> np.ndarray:
+        """Return the mask (N,) of the onsets within reach of an active one."""
+        mask = np.zeros(self.count, dtype=bool)
+        for onset in self.onsets:
+            mask[max(onset - reach, 0) : onset + reach + 1] = True
+        return mask
+
+    def __str__(self) -> str:
+        """Print what is active, the gap and what is ruled out."""
+        zero = sum(int(mask.sum()) for mask in self.provably_zero.values())
+        tested = "certified" if self.certified else "not certified"
+        lines = [f"group-sparse programme, penalty {self.penalty:g}: "
+                 f"{len(self.active)} groups active in {len(self.clusters)} clusters",
+                 f"relative duality gap {self.gap:.1e} ({tested}); {zero} groups are zero for certain"]
+        for group in self.active[:12]:
+            lines.append(f"  {group.label[:50]:<52}{group.onset:>6}   deflection {group.deflection:.3g}")
+        if len(self.active) > 12:
+            lines.append(f"  and {len(self.active) - 12} more")
+        if not self.certified:
+            lines.append(f"  {self.status}"[:80])
+        return "\n".join([*lines, "Magnitudes are shrunk: the exact search over these onsets answers."])

@@ -1,0 +1,244 @@
+"""Compiled recursions of the search for one fault and for two, over all onsets.
+
+A column j of a fault adds h_j(k) to the innovation of sample k and e_j(k) to the state of the predictor error at k + 1,
+from its onset on. Columns are ordered by their course: those that last, drifts, jumps of one sample. Every drift has a
+helper among those that last: what a drift of earlier onset is from k on, is a drift of onset k on top of a constant.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def correlate(tables, r, found):
+    """Correlations of a window with all columns at all onsets, by one backward sweep.
+
+    Args:
+        tables: `optid.faults.search.sweeps.Tables`.
+        r: (N, l) window.
+        found: (N, D) written.
+    """
+    of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
+    lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
+    count, l = r.shape  # noqa: E741
+    n, columns = F.shape[1], h.shape[2]
+    costate, later, s = np.zeros(n), np.zeros(n), np.zeros(l)
+    for step in range(count):
+        k = count - 1 - step
+        t = of[k]
+        for o in range(l):
+            s[o] = 0.0
+            for a in range(o, l):  # W is lower triangular
+                s[o] += W[t, a, o] * r[k, a]
+        for j in range(columns):
+            found[k, j] = found[k + 1, j] if step > 0 and j < lasting + drifts else 0.0
+        for o in range(l):
+            for j in range(lasting):
+                found[k, j] += h[t, o, j] * s[o]
+            for j in range(lasting + drifts, columns):
+                found[k, j] += h[t, o, j] * s[o]
+        for i in range(n):
+            for j in range(lasting):
+                found[k, j] += e[t, i, j] * costate[i]
+            for j in range(lasting + drifts, columns):
+                found[k, j] += e[t, i, j] * costate[i]
+        for j in range(drifts):
+            found[k, lasting + j] += found[k, helpers + j]
+        for i in range(n):
+            later[i] = 0.0
+        for o in range(l):
+            for i in range(n):
+                later[i] += C[o, i] * s[o]
+        for j in range(n):
+            for i in range(n):
+                later[i] += F[t, j, i] * costate[j]
+        for i in range(n):
+            costate[i] = later[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def grams(tables, group, slots, products, states):
+    """Products of the signatures of columns with the same onset, for all onsets, by one backward sweep.
+
+    Args:
+        tables: `optid.faults.search.sweeps.Tables`.
+        group: (D,) candidate of a column; products between groups are computed only where states are wanted.
+        slots: (D, D) where in a row of products that of two columns is written; -1 for nowhere.
+        products: (N, R) written.
+        states: (N, n, D) product of a column with what a unit state at its onset leaves, written; (0, n, D) where it is
+            not wanted.
+    """
+    whole = states.shape[0] > 0
+    of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
+    lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
+    count, n, columns, l = of.size, F.shape[1], h.shape[2], C.shape[0]  # noqa: E741
+    M, moved = np.zeros((n, n)), np.zeros((n, n))
+    P, carried, pushed = np.zeros((n, columns)), np.zeros((n, columns)), np.zeros((n, columns))
+    H, kept = np.zeros((columns, columns)), np.zeros((columns, columns))
+    S, weighed, seen = np.zeros((l, l)), np.zeros((l, columns)), np.zeros((l, n))
+    for step in range(count):
+        k = count - 1 - step
+        t = of[k]
+        # what goes on after this sample: a lasting column as it is, a drift on top of its helper, a jump not at all
+        for j in range(columns):
+            for i in range(n):
+                carried[i, j] = P[i, j] if j < lasting + drifts else 0.0
+        for j in range(drifts):
+            for i in range(n):
+                carried[i, lasting + j] += P[i, helpers + j]
+        for i in range(columns):
+            for j in range(columns):
+                kept[i, j] = 0.0
+                if (whole or group[i] == group[j]) and i < lasting + drifts and j < lasting + drifts:
+                    kept[i, j] = H[i, j]
+                    if i >= lasting:
+                        kept[i, j] += H[helpers + i - lasting, j]
+                    if j >= lasting:
+                        kept[i, j] += H[i, helpers + j - lasting]
+                    if i >= lasting and j >= lasting:
+                        kept[i, j] += H[helpers + i - lasting, helpers + j - lasting]
+        for a in range(l):
+            for b in range(l):
+                S[a, b] = 0.0
+                for o in range(l):
+                    S[a, b] += W[t, o, a] * W[t, o, b]
+        for a in range(l):
+            for j in range(columns):
+                weighed[a, j] = 0.0
+                for b in range(l):
+                    weighed[a, j] += S[a, b] * h[t, b, j]
+            for i in range(n):
+                seen[a, i] = 0.0
+                for b in range(l):
+                    seen[a, i] += S[a, b] * C[b, i]
+        for i in range(n):
+            for j in range(columns):
+                pushed[i, j] = carried[i, j]
+            for a in range(n):
+                for j in range(columns):
+                    pushed[i, j] += M[i, a] * e[t, a, j]
+        for i in range(columns):
+            for j in range(columns):
+                if whole or group[i] == group[j]:
+                    total = kept[i, j]
+                    for o in range(l):
+                        total += h[t, o, i] * weighed[o, j]
+                    for a in range(n):
+                        total += e[t, a, i] * pushed[a, j] + carried[a, i] * e[t, a, j]
+                    H[i, j] = total
+                    if slots[i, j] >= 0:
+                        products[k, slots[i, j]] = total
+        for i in range(n):
+            for j in range(columns):
+                P[i, j] = 0.0
+                for o in range(l):
+                    P[i, j] += C[o, i] * weighed[o, j]
+            for a in range(n):
+                for j in range(columns):
+                    P[i, j] += F[t, a, i] * pushed[a, j]
+        if whole:
+            states[k] = P
+        for i in range(n):
+            for j in range(n):
+                moved[i, j] = 0.0
+                for a in range(n):
+                    moved[i, j] += M[i, a] * F[t, a, j]
+        for i in range(n):
+            for j in range(n):
+                M[i, j] = 0.0
+                for o in range(l):
+                    M[i, j] += C[o, i] * seen[o, j]
+                for a in range(n):
+                    M[i, j] += F[t, a, i] * moved[a, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def explained(correlations, first, sizes, roots, places, statistic):
+    """Energies that the candidates explain at all onsets.
+
+    Args:
+        correlations: (N, D).
+        first: (C,) first column of a candidate.
+        sizes: (C,) its number of columns; 0 where it is not tested.
+        roots: (N, R) inverse roots of the products, row by row and candidate after candidate.
+        places: (C,) where those of a candidate begin.
+        statistic: (C, N) written where a candidate is tested.
+    """
+    for c in range(first.size):
+        d, begin, place = sizes[c], first[c], places[c]
+        if d == 1:
+            for k in range(correlations.shape[0]):
+                z = roots[k, place] * correlations[k, begin]
+                statistic[c, k] = z * z
+        elif d > 1:
+            for k in range(correlations.shape[0]):
+                total = 0.0
+                for q in range(d):
+                    z = 0.0
+                    for p in range(d):
+                        z += roots[k, place + q * d + p] * correlations[k, begin + p]
+                    total += z * z
+                statistic[c, k] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def many(tables, windows, first, sizes, roots, places, tested, largest):
+    """Largest energy over the onsets for every window and candidate.
+
+    Args:
+        tables: `optid.faults.search.sweeps.Tables`.
+        windows: (M, N, l).
+        first: as `explained`.
+        sizes: as `explained`.
+        roots: as `explained`.
+        places: as `explained`.
+        tested: (C, N) which onsets count.
+        largest: (M, C) written; NaN for a candidate that is not tested.
+    """
+    count, columns = windows.shape[1], tables.h.shape[2]
+    correlations, statistic = np.empty((count, columns)), np.zeros((first.size, count))
+    for m in range(windows.shape[0]):
+        correlate(tables, windows[m], correlations)
+        explained(correlations, first, sizes, roots, places, statistic)
+        for c in range(first.size):
+            best = np.nan
+            for k in range(count):
+                if tested[c, k] and not statistic[c, k] <= best:
+                    best = statistic[c, k]
+            largest[m, c] = best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def course(tables, first, order, onset, signature):
+    """The whitened signature of neighbouring columns with an onset.
+
+    Args:
+        tables: `optid.faults.search.sweeps.Tables`.
+        first: first of the d columns.
+        order: 0 for columns that last, 1 for drifts, 2 for jumps.
+        onset: first sample.
+        signature: (N, l, d) written from the onset on.
+    """
+    count, l, d = signature.shape  # noqa: E741
+    n = tables.F.shape[1]
+    x, later, now = np.zeros((n, d)), np.zeros((n, d)), np.zeros(l)
+    for k in range(onset, count):
+        t = tables.of[k]
+        age = k - onset
+        share = 1.0 if order == 0 else age + 1.0 if order == 1 else 1.0 if age == 0 else 0.0
+        for j in range(d):
+            for o in range(l):
+                now[o] = share * tables.h[t, o, first + j]
+                for i in range(n):
+                    now[o] += tables.C[o, i] * x[i, j]
+            for o in range(l):
+                total = 0.0
+                for a in range(o + 1):
+                    total += tables.W[t, o, a] * now[a]
+                signature[k, o, j] = total
+            for i in range(n):
+                total = share * tables.e[t, i, first + j]
+                for a in range(n):
+                    total += tables.F[t, i, a] * x[a, j]
+                later[i, j] = total
+        x[:] = later

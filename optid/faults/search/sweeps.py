@@ -1,0 +1,355 @@
+"""All correlations of a window with the signatures of a dictionary, over all onsets, by one sweep backwards in time.
+
+A fault of any kind adds to the error of the steady predictor, in the step from k to k + 1 and to the innovation of k, a
+combination of known columns. So the correlation of a window with an impulse at k follows from the costate of the
+predictor, and that with a lasting fault, a drift, a loss or a stuck actuator from running sums of it: O(N n^2) for all
+onsets and all candidates together, missing readings included. The products of the signatures with themselves obey a
+backward recursion of the same kind.
+
+An uncertain model (`optid.faults.nuisance`) multiplies window and signatures by S = (I + M M')^(-1/2). S is symmetric,
+so that correlations are those of the plain signatures with S r, and products lose a term of low rank.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from optid.bases.basis import Array
+from optid.errors import DataError, StructureError
+from optid.faults.scheduled import change
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Predictor
+from optid.models.experiments import samples_of
+
+if TYPE_CHECKING:
+    from optid.faults.nuisance import Nuisance
+
+SHARE = 1e-9
+"""Directions of a signature with less than this share of the energy of the largest one explain nothing."""
+
+ORDERS = {"drift": 1, "jump": 2, "spike": 2}
+"""Where the columns of a kind stand: those that last, drifts, jumps."""
+
+
+class Tables(NamedTuple):
+    """What the kernels of `optid.faults.search.sweep_kernels` read.
+
+    Attributes:
+        of: (N,) which of the T tables governs a sample.
+        F: (T, n, n) transition of the error of the predictor.
+        C: (l, n).
+        W: (T, l, l) whitening, lower triangular; zero rows and columns where a reading is missing.
+        h: (T, l, D) what the columns add to the innovation.
+        e: (T, n, D) what they add to the state of the next sample.
+        lasting: number of columns that last, which come first.
+        drifts: number of drifts, which follow; the others are jumps.
+        helpers: index of the helper of the first drift.
+    """
+
+    of: np.ndarray
+    F: Array
+    C: Array
+    W: Array
+    h: Array
+    e: Array
+    lasting: int
+    drifts: int
+    helpers: int
+
+
+class Blocks(NamedTuple):
+    """Where the columns and the inverse roots of every candidate are.
+
+    Attributes:
+        first: (C,) first column.
+        sizes: (C,) number of columns; 0 for a candidate without a signature.
+        places: (C,) where its inverse roots begin in a row of `Sweep.roots`.
+        group: (D,) candidate of every column, helpers included.
+    """
+
+    first: np.ndarray
+    sizes: np.ndarray
+    places: np.ndarray
+    group: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The search for one fault, ready for windows of one length, pattern of missing readings and input.
+
+    Attributes:
+        found: the dictionary.
+        predictor: whose innovations the windows are.
+        window: samples N.
+        present: (N, l) whether a reading is there; None where all are.
+        nuisance: what uncertain parameters leave in the windows.
+        tables: of the recursions.
+        blocks: of the columns.
+        roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
+            that nothing is seen of.
+        tested: (C, N) whether the candidate is looked for at the onset.
+    """
+
+    found: Dictionary
+    predictor: Predictor
+    window: int
+    present: Array | None
+    nuisance: "Nuisance | None"
+    tables: Tables
+    blocks: Blocks
+    roots: Array
+    tested: np.ndarray
+
+    def root(self, c: int, onset: int) -> Array:
+        """Return R (d, d) of a candidate: R' R is the inverse of the products of its columns."""
+        d, place = int(self.blocks.sizes[c]), int(self.blocks.places[c])
+        return self.roots[onset, place : place + d * d].reshape(d, d)
+
+    def columns(self, c: int) -> slice:
+        """Return the columns of a candidate among the correlations."""
+        return slice(int(self.blocks.first[c]), int(self.blocks.first[c] + self.blocks.sizes[c]))
+
+    def signature(self, c: int, onset: int) -> Array:
+        """Return the whitened signature (N, l, d) of a candidate that has one."""
+        from optid.faults.search.sweep_kernels import course
+
+        result = np.zeros((self.window, self.found.model.l, int(self.blocks.sizes[c])))
+        order = ORDERS.get(self.found.candidates[c].kind, 0)
+        course(self.tables, int(self.blocks.first[c]), order, int(onset), result)
+        return result if self.nuisance is None else self.nuisance(result)
+
+    def correlations(self, r: Array) -> Array:
+        """Return the correlations (N, D) of a window (N, l) with the signatures."""
+        from optid.faults.search.sweep_kernels import correlate
+
+        seen = r if self.nuisance is None else self.nuisance(r)
+        result = np.empty((self.window, self.blocks.group.size))
+        correlate(self.tables, np.ascontiguousarray(seen, dtype=float), result)
+        return result
+
+    def statistic(self, correlations: Array) -> Array:
+        """Return the energies (C, N) explained, NaN where a candidate is not tested."""
+        from optid.faults.search.sweep_kernels import explained
+
+        result = np.full(self.tested.shape, np.nan)
+        blocks = self.blocks
+        explained(correlations, blocks.first, blocks.sizes, self.roots, blocks.places, result)
+        result[~self.tested] = np.nan
+        return result
+
+    def largest(self, windows: Array) -> Array:
+        """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN for what is not tested."""
+        from optid.faults.search.sweep_kernels import many
+
+        shown = windows if self.present is None else np.where(self.present, windows, 0.0)
+        if self.nuisance is not None:
+            shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
+        result, blocks = np.empty((len(windows), len(self.tested))), self.blocks
+        many(self.tables, np.ascontiguousarray(shown, dtype=float), blocks.first, blocks.sizes, self.roots,
+             blocks.places, self.tested, result)
+        return result
+
+
+    def along(self) -> Array:
+        """Return V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one."""
+        columns = self.blocks.group.size
+        if self.nuisance is None:
+            return np.zeros((self.window, 0, columns))
+        return _along(self.tables, self.nuisance, columns)
+
+
+_KEPT: "WeakKeyDictionary[Dictionary, dict[Any, Sweep]]" = WeakKeyDictionary()
+_MOST = 4
+
+
+def sweep(
+    found: Dictionary, window: int, *, steady: Predictor | None = None, present: Array | None = None, u: Any = None,
+    nuisance: "Nuisance | None" = None, states: Array | None = None,
+) -> Sweep:
+    """Prepare the search for one fault.
+
+    What depends on the model alone is kept with the dictionary for the next window of the same length.
+
+    Args:
+        found: the dictionary.
+        window: samples N.
+        steady: the predictor behind the windows; that of the dictionary by default.
+        present: (N, l) whether a reading is there.
+        u: (N, m) inputs, for losses and stuck actuators, which are not tested without it.
+        nuisance: of an uncertain model.
+        states: (N, n) of the predictor, for scheduled changes, which are not tested without them and the inputs.
+
+    Raises:
+        DataError: inputs of another length, or missing.
+        StructureError: a window that is too short, or no candidate with a signature.
+    """
+    steady = found.predictor if steady is None else steady
+    if present is not None and bool(np.all(present)):
+        present = None
+    least = 2 * found.model.nx + 2
+    if window < least:
+        raise StructureError(f"window={window}: at least {least} samples are needed for {found.model.nx} states.")
+    inputs = None if u is None else _inputs(found, u, window)
+    able = tuple(
+        c.additive or (bool(c.columns) and inputs is not None)
+        or (c.schedule is not None and inputs is not None and states is not None) for c in found.candidates
+    )
+    if states is not None and len(states) != window and any(c.schedule for c in found.candidates):
+        raise DataError(f"The states have {len(states)} samples; the window has {window}: cut them like the rest.")
+    if not any(able):
+        raise StructureError(
+            "No candidate has a signature to look for: add the kind 'bias', 'drift' or a state jump, or pass the input "
+            "u for losses and stuck actuators."
+        )
+    plain = present is None and nuisance is None and all(c.additive for c, a in zip(found.candidates, able) if a)
+    if not plain:
+        return _prepared(found, window, steady, present, inputs, nuisance, states, able)
+    key = (window, able, *(part.tobytes() for part in (steady.A, steady.C, steady.K, steady.L, steady.root)))
+    kept = _KEPT.setdefault(found, {})
+    if key not in kept:
+        if len(kept) >= _MOST:
+            kept.pop(next(iter(kept)))
+        kept[key] = _prepared(found, window, steady, None, None, None, None, able)
+    return kept[key]
+
+
+def _inputs(found: Dictionary, u: Any, window: int) -> Array:
+    inputs = samples_of(u, "u", found.model.m)
+    if len(inputs) != window:
+        raise DataError(f"u has {len(inputs)} samples; the window has {window}.")
+    bad = ~np.isfinite(inputs)
+    if bad.any():
+        k, c = np.argwhere(bad)[0]
+        raise DataError(
+            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss needs every input."
+        )
+    return inputs
+
+
+def _prepared(
+    found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
+    nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...],
+) -> Sweep:
+    from optid.faults.search.sweep_kernels import grams
+
+    blocks, tables = _tables(found, window, steady, present, u, able)
+    if any(a and c.schedule for a, c in zip(able, found.candidates)):
+        tables = _with_schedules(found, steady, blocks, tables, states, u)
+    columns, size = blocks.group.size, int(np.sum(blocks.sizes**2))
+    slots = np.full((columns, columns), -1, dtype=np.int64)
+    for d, place, begin in zip(blocks.sizes, blocks.places, blocks.first):
+        slots[begin : begin + d, begin : begin + d] = place + np.arange(d * d).reshape(d, d)
+    products = np.zeros((window, size))
+    grams(tables, blocks.group, slots, products, np.empty((0, tables.F.shape[1], columns)))
+    along = None if nuisance is None else _along(tables, nuisance, columns)
+    roots, tested = np.zeros((window, size)), np.zeros((len(able), window), dtype=bool)
+    for c, (d, place, begin) in enumerate(zip(blocks.sizes, blocks.places, blocks.first)):
+        if d:
+            own = products[:, place : place + d * d].reshape(window, d, d)
+            largest = own[:, 0, 0] if d == 1 else np.asarray(np.linalg.eigvalsh(own)[:, -1], dtype=float)
+            if along is not None:
+                part = along[:, :, begin : begin + d]
+                own = own - np.einsum("kqi,kqj->kij", part, part, optimize=True)
+            root = inverse_roots(own, largest)
+            roots[:, place : place + d * d] = root.reshape(window, -1)
+            tested[c] = np.any(root, axis=(1, 2))
+            tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
+    return Sweep(found, steady, window, present, nuisance, tables, blocks, roots, tested)
+
+
+def _along(tables: Tables, nuisance: "Nuisance", columns: int) -> Array:
+    from optid.faults.search.sweep_kernels import correlate
+
+    window = tables.of.size
+    result, one = np.empty((window, nuisance.s.size, columns)), np.empty((window, columns))
+    for i, (axis, s) in enumerate(zip(nuisance.U.T, nuisance.s)):
+        correlate(tables, np.ascontiguousarray(axis.reshape(window, -1)), one)
+        result[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
+    return result
+
+
+def inverse_roots(products: Array, largest: Array) -> Array:
+    """Return R (T, d, d) with R' R the inverse of the products, zero in directions below `SHARE` of the largest."""
+    floor = SHARE * np.maximum(largest, 1e-300)
+    if products.shape[1] == 1:
+        there = products > floor[:, None, None]
+        return np.where(there, 1 / np.sqrt(np.where(there, products, 1.0)), 0.0)
+    values, axes = np.linalg.eigh(products)
+    there = values > floor[:, None]
+    inverse = np.where(there, 1 / np.sqrt(np.where(there, values, 1.0)), 0.0)
+    return np.asarray(inverse[:, :, None] * np.swapaxes(axes, 1, 2))
+
+
+def _tables(
+    found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None, able: tuple[bool, ...]
+) -> tuple[Blocks, Tables]:
+    l = found.model.l  # noqa: E741
+    if present is None:
+        patterns, of = np.ones((1, l), dtype=bool), np.zeros(window, dtype=np.int64)
+    else:
+        patterns, which = np.unique(present, axis=0, return_inverse=True)
+        of = np.asarray(which, dtype=np.int64).ravel()
+    gains = np.where(patterns[:, None, :], -steady.K, steady.L)
+    whitening = np.stack([_whitening(steady, pattern) for pattern in patterns])
+    order = sorted((i for i, a in enumerate(able) if a), key=lambda i: ORDERS.get(found.candidates[i].kind, 0))
+    chosen = [found.candidates[i] for i in order]
+    drifts = [i for i in order if found.candidates[i].kind == "drift"]
+    # the helpers of the drifts are the last of the columns that last
+    lasting = [i for i in order if found.candidates[i].kind not in ORDERS] + drifts
+    line = lasting + drifts + [i for i in order if ORDERS.get(found.candidates[i].kind) == 2]
+    into = [_into(found, found.candidates[i], window, u) for i in line]
+    driven = any(not found.candidates[i].additive for i in line)
+    if driven:
+        into = [tuple(np.broadcast_to(part, (window, *part.shape[1:])) for part in pair) for pair in into]
+        gains, whitening, of = gains[of], whitening[of], np.arange(window)
+    x, z = (np.concatenate([pair[i] for pair in into], axis=2) for i in (0, 1))
+    h = steady.C @ x + z
+    e = steady.A @ x + gains @ h
+    h = np.broadcast_to(h, (len(gains), *h.shape[1:]))
+    sizes = [pair[0].shape[2] for pair in into]
+    group = np.repeat(line, sizes)
+    first, dimensions = np.zeros(len(able), dtype=np.int64), np.zeros(len(able), dtype=np.int64)
+    for i, begin, d in zip(line, np.cumsum([0, *sizes]), sizes):  # of a drift, its own columns after its helpers
+        first[i], dimensions[i] = begin, d
+    places = np.concatenate([[0], np.cumsum(dimensions**2)[:-1]])
+    kinds = np.array([ORDERS.get(c.kind, 0) for c in chosen for _ in range(c.dimension)])
+    count = [int(np.sum(kinds == i)) for i in range(3)]
+    tables = Tables(
+        of, np.ascontiguousarray(steady.A + gains @ steady.C), np.ascontiguousarray(steady.C, dtype=float), whitening,
+        np.ascontiguousarray(h), np.ascontiguousarray(e), count[0] + count[1], count[1], count[0],
+    )
+    return Blocks(first, dimensions, places, group), tables
+
+
+def _with_schedules(
+    found: Dictionary, steady: Predictor, blocks: Blocks, tables: Tables, states: Array | None, u: Array | None
+) -> Tables:
+    """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
+    assert states is not None and u is not None
+    n = steady.A.shape[0]
+    chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and blocks.sizes[i]]
+    wide = n * (1 + len(chosen))
+    count, _, columns = tables.e.shape
+    F, h, e = np.zeros((count, wide, wide)), np.array(tables.h), np.zeros((count, wide, columns))
+    F[:, :n, :n], e[:, :n] = tables.F, tables.e
+    for place, (i, candidate) in enumerate(chosen, 1):
+        own, column = slice(n * place, n * (place + 1)), blocks.first[i]
+        added, A = change(found.model, candidate, states, u)
+        F[:, own, own] = tables.F + A - steady.A
+        h[:, :, column] = added[:, :, 0] @ steady.C.T
+        e[:, own, column] = np.einsum("kij,kj->ki", F[:, own, own], added[:, :, 0])
+    return tables._replace(F=F, C=np.tile(tables.C, 1 + len(chosen)), h=h, e=e)
+
+
+def _whitening(steady: Predictor, pattern: np.ndarray) -> Array:
+    """The whitening (l, l) of a sample of which only some readings are there."""
+    return np.ascontiguousarray(steady.whitened(np.eye(pattern.size)[None], pattern[None])[0])
+
+
+def _into(found: Dictionary, candidate: Candidate, window: int, u: Array | None) -> tuple[Array, Array]:
+    """What a candidate adds to the state (1 or N, n, d) and the output (1 or N, l, d) at a sample after its onset."""
+    if candidate.additive or candidate.schedule is not None:  # what the latter adds comes with its matrices
+        return candidate.into_state[None], candidate.into_output[None]
+    return found.additions(candidate, window, 0, u)
