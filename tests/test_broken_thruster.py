@@ -1,8 +1,10 @@
 """What a new user does: identify a built-in rig, then diagnose the broken one."""
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import optid
 from optid.cli.app import app
 from optid.examples import example
 from optid.faults import load_diagnosis
@@ -31,6 +33,19 @@ def test_the_broken_propeller_is_named_with_the_share_that_is_lost(model, tmp_pa
     assert low < truth["lost"] < high
     assert found.onset_interval[0] <= truth["onset"] <= found.onset_interval[1]
     assert "--identified" not in result.output
+
+
+def test_the_broken_rig_is_refitted(model, tmp_path):
+    answer, page = tmp_path / "d.json", tmp_path / "r.html"
+    run("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out", answer)
+    result = run("reformulate", model, answer, "--example", "broken_thruster", "--model", tmp_path / "damaged.json",
+                 "--report", page)
+    assert result.exit_code == 0, result.output
+    damaged, healthy = optid.load(tmp_path / "damaged.json"), optid.load(model)
+    ratio = np.ptp(damaged.f([-1.2, 1.2])) / np.ptp(healthy.f([-1.2, 1.2]))
+    assert abs(ratio - (1 - example("broken_thruster").truth["lost"])) < 0.1
+    assert "predicted RMSE" not in page.read_text()  # no sensor is lost
+    assert run("reformulate", model, answer).exit_code == 2
 
 
 def test_a_model_that_counts_as_exact_is_said_to(model):

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RESULT, SOLVER, Picture, Report, reads_a_record
+from optid.cli.options import MODEL, RESULT, SOLVER, Example, Picture, Report, reads_a_record
 from optid.cli.results import command_line, conclude, save_picture
 from optid.cli.terminal import Waiting, hearing
 
@@ -15,9 +15,13 @@ def reformulate(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (.json) of the healthy plant.")],
     diagnosis: Annotated[Path, typer.Argument(metavar="DIAGNOSIS", help="Written by optid diagnose --out.")],
     data: Annotated[
-        list[Path], typer.Argument(metavar="DATA", help="The record of the diagnosis: CSV, Parquet, MAT, NPZ or npy.")
-    ],
+        list[Path] | None,
+        typer.Argument(
+            metavar="DATA", help="The record of the diagnosis: CSV, Parquet, MAT, NPZ or npy.", show_default=False
+        ),
+    ] = None,
     *,
+    example: Example = None,
     how: dict[str, Any],
     constraint: Annotated[
         list[str] | None,
@@ -51,7 +55,9 @@ def reformulate(
     solver: Annotated[
         str, typer.Option("--solver", "-s", metavar="NAME", rich_help_panel=SOLVER, help="See optid solvers.")
     ] = "auto",
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=SOLVER, help="Seed of draws and probes.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", rich_help_panel=SOLVER, help="Seed of draws and probes, and of an example.")
+    ] = 0,
     out: Annotated[
         Path | None,
         typer.Option("--model", "-m", metavar="FILE", rich_help_panel=RESULT, help="Write the damaged model (JSON)."),
@@ -72,7 +78,7 @@ def reformulate(
         waiting.step("reading")
         plant = words.state_space_model(model)
         found = load_diagnosis(diagnosis)
-        record: Any = words.read_record(data, words.as_modelled(how, plant))
+        record: Any = words.record(data, words.as_modelled(how, plant), example, seed)[0]
         given = words.listed(constraint)
         waiting.step("refitting")
         built = rebuild(
@@ -89,7 +95,7 @@ def reformulate(
             from optid.faults.repair.page import write
 
             waiting.step("report")
-            write(built, report, record=record.name or data[0].name, command=command_line())
+            write(built, report, record=record.name or (data[0].name if data else ""), command=command_line())
         if picture is not None:
             waiting.step("drawing")
             save_picture(built.plot(), picture)

@@ -57,8 +57,8 @@ def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
         "sections": [("verdict", "Result"), ("tables", "Values"), ("figures", "Figure"), ("members", "Explanations"),
                      ("reproduce", "Reproduce")],
     }
-    if not found.members:
-        content["sections"] = [pair for pair in content["sections"] if pair[0] != "members"]
+    empty = {name for name in ("members", "tables") if not content[name]}
+    content["sections"] = [pair for pair in content["sections"] if pair[0] not in empty]
     return template("reformulation.html.j2").render(content)
 
 
@@ -105,6 +105,8 @@ def _tables(found: Reformulation) -> list[Table]:
         )
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
     noise = found.healthy.noise
+    if not found.observer.lost:  # nothing has changed of what the sensors say
+        return tables
     assert noise is not None
     rows = [
         (name, "not used" if name in found.observer.lost else "used", number(value, 3),

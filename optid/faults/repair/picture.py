@@ -18,14 +18,15 @@ COLOURS = (ORANGE, GREEN, BLUE)
 
 @styled
 def draw(found: "Reformulation") -> Figure:
-    """Draw the nonlinearities before and now, the outputs that can be held, and the errors of the outputs.
+    """Draw the nonlinearities before and now, the outputs that can be held, and what replaces a lost sensor.
 
     Args:
         found: the reformulation.
     """
     inputs = found.healthy.m
     flat = found.healthy.l == 2
-    panels = inputs + 1 + int(flat)
+    lost = bool(found.observer.lost)  # with all sensors left nothing has changed of what they say
+    panels = inputs + int(flat) + int(lost)
     columns = 2 if panels == 4 else min(panels, 3)
     rows = -(-panels // columns)
     figure = Figure(figsize=(3.6 * columns + 0.6, 3.1 * rows + 0.5), layout="constrained")
@@ -35,7 +36,8 @@ def draw(found: "Reformulation") -> Figure:
         _input(axes[c], found, shown, c)
     if flat:
         _attainable(axes[inputs], found, shown)
-    _sensors(axes[panels - 1], found, shown)
+    if lost:
+        _sensors(axes[panels - 1], found, shown)
     for ax in axes[panels:]:
         ax.set_visible(False)
     label = " or ".join(member.label for member in found.members) or "healthy"
