@@ -218,6 +218,16 @@ def test_robust_estimates_see_through_outliers(found, limits):
     assert same.best.label == "sensor:y2" and same.size[0] == pytest.approx(clean.size[0], abs=0.1)
 
 
+def test_robust_takes_out_neighbours_and_spikes_that_are_candidates():
+    u, y = record()
+    wild = y.copy()
+    wild[[30, 70, 71, 110], 0] += [30.0, -40.0, 20.0, 30.0]
+    with_spikes = dictionary(small(), kinds=["bias", "spike"])
+    answer = diagnose(small(), (u, wild), with_spikes, robust=True)
+    assert answer.verdict == "healthy"
+    assert "y1 at sample 30, y1 at sample 70, y1 at sample 71, y1 at sample 110" in answer.status
+
+
 def test_a_second_fault_is_not_bounded_as_if_it_were_outliers(found, limits):
     data = record(Fault.step("sensor:y2", 40, 1.5), Fault.step("actuator:u1", 80, 2.0))
     plain, robust = (diagnose(small(), data, found, thresholds=limits, max_faults=2, robust=r) for r in (False, True))

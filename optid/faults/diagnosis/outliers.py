@@ -66,10 +66,9 @@ def cleaned(found: Dictionary, part: Experiment, whitened_of: Callable[[Experime
     whitened = whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():
         search = scan(wide, whitened, part.u)
-        reading = _wildest(search, len(found.candidates))
+        reading = _wildest(search)
         if reading is None:  # behind a fault, perhaps
-            rest = scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u)
-            reading = _wildest(rest, len(found.candidates))
+            reading = _wildest(scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u))
         if reading is None:
             break
         taken.append(reading)
@@ -78,13 +77,14 @@ def cleaned(found: Dictionary, part: Experiment, whitened_of: Callable[[Experime
     return Cleaned(_bounded(found, whitened, part.u), part, tuple(sorted(taken)))
 
 
-def _wildest(search: Scan, count: int) -> tuple[int, int] | None:
-    """The reading that a spike explains better than any of the first `count` candidates explains anything."""
+def _wildest(search: Scan) -> tuple[int, int] | None:
+    """The reading that a spike explains better than any candidate of another kind explains anything."""
     statistic = np.nan_to_num(search.statistic, nan=-np.inf)
     c = _likeliest(search.dictionary, statistic)
-    if c < count or statistic[c].max() < WILD**2:
+    candidate = search.dictionary.candidates[c]
+    if candidate.kind != "spike" or statistic[c].max() < WILD**2:
         return None
-    o = int(np.flatnonzero(search.dictionary.candidates[c].into_output[:, 0])[0])
+    o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
     return int(np.argmax(statistic[c])), o
 
 
