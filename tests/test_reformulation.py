@@ -27,6 +27,7 @@ from optid.faults import (
     inject,
     inverse,
     observer,
+    predictor,
     probe_input,
     reformulate,
     subspace_projection,
@@ -100,6 +101,25 @@ def without(model, column):
 
 
 # -- refit ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_state_before_the_fault_is_that_of_the_predictor(healthy):
+    feedback = Nonlinearity(Triangular(2, (-9, 9), "extrapolate"), np.array([0.9, 2.7]))
+    L = np.array([[0.1, 0.0], [0.0, -0.1], [0.05, 0.1]])
+    model = replace(healthy, L=L, E=np.array([[0.05], [0.0], [-0.1]]), feedback=(feedback,), output_of=(1,))
+    data = broken_record(model, Fault.loss("actuator:u1", 300, 0.5), count=360)
+    y = data.y.copy()
+    y[150, 0] = np.nan  # corrects nothing, and is interpolated where it is fed back
+    window = refitting(model, Data(data.u, y), 300, damaged=[0]).windows[0]
+    steady, f, x = predictor(model), model.expanded(data.u), np.zeros(3)
+    filled = y.copy()
+    filled[150, 0] = (y[149, 0] + y[151, 0]) / 2
+    for k in range(300):
+        e = np.nan_to_num(y[k] - model.C @ x - model.D @ f[k] - model.offset_y)
+        state, x = x, (model.A @ x + model.B @ f[k] + model.offset_x + L @ filled[k]
+                       + model.E[:, 0] * float(feedback(filled[k, 1])) + steady.K @ e)
+    assert window.held and np.allclose(window.x0, state, atol=1e-8) and np.allclose(window.e0, e, atol=1e-8)
+
 
 
 @pytest.mark.parametrize("whole", [False, True])

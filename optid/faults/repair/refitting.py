@@ -5,19 +5,19 @@ Its innovations are linear in the values of a damaged nonlinearity, since the co
 the other parameters they are linearised.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from optid.bases import Linear, Triangular
+from optid.bases import Linear
 from optid.bases.basis import Array
 from optid.data import Data
-from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.errors import DataError, RankError, StructureError
+from optid.faults.repair.curves import Curve, curve_of
+from optid.faults.repair.windows import Window, cut, fed, observed
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor, predictor
 from optid.models.experiments import in_units_of
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 NODES = 7
 """Values of a damaged nonlinearity that are estimated, where it has no nodes of its own."""
-
-LONGEST = 20_000
-"""Samples after the fault that are used at most."""
 
 MATRICES = ("A", "B", "C", "D")
 
@@ -62,65 +59,6 @@ class Prior:
         for word in ("damaged", "curvature", "healthy"):
             if not getattr(self, word) > 0:
                 raise StructureError(f"prior: {word} = {getattr(self, word)!r}; a positive number is needed.")
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A nonlinearity of an input that is damaged.
-
-    Attributes:
-        name: "actuator:u1", with the number of the function where the input has several.
-        column: its index among the nonlinearities of the model.
-        basis: the basis of its new values.
-        nodes: (P + 1,) inputs at which its values are estimated.
-        to_nodes: (P + 1, P + 1) of [mu; constant] to those values.
-        healthy: (P + 1,) values before the fault.
-        visited: (P + 1,) how many samples after the fault lie at each node, shared between neighbours.
-        seen: smallest and largest input after the fault.
-        dead: whether it is held flat: the actuator no longer moves.
-    """
-
-    name: str
-    column: int
-    basis: Triangular
-    nodes: Array
-    to_nodes: Array
-    healthy: Array
-    visited: Array
-    seen: tuple[float, float]
-    dead: bool = False
-
-    @property
-    def half_range(self) -> float:
-        """Half of the range of the healthy nonlinearity."""
-        return max(float(np.ptp(self.healthy)) / 2, 1e-300)
-
-    @property
-    def prior_only(self) -> NDArray[np.bool_]:
-        """(P + 1,) whether the record says nothing of a value: less than half a sample lies there."""
-        return self.visited < 0.5
-
-
-class Window(NamedTuple):
-    """A record from the sample before the fault on.
-
-    Attributes:
-        u: (N, m) inputs.
-        y: (N, l) readings.
-        present: (N, l) whether a reading is there.
-        x0: (n,) predicted state at the first sample.
-        e0: (l,) innovation there; zero where not held.
-        held: whether the first sample is before the fault: its innovation belongs to the healthy plant.
-        free_start: whether nothing is known of x0.
-    """
-
-    u: Array
-    y: Array
-    present: Array
-    x0: Array
-    e0: Array
-    held: bool
-    free_start: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,14 +259,14 @@ class Refitting:
     def _window(self, model: "HammersteinSS", values: dict[str, Array], number: int) -> tuple[Array, Array]:
         w = self.windows[number]
         f = model.expanded(w.u)
-        drive = f @ model.B.T + model.offset_x + _fed(model, w.y)
+        drive = f @ model.B.T + model.offset_x + fed(model, w.y)
         direct = f @ model.D.T + model.offset_y
         for c in self.offsets:
             course = _course(c.kind, len(w.u), w.held)
             drive[:-1] += np.outer(course[1:], c.into_state @ values[f"size[{c.label}]"])
             direct += np.outer(course, c.into_output @ values[f"size[{c.label}]"])
         x = values["x0"][number] if "x0" in values else w.x0
-        states, innovations = _observed(
+        states, innovations = observed(
             model, self.steady.K, (drive, direct), w.y, x, w.e0 if w.held else None
         )
         steady = replace(self.steady, A=model.A, C=model.C, L=np.zeros_like(model.L))
@@ -415,9 +353,9 @@ def refitting(
         first = onset if number == 0 else 0
         if first >= len(part.y):
             raise DataError(f"The onset {first} lies beyond the record of {len(part.y)} samples.")
-        windows.append(_cut(model, steady, part.u, part.y, first, known_start))
+        windows.append(cut(model, steady, part.u, part.y, first, known_start))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
-    curves = tuple(replace(_curve(model, i, inputs, raw, nodes), dead=i in dead) for i in damaged)
+    curves = tuple(replace(curve_of(model, i, inputs, raw, nodes), dead=i in dead) for i in damaged)
     found = Refitting(model, steady, tuple(windows), curves, tuple(offsets), whole, prior)
     needed = sum(1 if curve.dead else curve.nodes.size for curve in curves)
     needed += sum(c.into_state.shape[1] for c in offsets)
@@ -428,105 +366,6 @@ def refitting(
             f"with every output are needed. Until then the healthy model stands as the prior."
         )
     return found
-
-
-def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> Window:
-    if len(y) - onset > LONGEST:
-        warnings.warn(
-            f"Of {len(y) - onset} samples after the fault the last {LONGEST} are used.", DataWarning, stacklevel=4
-        )
-        onset, known_start = len(y) - LONGEST, False
-    present = ~np.isnan(y)
-    before = min(onset, 4 * steady.settling)
-    start = max(onset - 1, 0)
-    missing = np.isnan(u[start:]).any(axis=1)
-    if missing.any():
-        k = start + int(np.argmax(missing))
-        raise DataError(f"Sample {k} lacks an input: a refit needs every input from the fault on.")
-    nothing = np.zeros(model.nx), np.zeros(model.l)
-    if not known_start or onset == 0 or np.isnan(u[onset - before : onset]).any():
-        return Window(u[onset:], y[onset:], present[onset:], *nothing, False, True)
-    part = slice(onset - before, onset)
-    f = model.expanded(u[part])
-    drive, direct = f @ model.B.T + model.offset_x + _fed(model, y[part]), f @ model.D.T + model.offset_y
-    states, innovations = _observed(model, steady.K, (drive, direct), y[part], nothing[0])
-    impulse = np.zeros((before, model.nx, model.nx))
-    impulse[0] = np.eye(model.nx)
-    held = replace(steady, L=np.zeros_like(steady.L))
-    seen = held.respond(impulse, np.zeros((before, model.l, model.nx)), present[part])
-    white = held.whitened(seen, present[part]).reshape(-1, model.nx)
-    r = held.whitened(innovations, present[part]).ravel()
-    if 3 * before < steady.settling or np.linalg.matrix_rank(white) < model.nx:  # 1e-2 of an error is left
-        return Window(u[onset:], y[onset:], present[onset:], *nothing, False, True)
-    x0: Any = np.linalg.lstsq(white, r, rcond=None)[0]
-    states, innovations = _observed(model, steady.K, (drive, direct), y[part], x0)
-    return Window(u[start:], y[start:], present[start:], states[-1], innovations[-1], True, False)
-
-
-def _observed(
-    model: "HammersteinSS", K: Array, known: tuple[Array, Array], y: Array, x0: Array, e0: Array | None = None
-) -> tuple[Array, Array]:
-    """Return the predicted states (N, n) and the innovations (N, l), zero where a reading is missing.
-
-    Args:
-        model: A and C.
-        K: (n, l) gain.
-        known: what is known of the step (N, n) and of the output (N, l).
-        y: (N, l) readings.
-        x0: (n,) state at the first sample.
-        e0: (l,) innovation there, where it is given.
-    """
-    from optid.faults.consistency import observing
-
-    states, innovations = np.empty((len(y), model.nx)), np.empty((len(y), model.l))
-    drive, direct = (np.ascontiguousarray(part) for part in known)
-    matrices: Any = [np.ascontiguousarray(part) for part in (model.A, model.C, K)]
-    observing.observe(
-        matrices[0], matrices[1], matrices[2], drive, direct, np.nan_to_num(y), ~np.isnan(y), np.array(x0, dtype=float),
-        np.zeros(model.l) if e0 is None else e0, e0 is not None, states, innovations,
-    )
-    return states, innovations
-
-
-def _fed(model: "HammersteinSS", y: Array) -> Array:
-    """What measured outputs drive the state with: E g(y) + L y, (N, n); a missing reading is held."""
-    if not model.feedback and not model.L.any():
-        return np.zeros((len(y), model.nx))
-    filled = np.array(y)
-    for o in range(model.l):
-        there = np.flatnonzero(~np.isnan(y[:, o]))
-        if there.size:
-            filled[:, o] = np.interp(np.arange(len(y)), there, y[there, o])
-    filled = np.nan_to_num(filled)
-    fed = filled @ model.L.T
-    for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
-        fed += np.outer(g(filled[:, o]), model.E[:, j])
-    return fed
-
-
-def _curve(model: "HammersteinSS", column: int, inputs: Array, raw: Data, nodes: int) -> Curve:
-    healthy, c = model.nonlinearities[column], model.input_of[column]
-    u = inputs[:, c]
-    basis = healthy.basis
-    if not isinstance(basis, Triangular):
-        interval = basis.interval
-        if interval is None:
-            whole = np.concatenate([part.u[:, c] for part in raw.experiments])
-            interval = float(np.nanmin(whole)), float(np.nanmax(whole))
-            if not interval[0] < interval[1]:
-                interval = interval[0] - 0.5, interval[1] + 0.5
-        outside = "clamp" if basis.outside == "error" else basis.outside
-        basis = Triangular(nodes - 1, interval, outside)
-    at = basis.nodes
-    to_nodes = np.column_stack([basis.values(at), np.ones(at.size)])
-    weights = np.maximum(1 - np.abs(np.clip(u, at[0], at[-1])[:, None] - at) / (at[1] - at[0]), 0.0)
-    several = model.input_of.count(c) > 1
-    number = [i for i, of in enumerate(model.input_of) if of == c].index(column) + 1
-    name = model.inputs[c] + f" {number}" * several
-    return Curve(
-        name, column, basis, at, to_nodes, np.asarray(healthy(at), dtype=float), weights.sum(axis=0),
-        (float(u.min()), float(u.max())),
-    )
 
 
 def _course(kind: str, count: int, held: bool) -> Array:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import DataWarning, RankError
+from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
-from optid.faults.repair.refitting import NODES, Curve, Prior, Refitting, refitting
+from optid.faults.repair.refitting import NODES, Prior, Refitting, refitting
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
