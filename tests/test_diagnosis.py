@@ -10,7 +10,7 @@ from test_fault_injection import small
 
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.faults import Fault, diagnose, dictionary, inject, model_uncertainty, thresholds
+from optid.faults import Fault, diagnose, dictionary, inject, load_diagnosis, model_uncertainty, thresholds
 
 LOAD = np.array([0.3, -0.2, 0.5])
 COUNT = 120
@@ -439,6 +439,18 @@ def test_collinear_faults_are_answered_as_a_group():
 
 
 # -- presentation ----------------------------------------------------------------------------------------------------
+
+
+def test_the_course_of_the_fault_is_estimated_on_request(found, limits, tmp_path):
+    answer = diagnose(small(), record(Fault.ramp("sensor:y2", 60, 0.03)), found, thresholds=limits)
+    assert set(answer.best.labels) == {"sensor:y2"}  # two steps in place of the drift, which is no candidate
+    course = answer.profile("trend").course
+    truth = 0.03 * np.maximum(np.arange(len(course)) - 59, 0)
+    assert np.linalg.norm(course - truth) < 0.15 * np.linalg.norm(truth)
+    with pytest.raises(StructureError, match="names none"):
+        diagnose(small(), record(), found, thresholds=limits).profile()
+    with pytest.raises(StructureError, match="read from a file"):
+        load_diagnosis(answer.save(tmp_path / "d.json")).profile()
 
 
 def test_every_verdict_has_words_and_a_picture(found, limits):

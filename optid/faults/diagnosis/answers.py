@@ -14,6 +14,7 @@ from optid.faults.signatures import Candidate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from optid.faults.consistency.profiles import Profile
     from optid.faults.diagnosis.evidence import Evidence
 
 FORMAT = "optid diagnosis"
@@ -293,6 +294,24 @@ class Diagnosis:
         from optid.faults.diagnosis.words import explained
 
         return " ".join(explained(self))
+
+    def profile(self, prior: str = "auto", **how: Any) -> "Profile":
+        """Estimate the course over time of the most probable fault, whatever kind of course was searched for.
+
+        Args:
+            prior: as in `optid.faults.profile`.
+            how: its other arguments.
+
+        Raises:
+            StructureError: no fault, several at once, one without a course, or a diagnosis read from a file.
+        """
+        from optid.faults.search.programmes import profile
+
+        if self.best is None or len(set(self.best.labels)) != 1:  # one place may change several times
+            raise StructureError("A course is estimated of one fault; this diagnosis names none, or several at once.")
+        if self.evidence is None or self.evidence.search is None:
+            raise StructureError("The record is not in a diagnosis that was read from a file: diagnose it again.")
+        return profile(self.evidence.search, self.best.faults[0].label, prior, **how)
 
     def plot(self) -> "Figure":
         """Draw the innovations, the statistic over onset and candidate, and the signature of the best answer.

@@ -1,10 +1,11 @@
-"""The record behind a diagnosis, for pictures."""
+"""The record behind a diagnosis, for pictures and for the course of a fault."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from optid.bases.basis import Array
+from optid.faults.search.scanning import Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +20,7 @@ class Evidence:
         labels: the C candidates.
         y: (N, l) readings.
         predicted: (N, l) one step ahead.
+        search: the scan; None where no candidate has a signature.
     """
 
     r: Array
@@ -28,3 +30,4 @@ class Evidence:
     labels: tuple[str, ...]
     y: Array
     predicted: Array
+    search: Scan | None

@@ -189,4 +189,5 @@ def _evidence(seen: Seen, fits: Sequence[Fit]) -> Evidence:
     return Evidence(
         white.r, white.present, fits[0].fitted if fits else np.zeros_like(white.r), seen.gains,
         tuple(seen.search.labels) if seen.search is not None else (), seen.part.y, seen.part.y - white.innovations,
+        seen.search,
     )
