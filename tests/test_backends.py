@@ -206,7 +206,8 @@ def test_nothing_is_printed_unless_asked(name, capfd):
     assert captured.out == "" and captured.err == ""
 
 
-NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating", "admm"}
+NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating", "admm",
+                "block_descent"}
 
 
 def test_one_accuracy_is_translated_for_every_solver():

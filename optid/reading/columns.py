@@ -164,7 +164,7 @@ def agreed_step(found: float | None, dt: float | None, tolerance: float, label: 
         return float(f"{found:.12g}")
     if abs(found - dt) > tolerance * dt:
         raise DataError(
-            f"{label}: dt = {dt:g} (as asked for, or of the model), but the time stamps step by {found:.6g}. Leave dt "
+            f"{label}: dt = {dt:g}, but the time stamps step by {found:.6g}. Leave dt "
             "out to use the stamps (mind their unit), pass time=False to ignore them, or resample for the model."
         )
     return dt
