@@ -88,7 +88,7 @@ def test_offsets_end_where_they_are_told():
     (Fault.hard_over("actuator:u1", 20, 1.2), lambda v, u, k: 1.2),
     (Fault.stuck("actuator:u1", 20), lambda v, u, k: u[18]),
     (Fault.frozen("actuator:u1", 20), lambda v, u, k: u[18]),
-], ids=str)
+], ids=lambda part: str(part) if isinstance(part, Fault) else "value")
 def test_a_broken_actuator_drives_the_state_at_the_onset(fault, value):
     model, u = small(), np.random.default_rng(3).normal(size=(N, 2))
     state, output = u.copy(), u.copy()
