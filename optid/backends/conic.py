@@ -32,6 +32,7 @@ PIP = {
 
 UNFIT = {
     "proxqp": {"LP"},  # calls feasible linear programmes infeasible, at any setting of its infeasibility tolerances
+    "scip": {"SOCP"},  # branches for minutes on a convex programme, then stops with an error of its LP solver
 }
 """Classes that CVXPY offers but that do not pass `optid.conformance`."""
 
