@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,56 +57,65 @@ class NumpySearch:
             jolts.append(jolts[-1] @ steady.F)
         self.responses = np.concatenate([np.array(jolts[::-1]), np.array(directs[::-1])], axis=2)  # (W, l, n + l)
         self.steady, self.x, self.before = steady, np.zeros(n), np.zeros(self.model.B.shape[1])
-        self.drives = {c.label: np.zeros((window, n + l)) for c in found.candidates if c.columns}
-        self.fixed, self.roots = {}, {}
+        self.bases = [function.basis for function in self.model.nonlinearities]  # one function of the user in each
+        self.losses = [c for c in found.candidates if c.columns]
+        self.others = [c for c in found.candidates if not c.columns]
+        self.columns = [list(c.columns) for c in self.losses]
+        shapes, self.parts, traces, self.roots, first = {}, {}, [], {}, 0
         for c in found.candidates:
             part = c.into_state if not c.columns else c.into_state[:, : len(c.columns)]
-            into = np.vstack([part, c.into_output])
-            trace = self.responses @ into
-            if c.kind != "jump":
-                trace = np.cumsum(trace[::-1], axis=0)[::-1]
-            self.fixed[c.label] = trace
+            trace = self.responses @ np.vstack([part, c.into_output])
+            shapes[c.label] = trace if c.kind == "jump" else np.cumsum(trace[::-1], axis=0)[::-1]
+        for c in self.others:
+            trace = shapes[c.label]
             grams = np.cumsum(np.einsum("koi,koj->kij", trace, trace)[::-1], axis=0)[::-1]
             self.roots[c.label] = inverse_roots(grams, np.linalg.eigvalsh(grams)[:, -1])
-        self.b = {c.label: np.zeros((window, c.dimension)) for c in found.candidates}
-        self.G = {label: np.zeros((window, 2, 2)) for label in self.drives}
+            self.parts[c.label] = slice(first, first := first + c.dimension)
+            traces.append(np.moveaxis(trace, 1, 0))
+        self.fixed = np.concatenate(traces, axis=2)  # (l, W, numbers)
+        self.b = np.zeros(self.fixed.shape[1:])
+        self.rest = np.array([shapes[c.label][:, :, 0] for c in self.losses])  # a loss has a constant beside it
+        self.drive = np.zeros((len(self.losses), window, n + l, 1))
+        self.loss_b, self.loss_G = np.zeros((2, len(self.losses), window)), np.zeros((3, len(self.losses), window))
         self.seen = 0
 
     def step(self, u: np.ndarray, y: np.ndarray) -> dict[str, float]:
         """Take in one sample; return the largest statistics."""
         model, steady = self.model, self.steady
-        f = model.expanded(u[None])[0]
+        f = np.array([basis.functions[0](u[c]) for basis, c in zip(self.bases, model.input_of)])
         innovation = y - model.C @ self.x - model.D @ f - model.offset_y
         r = steady.root @ innovation
         self.seen += 1
-        count, found = min(self.seen, self.window), {}
+        count, lines = min(self.seen, self.window), {}
+        self.b[:-1] = self.b[1:]
+        self.b[-1] = 0.0
+        self.b += np.tensordot(r, self.fixed, 1)
+        for c in self.others:
+            scores = (self.roots[c.label] @ self.b[:, self.parts[c.label], None])[:, :, 0]
+            lines[c.label] = np.sum(scores * scores, axis=1)
+        for lines_of_losses in (self.loss_b, self.loss_G):
+            lines_of_losses[:, :, :-1] = lines_of_losses[:, :, 1:]
+            lines_of_losses[:, :, -1] = 0.0
+        self.drive[:, :-1] = self.drive[:, 1:]
+        for drive, c, columns in zip(self.drive, self.losses, self.columns):
+            drive[-1, :, 0] = -np.concatenate([c.into_state @ self.before[columns], c.into_output @ f[columns]])
+        moved = np.cumsum((self.responses @ self.drive)[:, ::-1, :, 0], axis=1)[:, ::-1]  # (losses, W, l)
+        self.loss_b[0] += moved @ r
+        self.loss_b[1] += self.rest @ r
+        self.loss_G[0] += np.sum(moved * moved, axis=2)
+        self.loss_G[1] += np.sum(moved * self.rest, axis=2)
+        self.loss_G[2] += np.sum(self.rest * self.rest, axis=2)
+        (b, e), (g, cross, h) = self.loss_b, self.loss_G
+        rest = g * h - cross**2
+        there = rest > 1e-9 * (g + h) ** 2
+        both = (h * b**2 - 2 * cross * b * e + g * e**2) / np.where(there, rest, 1)
+        along = (g * b**2 + 2 * cross * b * e + h * e**2) / (g + h + 1e-150) ** 2
+        lines.update(zip((c.label for c in self.losses), np.where(there, both, along)))
+        found = {}
         for c in self.found.candidates:
-            b = self.b[c.label]
-            b[:-1] = b[1:]
-            b[-1] = 0.0
-            if not c.columns:
-                b += np.einsum("kod,o->kd", self.fixed[c.label], r)
-                scores = np.einsum("kij,kj->ki", self.roots[c.label], b)
-                line = np.einsum("ki,ki->k", scores, scores)
-            else:
-                drive, G, columns = self.drives[c.label], self.G[c.label], list(c.columns)
-                drive[:-1], G[:-1] = drive[1:], G[1:]
-                drive[-1] = -np.concatenate([c.into_state @ self.before[columns], c.into_output @ f[columns]])
-                G[-1] = 0.0
-                moved = np.einsum("koi,ki->ko", self.responses, drive)
-                moved = np.cumsum(moved[::-1], axis=0)[::-1]
-                signature = np.stack([moved, self.fixed[c.label][:, :, 0]], axis=2)
-                b += np.einsum("kod,o->kd", signature, r)
-                G += np.einsum("koi,koj->kij", signature, signature)
-                g, cross, h = G[:, 0, 0], G[:, 0, 1], G[:, 1, 1]
-                rest = g * h - cross**2
-                there = rest > 1e-9 * (g + h) ** 2
-                full = (h * b[:, 0] ** 2 - 2 * cross * b[:, 0] * b[:, 1] + g * b[:, 1] ** 2) / np.where(there, rest, 1)
-                along = (g * b[:, 0] ** 2 + 2 * cross * b[:, 0] * b[:, 1] + h * b[:, 1] ** 2) / (g + h + 1e-150) ** 2
-                line = np.where(there, full, along)
             early = 1 if c.columns and self.seen <= self.window else 0  # nothing is known of the input before
             first, last = self.window - count + early, self.window - (-(-c.dimension // model.l) - 1)
-            found[c.label] = float(np.max(line[first:last], initial=0.0))
+            found[c.label] = float(np.max(lines[c.label][first:last], initial=0.0))
         self.x = model.A @ self.x + model.B @ f + model.offset_x + steady.K @ innovation
         self.before = f
         return found
@@ -152,14 +160,19 @@ def latencies(samples: int) -> None:
         for label, value in plain.step(now, reading).items():
             worst = max(worst, abs(monitor.statistics[label] - value) / max(value, 1e-3))
     print(f"largest difference of the statistics, compiled and NumPy: {worst:.1e} (goal 1e-9)")
-    tracemalloc.start()
-    for k in range(400, 5400):
-        monitor.step(u[k], y[k])
-    before = tracemalloc.get_traced_memory()[0]
-    for k in range(400, 5400):
-        monitor.step(u[k], y[k])
-    print(f"memory after 5000 more samples: {tracemalloc.get_traced_memory()[0] - before:+d} bytes (goal 0)\n")
-    tracemalloc.stop()
+    made = [allocations(monitor, u[first:last], y[first:last]) for first, last in ((400, 401), (401, 5401))]
+    print(f"allocations of the compiled step, beyond the {made[0]} handles of its arguments, in 5000 samples: "
+          f"{made[1] - made[0]} (goal 0)\n")
+
+
+def allocations(monitor: Monitor, u: np.ndarray, y: np.ndarray) -> int:
+    """Count what compiled code allocates during one call; numba makes a handle of every array it is given."""
+    from numba.core.runtime import _nrt_python, rtsys
+
+    _nrt_python.memsys_enable_stats()
+    before = rtsys.get_allocation_stats().alloc
+    monitor.run(u, y)
+    return rtsys.get_allocation_stats().alloc - before
 
 
 def throughput(rows: int) -> None:
