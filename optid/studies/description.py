@@ -14,7 +14,7 @@ class DataEntry:
 
     Attributes:
         name: its label.
-        file: data file, relative to the folder of the study.
+        files: data files, one experiment each, relative to the folder of the study.
         system: name of a simulated system (`optid.studies.systems`).
         record: a record in memory, from Python only.
         samples: lengths of the simulated records; empty for the system's own.
@@ -23,7 +23,7 @@ class DataEntry:
     """
 
     name: str
-    file: str | None = None
+    files: tuple[str, ...] = ()
     system: str | None = None
     record: Data | None = field(default=None, repr=False, compare=False)
     samples: tuple[int, ...] = ()

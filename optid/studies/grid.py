@@ -18,7 +18,8 @@ class Cell:
         data: label of the data entry.
         formulation: label of the formulation entry.
         solver: label of the solver entry.
-        data_source: where the record comes from, its file name absolute.
+        data_source: where the record comes from, its file names absolute.
+        data_hash: sha256 of the bytes of the files or of the record in memory; empty for a simulated system.
         samples: length of a simulated record; None for a file.
         noise: relative standard deviation of its noise; None for a file.
         seed: of its simulation; None for a file.
@@ -42,6 +43,7 @@ class Cell:
     formulation: str
     solver: str
     data_source: DataEntry
+    data_hash: str
     samples: int | None
     noise: float | None
     seed: int | None
