@@ -29,7 +29,7 @@ class Example:
     suggestion: dict[str, Any]
 
 
-def dead_zone(seed: int = 0, n: int = 1000) -> Example:
+def dead_zone(seed: int = 0, n: int = 1000, noise: float | None = None) -> Example:
     """Return the simulation example of chapter 3: a dead zone of half width 0.25 before second-order dynamics.
 
     A = 1 - 1.5 q^-1 + 0.7 q^-2, b = (16/15, 0.8), f(u) = sign(u) max(|u| - 0.25, 0), u white and uniform on [-1, 1].
@@ -40,15 +40,16 @@ def dead_zone(seed: int = 0, n: int = 1000) -> Example:
     Args:
         seed: seed of input and noise.
         n: samples.
+        noise: standard deviation of the noise relative to that of the noise-free output; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1.0, 1.0, n)
     variance_of_f = 0.75**3 / 3  # integral of (|u| - 0.25)^2 over the density 1/2, f has zero mean
     power = variance_of_f * _energy(_DEAD_ZONE.b[0], _DEAD_ZONE.a)
-    return _DEAD_ZONE.example(u[:, None], power / 22, rng)
+    return _DEAD_ZONE.example(u[:, None], power / 22 if noise is None else power * noise**2, rng)
 
 
-def thruster(seed: int = 0, n: int = 600) -> Example:
+def thruster(seed: int = 0, n: int = 600, noise: float | None = None) -> Example:
     """Return a simulated marine thruster rig: servo current to thrust.
 
     Thrust is quadratic in the current, weaker astern (0.7), zero in a dead band of 0.1 A either way, and follows with
@@ -59,11 +60,13 @@ def thruster(seed: int = 0, n: int = 600) -> Example:
     Args:
         seed: seed of the phases and of the noise.
         n: samples.
+        noise: standard deviation of the noise relative to the root mean square of the noise-free
+            thrust; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = _currents(n, seed)
     power = float(np.mean(_THRUSTER.output(u) ** 2))
-    return _THRUSTER.example(u, power / 30, rng)
+    return _THRUSTER.example(u, power / 30 if noise is None else power * noise**2, rng)
 
 
 def broken_thruster(seed: int = 0, n: int = 400) -> Example:
@@ -88,7 +91,7 @@ def broken_thruster(seed: int = 0, n: int = 400) -> Example:
     return Example(data, truth, dict(_THRUSTER.suggestion))
 
 
-def two_inputs(seed: int = 0, n: int = 2000) -> Example:
+def two_inputs(seed: int = 0, n: int = 2000, noise: float | None = None) -> Example:
     """Return a simulated heated tank: a valve that saturates and a heater whose power is quadratic in the voltage.
 
     A = 1 - 1.1 q^-1 + 0.3 q^-2; valve: f(u) = tanh(2 u), b = (-0.6, -0.3), u in [-1, 1]; heater: f(u) = u^2 / 4,
@@ -98,10 +101,12 @@ def two_inputs(seed: int = 0, n: int = 2000) -> Example:
     Args:
         seed: seed of inputs and noise.
         n: samples.
+        noise: standard deviation of the noise relative to that of the noise-free output; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = np.column_stack([rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0, n)])
-    return _TWO_INPUTS.example(u, float(np.var(_TWO_INPUTS.output(u))) / 25, rng)
+    power = float(np.var(_TWO_INPUTS.output(u)))
+    return _TWO_INPUTS.example(u, power / 25 if noise is None else power * noise**2, rng)
 
 
 def pendulum(seed: int = 0, n: int = 4000) -> Example:
