@@ -1,0 +1,71 @@
+"""The record of a cell: read, or simulated, with what the fit does not see kept apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.data import Data
+from optid.errors import DataError
+from optid.studies.description import DataEntry
+from optid.studies.grid import Cell
+from optid.studies.systems import simulate
+from optid.studies.truth import Truth
+
+ANOTHER = 2**31
+"""Added to the seed of a simulated record for the hold-out, which is a record of its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What a cell works on.
+
+    Attributes:
+        data: what the fit sees.
+        holdout: what it is judged on; None where nothing is held out.
+        truth: the system behind a simulated record; None for a file.
+    """
+
+    data: Data
+    holdout: Data | None
+    truth: Truth | None
+
+
+def load(cell: Cell) -> Record:
+    """Read or simulate the record of a cell.
+
+    A file is cut: its last samples, of every experiment, are held out. A simulated record keeps the samples asked for,
+    and a second one with another seed is held out, as long as the share of the whole demands.
+
+    Args:
+        cell: whose record.
+
+    Raises:
+        DataError: what `optid.read` refuses.
+    """
+    entry = cell.data_source
+    if entry.system is None:
+        whole = read_entry(entry)
+        if not cell.holdout:
+            return Record(whole, None, None)
+        data, rest = whole.split(1.0 - cell.holdout)
+        return Record(data, rest, None)
+    if cell.samples is None or cell.seed is None:
+        raise DataError(f"the simulated record {entry.name!r} needs a length and a seed")
+    data, truth = simulate(entry.system, cell.samples, cell.noise, cell.seed)
+    if not cell.holdout:
+        return Record(data, None, truth)
+    length = int(np.ceil(cell.samples * cell.holdout / (1.0 - cell.holdout)))
+    return Record(data, simulate(entry.system, length, cell.noise, cell.seed + ANOTHER)[0], truth)
+
+
+def read_entry(entry: DataEntry) -> Data:
+    """Return the record of an entry that is not simulated.
+
+    Raises:
+        DataError: what `optid.read` refuses.
+    """
+    if entry.record is not None:
+        return entry.record
+    from optid.readers import read
+
+    return read(list(entry.files), **entry.options)
