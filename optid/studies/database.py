@@ -1,0 +1,232 @@
+"""The database of a study: one DuckDB file, one row per cell and repetition; read, append, export.
+
+A writer opens the file for each batch and closes it again, so that a report can be made while the study runs and a
+killed study leaves a database that opens. Every batch is one transaction.
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.errors import OptidError
+from optid.studies.rows import COLUMNS, NAMES, SCHEMA_VERSION, complete
+
+if TYPE_CHECKING:
+    import duckdb
+
+PATIENCE = 10.0  # seconds to wait for another process that has the file open for a moment
+
+
+class DatabaseError(OptidError, RuntimeError):
+    """The database cannot be used: missing, not a study's, of another version, locked, or the disk is full."""
+
+
+@contextmanager
+def opened(path: str | Path, write: bool = False) -> "Iterator[duckdb.DuckDBPyConnection]":
+    """Open a database of studies; made with its tables when it is not there and ``write`` is asked for.
+
+    Args:
+        path: the file.
+        write: open it for writing.
+
+    Raises:
+        DatabaseError: no such file, not a database of studies, another schema version, in use for longer than a few
+            seconds, or duckdb is missing (with the pip line).
+    """
+    path = Path(path)
+    if not write and not path.is_file():
+        raise DatabaseError(f"{path}: no such database; `optid study run` makes one")
+    connection = _connected(path, write)
+    try:
+        if write and not _tables(connection):
+            _create(connection)
+        _check(path, connection)
+        yield connection
+    finally:
+        connection.close()
+
+
+def _connected(path: Path, write: bool) -> "duckdb.DuckDBPyConnection":
+    try:
+        import duckdb
+    except ImportError:
+        raise DatabaseError("a database of studies needs duckdb: pip install 'optid[study]'") from None
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return duckdb.connect(str(path), read_only=not write, config={"threads": 1})
+        except duckdb.Error as error:
+            text = str(error).splitlines()[0]
+            if "lock" not in text.lower():
+                raise DatabaseError(f"{path} cannot be opened: {text}") from None
+            if time.monotonic() > until:
+                raise DatabaseError(f"{path} has been in use by another process for {PATIENCE:.0f} s: {text}") from None
+            time.sleep(0.02)
+
+
+def _tables(connection: "duckdb.DuckDBPyConnection") -> set[str]:
+    return {name for (name,) in connection.execute("SELECT table_name FROM duckdb_tables()").fetchall()}
+
+
+def _create(connection: "duckdb.DuckDBPyConnection") -> None:
+    columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
+    from optid import __version__
+
+    connection.execute("BEGIN")
+    connection.execute(f"CREATE TABLE rows ({columns}, PRIMARY KEY (key, repetition))")
+    connection.execute(f"CREATE TABLE superseded ({columns})")
+    connection.execute("CREATE TABLE sources (study VARCHAR, data VARCHAR, file VARCHAR, hash VARCHAR, "
+                       "PRIMARY KEY (study, data))")
+    connection.execute("CREATE TABLE studies (study VARCHAR PRIMARY KEY, description VARCHAR)")
+    connection.execute("CREATE TABLE meta (name VARCHAR PRIMARY KEY, value VARCHAR)")
+    connection.executemany("INSERT INTO meta VALUES (?, ?)", [("schema version", str(SCHEMA_VERSION)),
+                                                               ("made by", f"optid {__version__}")])
+    connection.execute("COMMIT")
+
+
+def _check(path: Path, connection: "duckdb.DuckDBPyConnection") -> None:
+    tables = _tables(connection)
+    if not {"rows", "meta"} <= tables:
+        raise DatabaseError(f"{path} is a DuckDB file, but not a database of studies (it has "
+                            f"{', '.join(sorted(tables)) or 'no tables'}); give another file name")
+    found = connection.execute("SELECT value FROM meta WHERE name = 'schema version'").fetchone()
+    version = found[0] if found else "unknown"
+    if version != str(SCHEMA_VERSION):
+        made = connection.execute("SELECT value FROM meta WHERE name = 'made by'").fetchone()
+        raise DatabaseError(f"{path} has schema version {version}{f' (made by {made[0]})' if made else ''}; this is "
+                            f"version {SCHEMA_VERSION}. Export it with the optid that made it, or give another file")
+
+
+def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append rows in one transaction; an older row of the same place in the grid moves to the table ``superseded``.
+
+    Args:
+        path: the database; made when it is not there.
+        rows: mappings of columns; completed and checked by `rows.complete`.
+
+    Raises:
+        DatabaseError: as in `opened`; or it cannot be written, such as on a full disk: nothing of the batch is in it
+            then, and what was in it before stays.
+        ValueError: a row that does not keep the schema.
+    """
+    whole = [complete(row) for row in rows]
+    with writing(path) as connection:
+        if not whole:
+            return
+        connection.register("batch", {c.name: _packed([row[c.name] for row in whole], c.kind) for c in COLUMNS})
+        names = ", ".join(f'"{name}"' for name in NAMES)
+        casts = ", ".join(f'CAST("{c.name}" AS {c.sql})' for c in COLUMNS)
+        older = ("SELECT {} FROM rows WHERE place IN (SELECT place FROM batch) "
+                 "AND (key, repetition) NOT IN (SELECT (key, repetition) FROM batch)")
+        connection.execute(f"INSERT INTO superseded {older.format(names)}")
+        connection.execute(f"DELETE FROM rows WHERE (key, repetition) IN ({older.format('(key, repetition)')})")
+        connection.execute(f"INSERT INTO rows ({names}) SELECT {casts} FROM batch")
+
+
+@contextmanager
+def writing(path: str | Path) -> "Iterator[duckdb.DuckDBPyConnection]":
+    """Open a database for one transaction, which is undone when anything fails.
+
+    Raises:
+        DatabaseError: as in `opened`, or it cannot be written.
+    """
+    try:
+        with opened(path, write=True) as connection:
+            connection.execute("BEGIN")
+            yield connection
+            connection.execute("COMMIT")
+    except OptidError:
+        raise
+    except Exception as error:
+        if not type(error).__module__.startswith(("duckdb", "_duckdb")) and not isinstance(error, OSError):
+            raise
+        raise DatabaseError(f"{path} cannot be written: {str(error).splitlines()[0]}") from error
+
+
+def _packed(values: list[Any], kind: str) -> np.ndarray:
+    missing = [value is None for value in values]
+    if kind == "number":
+        return np.ma.masked_array([0.0 if v is None else v for v in values], missing, dtype=float)
+    if kind in ("integer", "flag"):
+        return np.ma.masked_array([0 if v is None else v for v in values], missing,
+                                  dtype=np.int64 if kind == "integer" else bool)
+    return np.array(values, dtype=object)
+
+
+def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
+    """Return the rows as one array per column, in the order in which the cells started.
+
+    Args:
+        path: the database.
+        study: only rows of this study.
+
+    Returns:
+        {column: (rows,) array} for every column of `rows.COLUMNS`: "number" float64, "integer" float64 (int64 for the
+        columns that every row has), both NaN where there is no value; "text" and "json" objects, "" where there is no
+        value; "flag" bool, False where there is none; "time" datetime64[us].
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    names = ", ".join(f"coalesce(\"{c.name}\", '') AS \"{c.name}\"" if c.kind in ("text", "json") else f'"{c.name}"'
+                      for c in COLUMNS)
+    with opened(path) as connection:
+        condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
+        found = connection.execute(f"SELECT {names} FROM rows {condition} ORDER BY started, key, repetition", values
+                                   ).fetchnumpy()
+    return {c.name: _unpacked(found[c.name], c.kind, c.always) for c in COLUMNS}
+
+
+def _unpacked(values: Any, kind: str, always: bool) -> np.ndarray:
+    if kind in ("text", "json"):
+        return np.asarray(values, dtype=object)
+    if kind == "flag":
+        return np.asarray(np.ma.filled(values, False), dtype=bool)
+    if kind == "time":
+        return np.asarray(np.ma.filled(values, np.datetime64("NaT")), dtype="datetime64[us]")
+    if kind == "integer" and always:
+        return np.asarray(values, dtype=np.int64)
+    return np.asarray(np.ma.filled(np.ma.asarray(values, dtype=float), np.nan), dtype=float)
+
+
+def finished(path: str | Path) -> set[tuple[str, int]]:
+    """Return (key, repetition) of every row; empty where there is no database yet.
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    if not Path(path).exists():
+        return set()
+    with opened(path) as connection:
+        return {(key, int(number)) for key, number in connection.execute("SELECT key, repetition FROM rows").fetchall()}
+
+
+def export(path: str | Path, target: str | Path) -> int:
+    """Write the rows to a Parquet or CSV file and return how many there are.
+
+    Args:
+        path: the database.
+        target: file that ends in .parquet or .csv; replaced when it is there.
+
+    Raises:
+        DatabaseError: another ending, the target cannot be written, or as in `opened`.
+    """
+    target = Path(target)
+    formats: dict[str, str] = {".parquet": "FORMAT parquet", ".csv": "FORMAT csv, HEADER"}
+    if target.suffix.lower() not in formats:
+        raise DatabaseError(f"{target}: rows are exported to a file that ends in .parquet or .csv")
+    names = ", ".join(f'"{name}"' for name in NAMES)
+    with opened(path) as connection:
+        import duckdb
+
+        try:
+            count = connection.execute(
+                f"COPY (SELECT {names} FROM rows ORDER BY started, key, repetition) "
+                f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({formats[target.suffix.lower()]})").fetchone()
+        except duckdb.Error as error:
+            raise DatabaseError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
+    return int(count[0]) if count else 0

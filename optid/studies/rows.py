@@ -1,0 +1,228 @@
+"""The row of a study: names, types, units and meaning of its columns; tables and documentation come from here."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from optid.solution import Status
+
+SCHEMA_VERSION = 1
+
+DONE, TIME_LIMIT, MEMORY_LIMIT, CRASHED = "done", "time limit", "memory limit", "crashed"
+ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
+
+OUTCOMES = {
+    DONE: "the fit ran to its end and was judged; `status_verified` says with what result",
+    TIME_LIMIT: "the worker was killed because the cell took longer than its time limit",
+    MEMORY_LIMIT: "the worker was killed because it held more memory than the limit",
+    CRASHED: "the worker died: segmentation fault, abort, kill by another hand",
+    ERROR: "the cell could not be run: unreadable record, wrong argument, an exception outside the solver",
+    REFUSED: "the solver cannot take this formulation, or is not installed; nothing was run",
+    NON_FINITE: "the fit ended, but the solver's point, its objective or the model holds numbers that are not finite",
+}
+"""Every value of the column ``outcome`` and what it means."""
+
+STATUSES = tuple(str(status) for status in Status)
+"""Every value of the column ``status_verified``."""
+
+SUCCESS = (str(Status.OPTIMAL), str(Status.LOCAL))
+"""Verified statuses with which the requested accuracy was reached."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column.
+
+    Attributes:
+        name: its name.
+        kind: "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row).
+        meaning: one sentence for people.
+        unit: of its numbers; "" where it has none.
+        always: whether every row has a value, whatever happened to the cell.
+    """
+
+    name: str
+    kind: str
+    meaning: str
+    unit: str = ""
+    always: bool = False
+
+    @property
+    def sql(self) -> str:
+        """Its type in the database."""
+        kinds = {"text": "VARCHAR", "json": "VARCHAR", "number": "DOUBLE", "integer": "BIGINT", "flag": "BOOLEAN",
+                 "time": "TIMESTAMP"}
+        return kinds[self.kind]
+
+
+COLUMNS: tuple[Column, ...] = (
+    # which cell
+    Column("key", "text", "SHA-256 of everything that determines the result, the machine excepted", always=True),
+    Column("repetition", "integer", "counted from 0; (key, repetition) identifies a row", always=True),
+    Column("place", "text", "hash of the labels below: the place in the grid, the same for other versions and options",
+           always=True),
+    Column("study", "text", "title of the study", always=True),
+    Column("data", "text", "label of the data entry", always=True),
+    Column("formulation", "text", "label of the formulation entry", always=True),
+    Column("solver", "text", "label of the solver entry", always=True),
+    # what was run
+    Column("system", "text", "simulated system; empty for a file"),
+    Column("file", "text", "data file; empty for a simulated system"),
+    Column("samples", "integer", "requested length of a simulated record"),
+    Column("noise", "number", "standard deviation of the noise relative to that of the noise-free output"),
+    Column("seed", "integer", "seed of the simulation"),
+    Column("formulation_name", "text", "registered name of the formulation", always=True),
+    Column("options", "json", "arguments of the formulation", always=True),
+    Column("constraints", "json", "named constraints, a list of texts", always=True),
+    Column("solver_name", "text", "word of the back end that was asked for, or auto", always=True),
+    Column("solver_options", "json", "native options of the solver", always=True),
+    Column("accuracy", "number", "requested relative accuracy", always=True),
+    Column("warm", "flag", "whether the cell was also solved a second time from its own solution", always=True),
+    Column("holdout", "number", "share of the record that the fit did not see", always=True),
+    Column("time_limit", "number", "longest time a cell may take", "s", always=True),
+    Column("memory_limit", "number", "largest memory a cell may take", "MB", always=True),
+    # the record
+    Column("record_hash", "text", "SHA-256 of the samples and channel names that the cell saw"),
+    Column("n_samples", "integer", "samples of the record, all experiments together"),
+    Column("n_estimation", "integer", "samples that the fit saw"),
+    Column("n_inputs", "integer", "inputs of the record"),
+    Column("n_outputs", "integer", "outputs of the record"),
+    # how it ended
+    Column("outcome", "text", "how the cell ended; see the table of outcomes", always=True),
+    Column("status_claimed", "text", "what the solver said, in its own word"),
+    Column("status_verified", "text", "status after our own residuals have judged the claim; empty where nothing was "
+                                      "judged"),
+    Column("reason", "text", "one sentence where outcome or status needs one"),
+    Column("reached", "flag", "whether the verified accuracy was reached: optimal or locally optimal", always=True),
+    Column("proved", "flag", "whether global optimality is proved", always=True),
+    Column("false_claim", "flag", "whether the solver claimed a success or an infeasibility that our residuals "
+                                  "took back", always=True),
+    Column("solver_used", "text", "back end that ran, where auto chose it"),
+    Column("program_class", "text", "class of the last programme: LP, QP, SOCP, SDP, conic or NLP"),
+    Column("unknowns", "integer", "scalar variables of the last programme"),
+    Column("n_programs", "integer", "programmes solved: 1, or the steps of a procedure"),
+    # the answer
+    Column("objective", "number", "objective at the point, recomputed", "data"),
+    Column("scale", "number", "objective of the zero model, the yardstick of objectives", "data"),
+    Column("bound", "number", "certified lower bound; empty where there is none", "data"),
+    Column("gap", "number", "relative gap between objective and bound; empty without a bound"),
+    Column("violation", "number", "largest constraint violation, relative to its terms"),
+    Column("stationarity", "number", "largest component of the gradient of the Lagrangian, relative to its terms"),
+    Column("complementarity", "number", "products of multipliers and slacks, relative to the objective"),
+    Column("iterations", "integer", "iterations as counted by the solver, all programmes together"),
+    # times and memory
+    Column("load_s", "number", "reading or simulating the record; near 0 where the worker had it from an earlier cell",
+           "s"),
+    Column("build_s", "number", "posing the problem: examination, statistics, programme", "s"),
+    Column("compile_s", "number", "translation of the programme for the solver, part of a cold solve; empty where the "
+                                  "back end does not tell it apart", "s"),
+    Column("solve_s", "number", "cold solve without the compilation that was told apart, all programmes together", "s"),
+    Column("judge_s", "number", "measuring residuals at the point", "s"),
+    Column("prove_s", "number", "the attempt to prove global optimality", "s"),
+    Column("fit_s", "number", "the whole fit: build, compile, solve, judge, prove, prices", "s"),
+    Column("warm_s", "number", "the second solve, from the first one's solution, with nothing built or compiled again",
+           "s"),
+    Column("warm_iterations", "integer", "iterations of the second solve"),
+    Column("warm_status", "text", "verified status of the second solve"),
+    Column("total_s", "number", "the whole cell as the worker saw it, or until it was killed", "s"),
+    Column("peak_mb", "number", "largest resident memory of the worker during the cell", "MB"),
+    Column("base_mb", "number", "resident memory of the worker before the cell", "MB"),
+    # the model
+    Column("one_step_fit", "number", "one-step fit on the hold-out samples, mean over the outputs", "%"),
+    Column("one_step_fits", "json", "the same for every output, a list", "%"),
+    Column("simulation_fit", "number", "simulation fit on the hold-out samples, initial state fitted, mean over the "
+                                       "outputs", "%"),
+    Column("simulation_fits", "json", "the same for every output, a list", "%"),
+    Column("parameter_error", "number", "relative error of the linear part against the truth, in a common gauge"),
+    Column("nonlinearity_error", "number", "relative error of the nonlinearity against the truth, in a common gauge"),
+    Column("poles", "json", "poles of the linear part, a list of [real, imaginary]"),
+    Column("stable", "flag", "whether every pole lies inside the unit circle; empty without a model"),
+    # when and where
+    Column("started", "time", "when the cell started, UTC", always=True),
+    Column("machine", "text", "name, processor, system and Python of the machine that ran it", always=True),
+    Column("versions", "json", "versions of optid and of the packages that determine the result", always=True),
+)
+
+NAMES: tuple[str, ...] = tuple(column.name for column in COLUMNS)
+BY_NAME: Mapping[str, Column] = {column.name: column for column in COLUMNS}
+
+_TYPES: Mapping[str, tuple[type, ...]] = {"text": (str,), "json": (str,), "number": (float, int), "integer": (int,),
+                                          "flag": (bool,), "time": (str,)}
+
+
+def complete(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a whole row in the order of the columns; what is not given is empty (None), or False for a sure flag.
+
+    Numbers that are not finite become empty, so that one of them cannot poison a mean; whether that is an outcome of
+    its own is for the caller to say.
+
+    Args:
+        values: {column: value}; numpy scalars are taken as the numbers they are.
+
+    Raises:
+        ValueError: unknown column, value of another type, unknown outcome or status, or no value where every row has
+            one.
+    """
+    unknown = sorted(set(values) - set(NAMES))
+    if unknown:
+        raise ValueError(f"no column is called {', '.join(unknown)}")
+    row = {column.name: _cell_value(column, values.get(column.name)) for column in COLUMNS}
+    if row["outcome"] not in OUTCOMES:
+        raise ValueError(f"outcome {row['outcome']!r} is none of {', '.join(OUTCOMES)}")
+    if row["status_verified"] not in (None, *STATUSES):
+        raise ValueError(f"status_verified {row['status_verified']!r} is none of {', '.join(STATUSES)}")
+    return row
+
+
+def _cell_value(column: Column, value: Any) -> Any:
+    value = value.item() if hasattr(value, "item") else value
+    if value is None and column.always and column.kind == "flag":
+        return False
+    if column.kind in ("number", "integer") and isinstance(value, float) and not math.isfinite(value):
+        value = None
+    if column.kind == "integer" and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if value is None:
+        if column.always:
+            raise ValueError(f"column {column.name!r} needs a value in every row")
+        return None
+    if isinstance(value, bool) != (column.kind == "flag") or not isinstance(value, _TYPES[column.kind]):
+        raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
+    return float(value) if column.kind == "number" else value
+
+
+def place(*labels: Any) -> str:
+    """Return the hash of a place in the grid.
+
+    Args:
+        labels: study, data, formulation and solver label, samples, noise, seed, accuracy, repetition.
+    """
+    return hashlib.sha256(json.dumps(labels).encode()).hexdigest()[:32]
+
+
+def as_json(value: Any) -> str:
+    """Write a value as JSON text; numbers that are not finite become null, what JSON does not know its text."""
+    return json.dumps(_finite(value), sort_keys=True, default=str, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return _finite(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def markdown(columns: Iterable[Column] = COLUMNS) -> str:
+    """Return the documentation of the schema as two Markdown tables: columns and outcomes."""
+    lines = [f"Schema version {SCHEMA_VERSION}. A column without a value is NULL; there is no NaN and no infinity.", "",
+             "| column | type | unit | meaning |", "|---|---|---|---|"]
+    lines += [f"| `{c.name}` | {c.sql}{' (JSON)' if c.kind == 'json' else ''}{' NOT NULL' if c.always else ''} "
+              f"| {c.unit} | {c.meaning} |" for c in columns]
+    lines += ["", "| outcome | meaning |", "|---|---|", *(f"| {word} | {text} |" for word, text in OUTCOMES.items())]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,125 @@
+"""The database of a study: what goes in comes out, and what cannot be used is refused."""
+
+import numpy as np
+import pytest
+from study_rows import rows
+
+from optid.studies import database
+from optid.studies.database import DatabaseError, append, export, finished, opened, read_rows
+from optid.studies.rows import COLUMNS, NAMES
+
+duckdb = pytest.importorskip("duckdb")
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "study.duckdb"
+
+
+def test_rows_come_back_as_they_went_in(path):
+    made = rows(400, seed=2)
+    append(path, made[:150])
+    append(path, made[150:])
+    found = read_rows(path)
+    assert tuple(found) == NAMES
+    assert finished(path) == {(row["key"], row["repetition"]) for row in made}
+    for column in COLUMNS:
+        want = [row[column.name] for row in made]
+        got = found[column.name]
+        if column.kind in ("text", "json"):
+            assert list(got) == [value or "" for value in want]
+        elif column.kind == "time":
+            assert [np.datetime64(value[:-6], "us") for value in want] == list(got)
+        else:
+            empty = 0.0 if column.kind == "flag" else np.nan
+            np.testing.assert_array_equal(got.astype(float), [empty if value is None else value for value in want])
+    assert found["repetition"].dtype == np.int64 and found["proved"].dtype == bool
+
+
+def test_ten_thousand_rows_are_written_and_read_quickly(path):
+    append(path, rows(10_000))
+    assert read_rows(path)["key"].size == 10_000
+
+
+def test_a_row_twice_is_refused_and_leaves_the_rest(path):
+    made = rows(20)
+    append(path, made[:10])
+    with pytest.raises(DatabaseError, match="cannot be written"):
+        append(path, made[9:])
+    assert len(finished(path)) == 10
+
+
+def test_a_newer_row_of_the_same_place_moves_the_older_aside(path):
+    made = rows(10)
+    append(path, made)
+    append(path, [{**made[3], "key": "f" * 64, "objective": 5.0}])
+    assert len(finished(path)) == 10 and ("f" * 64, made[3]["repetition"]) in finished(path)
+    with opened(path) as connection:
+        assert connection.execute("SELECT key FROM superseded").fetchall() == [(made[3]["key"],)]
+
+
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
+def test_export_has_every_row_and_column(path, tmp_path, ending):
+    import pandas as pd
+
+    made = rows(200)
+    append(path, made)
+    target = tmp_path / f"it's here.{ending}"
+    assert export(path, target) == 200
+    frame = (pd.read_parquet if ending == "parquet" else pd.read_csv)(target)
+    assert tuple(frame.columns) == NAMES and len(frame) == 200
+    assert frame["objective"].isna().sum() == sum(row["objective"] is None for row in made)
+
+
+def test_no_rows_yet(path):
+    assert finished(path) == set()
+    append(path, [])
+    assert read_rows(path)["objective"].shape == (0,)
+
+
+def test_missing_database(path):
+    with pytest.raises(DatabaseError, match="no such database"):
+        read_rows(path)
+
+
+def test_another_version_is_refused_for_reading_and_writing(path):
+    append(path, rows(3))
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
+    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
+        with pytest.raises(DatabaseError, match="schema version 99.*made by optid"):
+            attempt()
+
+
+def test_other_files_are_refused(path):
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE TABLE mine (x INTEGER)")
+    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1))):
+        with pytest.raises(DatabaseError, match="not a database of studies"):
+            attempt()
+    path.write_text("time,u,y\n" * 1000)
+    with pytest.raises(DatabaseError, match="cannot be opened"):
+        read_rows(path)
+
+
+def test_export_to_another_ending_or_nowhere(path, tmp_path):
+    append(path, rows(1))
+    with pytest.raises(DatabaseError, match="ends in .parquet or .csv"):
+        export(path, tmp_path / "rows.xlsx")
+    with pytest.raises(DatabaseError, match="cannot be written"):
+        export(path, tmp_path / "no folder" / "rows.csv")
+
+
+def test_a_database_in_use_is_waited_for_then_refused(path, monkeypatch):
+    import subprocess
+    import sys
+
+    append(path, rows(1))
+    monkeypatch.setattr(database, "PATIENCE", 0.1)
+    hold = f"import duckdb, sys; c = duckdb.connect({str(path)!r}); print('open', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"open\n"
+        with pytest.raises(DatabaseError, match="in use by another process"):
+            read_rows(path)
+        other.communicate()
+    assert len(finished(path)) == 1
