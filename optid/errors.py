@@ -40,6 +40,14 @@ class SolverFailed(OptidError, RuntimeError):  # noqa: N818
     """The solver crashed, ran out of time or returned a point that our residuals refuse."""
 
 
+class ClusterError(OptidError, RuntimeError):
+    """A Dask cluster cannot be used: no scheduler answers, no worker, other package versions, or its workers die."""
+
+
+class StudyError(OptidError, ValueError):
+    """The description of a study is wrong, or its database belongs to another; the message lists every problem."""
+
+
 class ModelFileError(OptidError, ValueError):
     """A model file is truncated, of another version, or not a model."""
 
