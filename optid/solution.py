@@ -72,12 +72,17 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds spent building, solving, judging and proving."""
+    """Seconds spent building, solving, judging and proving.
+
+    ``compile`` is the part of ``solve`` that translated the programme for the solver; nan where the back end does not
+    tell it apart.
+    """
 
     build: float = 0.0
     solve: float = 0.0
     judge: float = 0.0
     prove: float = 0.0
+    compile: float = float("nan")
 
     @property
     def total(self) -> float:
@@ -102,6 +107,7 @@ class Solution:
         solver: name of the back end; ``chosen`` says why when it was chosen automatically.
         iterations: as counted by the solver, -1 where it does not say.
         times: seconds per phase.
+        claim: what the solver said, in our words; None where nothing was asked of one.
     """
 
     status: Status
@@ -117,11 +123,19 @@ class Solution:
     scale: float = 1.0
     iterations: int = -1
     times: Times = Times()
+    claim: Status | None = None
 
     @property
     def has_point(self) -> bool:
         """Whether there is a point at all."""
         return bool(self.values)
+
+    @property
+    def false_claim(self) -> bool:
+        """Whether the solver claimed a success, or infeasibility, and our measurements took it back."""
+        if self.claim in (Status.OPTIMAL, Status.LOCAL):
+            return self.status not in (Status.OPTIMAL, Status.LOCAL)
+        return self.claim is Status.INFEASIBLE and self.status is Status.FAILED
 
     @property
     def proof(self) -> bool:

@@ -80,7 +80,8 @@ def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: 
 def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, settings: Settings, seconds: float,
              prove: bool, separate: bool) -> Solution:
     base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
-                    iterations=answer.iterations, times=Times(solve=seconds))
+                    iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
+                    claim=answer.status)
     values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
     if not values:
         status, reason = _without_point(program, answer, back_end.name)
@@ -106,7 +107,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
                    values=point.values, duals=point.duals, objective=point.objective, bound=bound,
                    residuals=point.residuals,
-                   times=Times(solve=seconds, judge=judged - clock, prove=done - judged))
+                   times=replace(base.times, judge=judged - clock, prove=done - judged))
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class Answer:
         values: {variable: array}, empty without a point.
         duals: {constraint: flat multipliers}; may be incomplete.
         iterations: -1 where unknown.
+        compile: seconds of the call that translated the programme for the solver; nan where they are not told apart.
     """
 
     status: Status
@@ -56,6 +57,7 @@ class Answer:
     values: Mapping[str, np.ndarray] = field(default_factory=dict)
     duals: Mapping[str, np.ndarray] = field(default_factory=dict)
     iterations: int = -1
+    compile: float = float("nan")
 
 
 @dataclass(frozen=True)

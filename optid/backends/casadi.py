@@ -8,6 +8,7 @@ CasADi's other solvers are not offered because they do not pass `optid.conforman
 infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay at the start.
 """
 
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
@@ -302,11 +303,13 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     Returns:
         The solver's claim with values and multipliers in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
+    clock = time.perf_counter()
     form = smooth(program.problem)
     chosen = options(name, settings)
     if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
         chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
     solver = _compiled(name, form, chosen)
+    compiling = time.perf_counter() - clock
     lower, upper = form.bounds
     row_lower, row_upper = form.row_bounds
     found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
@@ -314,10 +317,10 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     word, status = _status(statistics)
     iterations = int(statistics.get("iter_count", -1))
     if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations)
+        return Answer(status, word, iterations=iterations, compile=compiling)
     values, duals = form.restore(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
     named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
-    return Answer(status, word, named, by_name(program.constraints, duals), iterations)
+    return Answer(status, word, named, by_name(program.constraints, duals), iterations, compiling)
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:

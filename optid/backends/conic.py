@@ -103,14 +103,16 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
     status = STATUS.get(problem.status, Status.FAILED)
     statistics = problem.solver_stats
+    compiling = float("nan") if problem.compilation_time is None else float(problem.compilation_time)
     iterations = getattr(statistics, "num_iters", None)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT) or any(
         v.value is None for v in program.variables.values()
     ):
-        return Answer(status, problem.status, iterations=iterations if iterations is not None else -1)
+        return Answer(status, problem.status, iterations=iterations if iterations is not None else -1,
+                      compile=compiling)
     duals = {} if name in WITHOUT_DUALS else program.duals()
     return Answer(status, problem.status, program.values(), duals,
-                  int(iterations) if iterations is not None else -1)
+                  int(iterations) if iterations is not None else -1, compiling)
 
 
 def family() -> list[BackEnd]:

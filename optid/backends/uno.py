@@ -4,6 +4,7 @@ CVXPY's own interface to Uno reports "optimal" for any terminated run, infeasibl
 returns no multipliers. Here the status of the *point* decides the claim.
 """
 
+import time
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -35,6 +36,7 @@ def run(program: Program, settings: Settings) -> Answer:
         settings: what is asked.
     """
     unopy: Any = import_module("unopy")
+    clock = time.perf_counter()
     form = smooth(program.problem)
     start, _ = form.start(), form.parameter_values()
     engine = derivatives(form)
@@ -44,16 +46,18 @@ def run(program: Program, settings: Settings) -> Answer:
     solver.set_preset(chosen.pop("preset"))
     for name, value in chosen.items():
         solver.set_option(name, value)
-    result = solver.optimize(_model(unopy, form, engine, start))
+    model = _model(unopy, form, engine, start)
+    compiling = time.perf_counter() - clock
+    result = solver.optimize(model)
     word, status = _status(str(result.optimization_status), str(result.solution_status))
     iterations = int(result.number_iterations)
     if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations)
+        return Answer(status, word, iterations=iterations, compile=compiling)
     x = np.array(list(result.primal_solution))
     multipliers = np.array(list(result.constraint_dual_solution))
     values, duals = form.restore(x, multipliers)
     named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
-    return Answer(status, word, named, by_name(program.constraints, duals), iterations)
+    return Answer(status, word, named, by_name(program.constraints, duals), iterations, compiling)
 
 
 def options(settings: Settings) -> dict[str, Any]:

@@ -1,0 +1,47 @@
+"""What a solution keeps of the solver's claim, and the times of compiling."""
+
+import math
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from optid.backends import Answer, BackEnd
+from optid.program import Program, View
+from optid.solution import Solution, Status
+from optid.solving import solve
+
+
+def _program():
+    x = cp.Variable(2, name="x")
+    objective = cp.Minimize(cp.sum_squares(x - np.array([1.0, 2.0])))
+    return Program("small", objective, {"sum": (cp.sum(x) == 2.0,)}, {"x": x}, {"x": np.ones(2)}, dict,
+                   View({"x": x}, kind="exact"), frozenset({"sum"}))
+
+
+def _claiming(status, values):
+    return BackEnd("liar", frozenset({"QP"}), lambda program, settings: Answer(status, "trust me", values))
+
+
+@pytest.mark.parametrize("status, x, false", [
+    (Status.OPTIMAL, [9.0, 9.0], True),
+    (Status.OPTIMAL, [math.nan, 1.0], True),
+    (Status.LIMIT, [9.0, 9.0], False),
+    (Status.INFEASIBLE, [0.5, 1.5], True),
+    (Status.UNBOUNDED, None, False),
+])
+def test_a_claim_that_is_taken_back_is_false(status, x, false):
+    values = {} if x is None else {"x": np.array(x)}
+    solution = solve(_program(), _claiming(status, values))
+    assert solution.claim is status and solution.false_claim is false
+
+
+def test_nothing_claimed_is_not_false():
+    assert not Solution(Status.FAILED, "", "").false_claim
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "ipopt", "osqp"])
+def test_compiling_is_told_apart_and_part_of_the_solve(solver):
+    times = solve(_program(), solver).times
+    assert 0.0 < times.compile <= times.solve
+    assert times.total == pytest.approx(times.build + times.solve + times.judge + times.prove)
