@@ -45,6 +45,7 @@ def _row(rng: np.random.Generator, k: int, turn: int, data: str, formulation: st
     row: dict[str, Any] = dict(
         key=f"{place(*labels[:-1]):0<64}", repetition=repetition, place=hashed, study="synthetic", data=data,
         formulation=formulation, solver=solver, system=system or None, file=None if system else f"{data}.csv",
+        data_hash=None if system else place(data),
         samples=samples, noise=noise, seed=seed, formulation_name=name, options=as_json({"na": 2, "nb": 2}),
         constraints="[]", solver_name=solver, solver_options="{}", accuracy=1e-8, warm=True, holdout=0.3,
         time_limit=60.0, memory_limit=2000.0, n_samples=samples or 1500, n_estimation=int(0.7 * (samples or 1500)),
@@ -91,7 +92,8 @@ def _row(rng: np.random.Generator, k: int, turn: int, data: str, formulation: st
         "objective": objective, "bound": best if proved else None, "gap": error if proved else None,
         "violation": error if lies else 0.0, "stationarity": error, "complementarity": 0.0,
         "one_step_fit": fit, "one_step_fits": as_json([fit]), "simulation_fit": fit - 3.0,
-        "simulation_fits": as_json([fit - 3.0]), "poles": as_json([pole, [pole[0], -pole[1]]]), "stable": True})
+        "simulation_fits": as_json([fit - 3.0]), "parameters": as_json({"a1": -2 * pole[0], "mu[u]": [0.0, 1.0]}),
+        "poles": as_json([pole, [pole[0], -pole[1]]]), "stable": True})
 
 
 def hash_of(*labels: Any) -> int:

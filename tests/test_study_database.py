@@ -5,7 +5,7 @@ import pytest
 from study_rows import rows
 
 from optid.studies import database
-from optid.studies.database import DatabaseError, append, export, finished, opened, read_rows
+from optid.studies.database import DatabaseError, append, data_hashes, export, finished, opened, read_rows
 from optid.studies.rows import COLUMNS, NAMES
 
 duckdb = pytest.importorskip("duckdb")
@@ -34,6 +34,14 @@ def test_rows_come_back_as_they_went_in(path):
             empty = 0.0 if column.kind == "flag" else np.nan
             np.testing.assert_array_equal(got.astype(float), [empty if value is None else value for value in want])
     assert found["repetition"].dtype == np.int64 and found["proved"].dtype == bool
+
+
+def test_hashes_of_data_files_by_study_and_label(path):
+    assert data_hashes(path) == {}
+    made = rows(200)
+    append(path, made)
+    expected = {("synthetic", row["data"]): {row["data_hash"]} for row in made if row["data_hash"]}
+    assert expected and data_hashes(path) == expected
 
 
 def test_ten_thousand_rows_are_written_and_read_quickly(path):

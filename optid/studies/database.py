@@ -79,8 +79,6 @@ def _create(connection: "duckdb.DuckDBPyConnection") -> None:
     connection.execute("BEGIN")
     connection.execute(f"CREATE TABLE rows ({columns}, PRIMARY KEY (key, repetition))")
     connection.execute(f"CREATE TABLE superseded ({columns})")
-    connection.execute("CREATE TABLE sources (study VARCHAR, data VARCHAR, file VARCHAR, hash VARCHAR, "
-                       "PRIMARY KEY (study, data))")
     connection.execute("CREATE TABLE studies (study VARCHAR PRIMARY KEY, description VARCHAR)")
     connection.execute("CREATE TABLE meta (name VARCHAR PRIMARY KEY, value VARCHAR)")
     connection.executemany("INSERT INTO meta VALUES (?, ?)", [("schema version", str(SCHEMA_VERSION)),
@@ -203,6 +201,22 @@ def finished(path: str | Path) -> set[tuple[str, int]]:
         return set()
     with opened(path) as connection:
         return {(key, int(number)) for key, number in connection.execute("SELECT key, repetition FROM rows").fetchall()}
+
+
+def data_hashes(path: str | Path) -> dict[tuple[str, str], set[str]]:
+    """Return {(study, data label): hashes of the data files that the rows were made from}; simulated data have none.
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    if not Path(path).exists():
+        return {}
+    with opened(path) as connection:
+        found = connection.execute("SELECT DISTINCT study, data, data_hash FROM rows WHERE data_hash <> ''").fetchall()
+    hashes: dict[tuple[str, str], set[str]] = {}
+    for study, data, value in found:
+        hashes.setdefault((study, data), set()).add(value)
+    return hashes
 
 
 def export(path: str | Path, target: str | Path) -> int:

@@ -70,7 +70,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("solver", "text", "label of the solver entry", always=True),
     # what was run
     Column("system", "text", "simulated system; empty for a file"),
-    Column("file", "text", "data file; empty for a simulated system"),
+    Column("file", "text", "data file, or several with a comma between them; empty for a simulated system"),
+    Column("data_hash", "text", "SHA-256 of the bytes of the data files; empty for a simulated system"),
     Column("samples", "integer", "requested length of a simulated record"),
     Column("noise", "number", "standard deviation of the noise relative to that of the noise-free output"),
     Column("seed", "integer", "seed of the simulation"),
@@ -139,6 +140,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("parameter_error", "number", "relative error of the linear part against the truth, in a common gauge"),
     Column("nonlinearity_error", "number", "relative error of the nonlinearity against the truth, in a common gauge"),
     Column("poles", "json", "poles of the linear part, a list of [real, imaginary]"),
+    Column("parameters", "json", "coefficients of the linear part by name, mu[input] of nonlinearities as lists"),
     Column("stable", "flag", "whether every pole lies inside the unit circle; empty without a model"),
     # when and where
     Column("started", "time", "when the cell started, UTC", always=True),
