@@ -1,7 +1,7 @@
 """What a study is made of: data, formulations and solvers with their labels, and what holds for every cell."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from optid.data import Data
 
 @dataclass(frozen=True)
 class DataEntry:
-    """One entry of the data axis: a file, a record in memory, or a simulated system at several lengths and noises.
+    """One entry of the data axis: files, a record in memory, or a simulated system at several lengths and noises.
 
     Attributes:
         name: its label.
@@ -19,13 +19,13 @@ class DataEntry:
         record: a record in memory, from Python only.
         samples: lengths of the simulated records; empty for the system's own.
         noise: standard deviations of the noise relative to the noise-free output; empty for the system's own.
-        options: how the file is read: inputs, outputs, dt, time, experiment, columns, delimiter, decimal.
+        options: how the files are read: inputs, outputs, dt, time, experiment, columns, delimiter, decimal.
     """
 
     name: str
     files: tuple[str, ...] = ()
     system: str | None = None
-    record: Data | None = field(default=None, repr=False, compare=False)
+    record: Data | None = field(default=None, repr=False)
     samples: tuple[int, ...] = ()
     noise: tuple[float, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -40,12 +40,14 @@ class FormulationEntry:
         formulation: registered name.
         constraints: named constraints as texts, such as "monotone:increasing".
         options: arguments of the formulation in the words of the command line, such as basis = "triangular:8".
+        data: labels of the data entries it is for; empty for all.
     """
 
     name: str
     formulation: str
     constraints: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
+    data: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,19 +71,28 @@ class SolverEntry:
 class Study:
     """A grid of data x formulations x solvers x seeds, and the limits that hold for every cell.
 
+    From Python the axes may be written more simply, and are entries once the study is built:
+
+        optid.Study("rig", data={"rig": optid.read("rig.csv")}, solvers="all",
+                    formulations={"formulation": "arx", "na": 2, "nb": 2})
+
     Attributes:
         name: title of the study.
-        data: the data axis.
-        formulations: the formulation axis.
-        solvers: the solver axis.
+        data: the data axis; given as one or several of: `Data`, name of a simulated system, file name, mapping with the
+            keys of [[data]] in a study file, {label: any of these}.
+        formulations: the formulation axis; given as mappings with the keys of [[formulation]].
+        solvers: the solver axis; given as words or mappings with the keys of [[solver]]; "all" for every installed one.
         accuracy: requested relative accuracies; every solver is run at each.
         time_limit: seconds a cell may take.
         memory_limit: MB a cell may take.
         repetitions: how often a cell is run, for its times.
         warm: whether a cell is also solved a second time from its own solution.
-        seeds: of the simulated records.
+        seeds: of the simulated records; their number, or a list of them.
         holdout: share of a record that the fit does not see.
         folder: where relative file names start.
+
+    Raises:
+        StudyError: lists everything that is wrong. Whether the files can be read is found out by `check_data`.
     """
 
     name: str
@@ -96,3 +107,84 @@ class Study:
     seeds: tuple[int, ...] = (0,)
     holdout: float = 0.3
     folder: Path = field(default_factory=Path, compare=False)
+
+    def __post_init__(self) -> None:
+        from optid.studies.entries import read
+        from optid.studies.problems import Problems
+        from optid.studies.writing import as_raw
+
+        problems = Problems()
+        found = read(as_raw({f.name: getattr(self, f.name) for f in fields(self)}, problems), problems)
+        problems.told(f"study {self.name!r}")
+        for key, value in found.items():
+            object.__setattr__(self, key, value)
+        object.__setattr__(self, "folder", Path(self.folder))
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> "Study":
+        """Read a study file.
+
+        Args:
+            path: of the file; relative data files are looked for beside it.
+
+        Raises:
+            StudyError: every problem with its line and column; data that cannot be read count as such.
+        """
+        from optid.studies.study_file import read_study
+
+        return read_study(Path(path))
+
+    @classmethod
+    def from_text(cls, text: str, folder: str | Path = ".", label: str = "the study") -> "Study":
+        """Read a study from TOML text.
+
+        Args:
+            text: what a study file holds.
+            folder: where relative data files are looked for.
+            label: what the text is called in messages.
+
+        Raises:
+            StudyError: as for `from_toml`.
+        """
+        from optid.studies.study_file import parse_study
+
+        return parse_study(text, Path(folder), label)
+
+    def to_toml(self) -> str:
+        """Return the study as the text of a study file, which `from_text` reads back.
+
+        Raises:
+            StudyError: a record in memory, which no file holds.
+        """
+        from optid.studies.writing import as_toml
+
+        return as_toml(self)
+
+    def check_data(self) -> None:
+        """Read every data file once.
+
+        Raises:
+            StudyError: lists the files and columns that are not there or cannot be read.
+        """
+        from optid.studies.problems import Problems
+        from optid.studies.study_file import note_unreadable
+
+        problems = Problems()
+        note_unreadable(self, problems)
+        problems.told(f"study {self.name!r}")
+
+    def run(self, db: str | Path | None = None, **settings: Any) -> Any:
+        """Run what is left of the study and return its rows.
+
+        Args:
+            db: database file, from which an interrupted study goes on; a temporary one when not given.
+            settings: workers, scheduler, progress and accept_changed_data of `optid.studies.running.run`.
+
+        Returns:
+            A pandas frame with the columns of `optid.studies.rows`; a list of dictionaries where pandas is not
+            installed.
+        """
+        from optid.studies.running import run_to_frame
+
+        return run_to_frame(self, db, **settings)
+

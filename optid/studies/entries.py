@@ -1,0 +1,300 @@
+"""From what a user writes, in a file or in Python, to the entries of a study; every problem is noted, none stops it."""
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import PurePath
+from typing import Any
+
+from optid.backends import back_ends
+from optid.bases import parse
+from optid.data import Data
+from optid.errors import OptidError, nearest
+from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.positions import Path
+from optid.studies.problems import Problems, one_or_several, shown
+from optid.studies.systems import SYSTEMS
+
+AUTO, ALL = "auto", "all"
+
+READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")
+"""Keys of a data entry that say how its files are read."""
+
+_TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout", "data",
+        "formulation", "solver", "solvers")
+_DATA = ("name", "file", "system", "samples", "noise", *READING)
+_FORMULATION = ("name", "formulation", "constraints", "data")
+_SOLVER = ("name", "solver", "accuracy", "options")
+
+_KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
+    (bool, "bool", "true or false"),
+    (int, "int float", "a whole number"),
+    (float, "float", "a number"),
+    (str, "str", "a text"),
+    ((list, tuple), "Sequence list tuple", "a list"),
+)
+"""Types of a value, the words of an annotation that take it, and its words for people."""
+
+
+def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
+    """Return the arguments of a `Study` for a raw description.
+
+    Args:
+        raw: keys and values as in a study file.
+        problems: collects what is wrong; what is returned is usable only if nothing is.
+    """
+    for key in raw:
+        if key not in _TOP:
+            problems.add((key,), _unknown(key, _TOP), value=False)
+    found: dict[str, Any] = {}
+    if "name" in raw:
+        found["name"] = problems.text(("name",), raw["name"])
+    for key, what in (("time_limit", "a positive number of seconds"), ("memory_limit", "a positive number of MB")):
+        if key in raw:
+            found[key] = problems.number((key,), raw[key], what, 0.0)
+    if "holdout" in raw:
+        found["holdout"] = problems.number(("holdout",), raw["holdout"], "a share from 0 and below 1", 0.0, 1.0,
+                                           closed=True)
+    if "repetitions" in raw:
+        found["repetitions"] = problems.whole(("repetitions",), raw["repetitions"], 1)
+    if "warm" in raw:
+        found["warm"] = problems.flag(("warm",), raw["warm"])
+    if "accuracy" in raw:
+        found["accuracy"] = _accuracies(("accuracy",), raw["accuracy"], problems)
+    if "seeds" in raw:
+        found["seeds"] = _seeds(raw["seeds"], problems)
+    data = tuple(_data(("data", i), entry, problems) for i, entry in enumerate(_tables("data", raw, problems)))
+    names = [entry.name for entry in data]
+    found["data"] = data
+    found["formulations"] = tuple(_formulation(("formulation", i), entry, names, problems)
+                                  for i, entry in enumerate(_tables("formulation", raw, problems)))
+    found["solvers"] = tuple(_solvers(raw, problems))
+    for axis, key in (("data", "data"), ("formulations", "formulation"), ("solvers", "solver")):
+        _distinct(key, found[axis], raw, problems)
+    return found
+
+
+def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mapping[str, Any]]:
+    entries = raw.get(key, [])
+    if not entries and key != "solver":
+        problems.add((), f"there is no [[{key}]]: a study needs at least one", value=False)
+        return []
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        problems.add((key,), f"{key} is written as one or more tables [[{key}]]; {shown(entries)} is not")
+        return []
+    return entries
+
+
+def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
+    record = raw.get("record")
+    in_memory = isinstance(record, Data)
+    for key in raw:
+        if key not in _DATA and not (key == "record" and in_memory):
+            problems.add((*path, key), _unknown(key, _DATA), value=False)
+    sources = [key for key in ("file", "system") if key in raw] + ["record"] * in_memory
+    if len(sources) != 1:
+        problems.add(path, f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}",
+                     value=False)
+    files = problems.texts((*path, "file"), raw["file"]) if "file" in raw else ()
+    system = problems.text((*path, "system"), raw["system"]) if "system" in raw else None
+    if system is not None and system not in SYSTEMS:
+        problems.add((*path, "system"), f"no system is called {system!r}. {nearest(system, SYSTEMS)}")
+    for key in ("samples", "noise") if system is None and sources else READING if "file" not in raw else ():
+        if key in raw:
+            which = "a simulated system" if key in ("samples", "noise") else "a file"
+            problems.add((*path, key), f"{key} is for {which}, which this entry is not", value=False)
+    samples = [problems.whole((*path, "samples", i), value, 1)
+               for i, value in enumerate(one_or_several(raw.get("samples", [])))]
+    noise = [problems.number((*path, "noise", i), value, "a number from 0, relative to the noise-free output", 0.0,
+                             closed=True) for i, value in enumerate(one_or_several(raw.get("noise", [])))]
+    default = system or (PurePath(files[0]).stem if files else getattr(record, "name", "") or "record")
+    return DataEntry(
+        _label(path, raw, default, problems), files, system, record if in_memory else None,
+        tuple(value for value in samples if value is not None), tuple(value for value in noise if value is not None),
+        {key: _reading((*path, key), raw[key], problems) for key in READING if key in raw},
+    )
+
+
+def _reading(path: Path, value: Any, problems: Problems) -> Any:
+    """Check one key that says how a file is read."""
+    key = path[-1]
+    if key == "dt":
+        return problems.number(path, value, "a positive number", 0.0)
+    if key in ("inputs", "outputs", "columns"):
+        if isinstance(value, Mapping) and key != "columns":
+            return {str(name): problems.text((*path, name), column) for name, column in value.items()}
+        return list(problems.texts(path, value))
+    if key == "time" and value is False:
+        return value
+    if key in ("delimiter", "decimal") and isinstance(value, str) and len(value) == 1:
+        return value
+    return problems.text(path, value)
+
+
+def _formulation(path: Path, raw: Mapping[str, Any], data: Sequence[str], problems: Problems) -> FormulationEntry:
+    name = problems.text((*path, "formulation"), raw["formulation"]) if "formulation" in raw else None
+    known = registered(FORMULATIONS)
+    options = {key: value for key, value in raw.items() if key not in _FORMULATION}
+    if "formulation" not in raw:
+        problems.add(path, "[[formulation]] needs formulation = \"NAME\" (optid formulations lists them)", value=False)
+    elif name is not None and name not in known:
+        problems.add((*path, "formulation"), f"no formulation is called {name!r}. {nearest(name, known)}")
+    elif name is not None:
+        try:
+            _arguments(path, name, known[name].load(), options, "constraints" in raw, problems)
+        except Exception as error:  # a broken plug-in is told like everything else
+            problems.add((*path, "formulation"),
+                         f"formulation {name!r} cannot be loaded: {type(error).__name__}: {error}")
+    constraints = problems.texts((*path, "constraints"), raw["constraints"]) if "constraints" in raw else ()
+    for i, text in enumerate(constraints):
+        _constraint((*path, "constraints", i), text, problems)
+    only = problems.texts((*path, "data"), raw["data"]) if "data" in raw else ()
+    for i, label in enumerate(only):
+        if label not in data:
+            problems.add((*path, "data", i), f"no [[data]] is called {label!r}. {nearest(label, data)}")
+    default = " + ".join([name or "formulation", *constraints])
+    return FormulationEntry(_label(path, raw, default, problems), name or "", constraints, options, only)
+
+
+def _constraint(path: Path, text: str, problems: Problems) -> None:
+    word = text.partition(":")[0]
+    known = registered(CONSTRAINTS)
+    if word not in known:
+        problems.add(path, f"no constraint is called {word!r}. {nearest(word, known)}")
+        return
+    try:
+        named_constraint(text)
+    except Exception as error:  # whatever a builder of a third party raises
+        problems.add(path, f"constraint {text!r}: {error}")
+
+
+def _arguments(path: Path, name: str, function: Callable[..., Any], options: Mapping[str, Any], constrained: bool,
+               problems: Problems) -> None:
+    """Check the options of a formulation by its signature, and bases by their names."""
+    parameters = inspect.signature(function).parameters
+    takes = {key: p for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        return
+    if constrained and "constraints" not in takes:
+        problems.add((*path, "constraints"), f"formulation {name!r} takes no constraints", value=False)
+    for key, value in options.items():
+        if key not in takes:
+            known = [*takes, *_FORMULATION]
+            problems.add((*path, key), f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}",
+                         value=False)
+            continue
+        if (wanted := _misfit(takes[key].annotation, value)) is not None:
+            problems.add((*path, key), f"{key} is {wanted}; {shown(value)} is not")
+        elif "basis" in key:
+            for i, text in enumerate(one_or_several(value)):
+                _basis((*path, key, i), text, problems)
+    missing = [key for key, p in takes.items() if p.default is p.empty and key not in options]
+    if missing:
+        problems.add(path, f"formulation {name!r} needs {', '.join(missing)}", value=False)
+
+
+def _misfit(annotation: Any, value: Any) -> str | None:
+    """What a value of the annotation would be, where this one is none; None where it is or cannot be told."""
+    words = set(re.findall(r"\w+", annotation if isinstance(annotation, str) else
+                           annotation.__name__ if isinstance(annotation, type) else str(annotation)))
+    if annotation is inspect.Parameter.empty or "Any" in words or not words & {"bool", "int", "float", "str"}:
+        return None
+    for kind, takers, _ in _KINDS:
+        if isinstance(value, kind):
+            if words & set(takers.split()):
+                return None
+            break
+    else:
+        return None  # a table or a date: the formulation says
+    return " or ".join(word for _, takers, word in _KINDS if words & {takers.split()[0]})
+
+
+def _basis(path: Path, text: Any, problems: Problems) -> None:
+    if not isinstance(text, str):
+        problems.add(path, f"a basis is a text such as \"triangular:10\"; {shown(text)} is not")
+        return
+    if text == "none":  # an output that is not fed back
+        return
+    try:
+        parse(text)
+    except OptidError as error:
+        problems.add(path, str(error))
+
+
+def _solvers(raw: Mapping[str, Any], problems: Problems) -> list[SolverEntry]:
+    found = []
+    if "solvers" in raw:
+        words = problems.texts(("solvers",), raw["solvers"])
+        if words == (ALL,):
+            words = tuple(name for name, back_end in sorted(back_ends().items()) if back_end.installed)
+        for i, word in enumerate(words):
+            found.append(SolverEntry(word, _solver(("solvers", i), word, problems)))
+    for i, entry in enumerate(_tables("solver", raw, problems)):
+        found.append(_solver_entry(("solver", i), entry, problems))
+    if "solvers" not in raw and not raw.get("solver"):
+        problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]",
+                     value=False)
+    return found
+
+
+def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> SolverEntry:
+    for key in raw:
+        if key not in _SOLVER:
+            problems.add((*path, key), _unknown(key, _SOLVER) + " Native options of the solver go into "
+                         "options = { ... }.", value=False)
+    word = problems.text((*path, "solver"), raw["solver"]) if "solver" in raw else None
+    if "solver" not in raw:
+        problems.add(path, "[[solver]] needs solver = \"NAME\" (optid solvers lists them)", value=False)
+    name = word and _solver((*path, "solver"), word, problems)
+    options = raw.get("options", {})
+    if not isinstance(options, Mapping):
+        problems.add((*path, "options"), f"options is a table, {{ key = value }}; {shown(options)} is not")
+        options = {}
+    accuracy = _accuracies((*path, "accuracy"), raw["accuracy"], problems) if "accuracy" in raw else ()
+    return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
+
+
+def _solver(path: Path, word: str, problems: Problems) -> str:
+    known = [AUTO, *back_ends()]
+    if word.lower() not in known:
+        problems.add(path, f"no solver is called {word!r}. {nearest(word.lower(), known)}")
+    return word.lower()
+
+
+def _accuracies(path: Path, value: Any, problems: Problems) -> tuple[float, ...]:
+    several = one_or_several(value)
+    numbers = [problems.number((*path, i), one, "a number between 0 and 1", 0.0, 1.0) for i, one in enumerate(several)]
+    if not several:
+        problems.add(path, "accuracy is empty; give at least one number")
+    return tuple(number for number in numbers if number is not None)
+
+
+def _seeds(value: Any, problems: Problems) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple | range):
+        count = problems.whole(("seeds",), value, 1)
+        return tuple(range(count or 1))
+    seeds = [problems.whole(("seeds", i), seed, 0) for i, seed in enumerate(value)]
+    if not seeds:
+        problems.add(("seeds",), "seeds is empty; give their number or a list of them")
+    return tuple(seed for seed in seeds if seed is not None)
+
+
+def _label(path: Path, raw: Mapping[str, Any], default: str, problems: Problems) -> str:
+    return (problems.text((*path, "name"), raw["name"]) if "name" in raw else None) or default
+
+
+def _distinct(key: str, entries: Sequence[Any], raw: Mapping[str, Any], problems: Problems) -> None:
+    """Refuse two entries with one label; solvers listed at the top come before the tables."""
+    seen: set[str] = set()
+    listed = len(entries) - len(raw.get("solver", [])) if key == "solver" else 0
+    for i, entry in enumerate(entries):
+        if entry.name in seen:
+            path: Path = ("solvers", i) if i < listed else (key, i - listed)
+            problems.add(path, f"two entries are called {entry.name!r}; give this one another name = \"...\"",
+                         value=False)
+        seen.add(entry.name)
+
+
+def _unknown(key: str, known: Sequence[str]) -> str:
+    return f"unknown key {key!r}. {nearest(key, known)}"

@@ -1,0 +1,121 @@
+"""What is wrong with the description of a study, collected so that everything is told at once."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.errors import StudyError
+from optid.studies.positions import Path, Positions
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong.
+
+    Attributes:
+        path: keys that lead to it; positions in lists are counted from 0.
+        text: what is wrong and what would be right.
+        value: whether it is the value that is wrong, rather than the key.
+    """
+
+    path: Path
+    text: str
+    value: bool = False
+
+
+class Problems(list[Problem]):
+    """All of them, in the order in which they are found."""
+
+    def add(self, path: Path, text: str, value: bool = True) -> None:
+        """Note one problem."""
+        self.append(Problem(path, text, value))
+
+    def told(self, label: str, positions: Positions | None = None) -> None:
+        """Raise what was found, with line and column where the text is known.
+
+        Raises:
+            StudyError: one line per problem.
+        """
+        if not self:
+            return
+        if positions is None:
+            lines = [f"{written(problem.path)}: {problem.text}" if problem.path else problem.text for problem in self]
+        else:
+            places = sorted(((positions.of(problem.path, problem.value), problem.text) for problem in self),
+                            key=lambda found: found[0])
+            lines = [f"line {line}, column {column}: {text}" for (line, column), text in places]
+        lines = list(dict.fromkeys(lines))
+        count = f"{len(lines)} problems" if len(lines) > 1 else "a problem"
+        raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
+
+    # -- values of one type ----------------------------------------------------------------------------------------
+
+    def text(self, path: Path, value: Any) -> str | None:
+        """Return a text that is not empty, or note a problem."""
+        if isinstance(value, str) and value.strip():
+            return value
+        self.add(path, f"{path[-1]} is a text; {shown(value)} is not")
+        return None
+
+    def texts(self, path: Path, value: Any) -> tuple[str, ...]:
+        """Return a text or a list of texts as a tuple, or note a problem."""
+        if isinstance(value, str) and value.strip():
+            return (value,)
+        if isinstance(value, list | tuple) and all(isinstance(entry, str) and entry.strip() for entry in value):
+            return tuple(value)
+        self.add(path, f"{path[-1]} is a text or a list of texts; {shown(value)} is not")
+        return ()
+
+    def flag(self, path: Path, value: Any) -> bool | None:
+        """Return true or false, or note a problem."""
+        if isinstance(value, bool):
+            return value
+        self.add(path, f"{path[-1]} is true or false; {shown(value)} is not")
+        return None
+
+    def number(self, path: Path, value: Any, what: str, low: float, high: float = np.inf, *, closed: bool = False
+               ) -> float | None:
+        """Return a number between low and high, itself included where `closed`, or note a problem."""
+        fits = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        if fits and (low < value < high or (closed and value == low)):
+            return float(value)
+        self.add(path, f"{_last_word(path)} is {what}; {shown(value)} is not")
+        return None
+
+    def whole(self, path: Path, value: Any, low: int) -> int | None:
+        """Return a whole number from low, or note a problem."""
+        if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
+            return int(value)
+        self.add(path, f"{_last_word(path)} is a whole number from {low}; {shown(value)} is not")
+        return None
+
+
+def one_or_several(value: Any) -> Sequence[Any]:
+    """Return a list as it is, anything else as the only entry of one."""
+    return list(value) if isinstance(value, list | tuple | range | np.ndarray) else [value]
+
+
+def shown(value: Any) -> str:
+    """Write a value as people call it."""
+    if isinstance(value, str):
+        return f"the text {value!r}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return "a table"
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def written(path: Path) -> str:
+    """Write a path as Python does: data[0].noise."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def _last_word(path: Path) -> str:
+    return next((part for part in reversed(path) if isinstance(part, str)), "")
