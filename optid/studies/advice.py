@@ -1,0 +1,202 @@
+"""The verdict in words: recommendations with the numbers they rest on, warnings, and what cannot be told."""
+
+from dataclasses import dataclass
+
+from optid.showing.wording import seconds
+from optid.studies.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
+from optid.studies.quality import Quality
+from optid.studies.standings import Section, Standing
+
+GOOD, FAIR, BAD = "good", "fair", "bad"
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One sentence or two.
+
+    Attributes:
+        tone: "good", "fair" or "bad".
+        word: the heading: what to do.
+        text: why, with the numbers.
+        about: "solver", "formulation", "data sets", "claims".
+    """
+
+    tone: str
+    word: str
+    text: str
+    about: str
+
+
+def of(n: int, total: int, noun: str = "problem") -> str:
+    """Write "3 of 4 problems"; "all 4 problems" where nothing is missing."""
+    plural = noun if total == 1 else noun + "s"
+    if n == total:
+        return f"the only {noun}" if total == 1 else f"all {total:,} {plural}"
+    return f"{n:,} of {total:,} {plural}"
+
+
+def choice_of_solver(section: Section) -> Statement:
+    """Say which solver to use on the problems of a section, or why that cannot be told."""
+    choice, n = section.choice, len(section.found.data)
+    if not n:
+        agreed = " Every problem is infeasible, and the solvers agree." if section.infeasible else ""
+        return Statement(FAIR, "Nothing to compare", f"There is no run of a solver.{agreed}", "solver")
+    if choice.kind == NOBODY:
+        common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
+        text = f"No solver reached the accuracy on any of {n:,} problems ({common})."
+        return Statement(BAD, "No solver can be recommended", text, "solver")
+    if not choice.first:
+        return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
+    lead = section.standing(choice.first)
+    solved = f"{lead.solver} reached the accuracy on {of(lead.solved, n)}{_median(lead)}"
+    if choice.kind == ONLY_ONE:
+        return Statement(_tone(lead, n), "Only one solver", f"{solved}. There is nothing to compare it with.", "solver")
+    if choice.kind == CANNOT_TELL:
+        return Statement(FAIR, "Cannot tell yet", f"The comparison {choice.missing}. So far {solved}.", "solver")
+    if choice.kind == TIE:
+        names = (choice.first, *choice.tied)
+        each = "; ".join(f"{name} {_against(section, name)}" for name in choice.tied[:3])
+        text = f"{solved}. No difference in time beyond chance or 10 %: {each}.{_claims(section, names)}"
+        return Statement(_tone(lead, n), f"A tie: {listed(names)}", text, "solver")
+    return Statement(_tone(lead, n), f"Use {choice.first}",
+                     f"{solved}. {_runner_up(section)}{_quicker(section)}{_claims(section, (choice.first,))}".rstrip(),
+                     "solver")  # fmt: skip
+
+
+def _tone(lead: Standing, n: int) -> str:
+    return GOOD if lead.solved >= 0.95 * n and not lead.false_claims else FAIR if lead.solved >= 0.5 * n else BAD
+
+
+def _median(standing: Standing) -> str:
+    return f", in {seconds(standing.time)} on average" if standing.time == standing.time else ""
+
+
+def _failures(section: Section) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for standing in section.standings:
+        for word, count in standing.failures.items():
+            total[word] = total.get(word, 0) + count
+    return dict(sorted(total.items(), key=lambda item: -item[1])[:4])
+
+
+def times_as(value: float) -> str:
+    """Write a ratio of times in words."""
+    if 0.995 <= value <= 1.005:
+        return "the same time"
+    return f"{value:.3g} times the time" if value < 10 else f"{value:.0f} times the time"
+
+
+def _against(section: Section, name: str) -> str:
+    pair = section.choice.against[name]
+    return f"takes {times_as(pair.value)} (95 %: {pair.low:.2g} to {pair.high:.2g}, {pair.n:,} problems)"
+
+
+def _runner_up(section: Section) -> str:
+    """Compare with the next candidate, or with the one that solved most after the first."""
+    choice = section.choice
+    rivals = [name for name in choice.candidates if name != choice.first]
+    if rivals:
+        name = min(rivals, key=lambda rival: choice.against[rival].value)
+        return f"The next that solves as many, {name}, {_against(section, name)}."
+    others = [s for s in section.standings if s.solver != choice.first]
+    if not any(s.solved for s in others):
+        return f"Nobody else solved any: {listed([s.solver for s in others])}."
+    most = max(others, key=lambda s: s.solved)
+    return f"The next, {most.solver}, solved only {most.solved:,}."
+
+
+def _quicker(section: Section) -> str:
+    """Name a solver that is faster where it works but solves less."""
+    choice, n = section.choice, len(section.found.data)
+    fast = [
+        (pair.value, name)
+        for name, pair in choice.against.items()
+        if name not in choice.candidates and pair.enough and pair.high < 1 and pair.value < 1 / 1.1
+    ]
+    if not fast:
+        return ""
+    value, name = min(fast)
+    return f" {name} is {1 / value:.3g} times faster where both work, but solved only {of(choice.solved[name], n)}."
+
+
+def _claims(section: Section, names: tuple[str, ...]) -> str:
+    false = [(name, section.standing(name).false_claims) for name in names if section.standing(name).false_claims]
+    return "".join(f" Mind that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false: "
+                   "let them be verified." for name, k in false)  # fmt: skip
+
+
+def carries_over(section: Section) -> Statement:
+    """Say whether the order of the solvers carries over to other data sets."""
+    ranking = section.ranking
+    if not ranking.told:
+        text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
+        return Statement(FAIR, "Other data: cannot tell", text, "data sets")
+    p = "below 0.001" if ranking.probability < 0.001 else f"{ranking.probability:.2g}"
+    evidence = f"{ranking.test}, {ranking.n} data sets, probability {p}"
+    if ranking.probability >= ranking.level:
+        text = f"Over the data sets no solver ranks differently from another ({evidence})."
+        return Statement(FAIR, "Other data: no difference", text, "data sets")
+    best = ranking.names[0]
+    same = [name for name in ranking.names[1:] if not ranking.differ(best, name)]
+    text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} ({evidence})"
+    if len(same) == len(ranking.names) - 1:
+        text += "; the ranks differ as a whole, but no other solver is behind it for certain."
+        return Statement(FAIR, "Other data: a tie", text, "data sets")
+    text += f"; {listed(same)} cannot be told apart from it." if same else "; every other ranks behind it for certain."
+    return Statement(GOOD, "Other data: the order holds", text, "data sets")
+
+
+def choice_of_formulation(quality: Quality) -> Statement | None:
+    """Say which formulation gives the best models, or why that cannot be told; None for a single formulation."""
+    choice, n = quality.choice, quality.records
+    if len(quality.formulations) < 2 or not n:
+        return None
+    if choice.kind == NOBODY:
+        text = "No model has a simulation fit on samples it has not seen: keep a hold-out share."
+        return Statement(FAIR, "Models: cannot tell", text, "formulation")
+    if not choice.first:
+        return Statement(FAIR, "Models: cannot tell", f"The comparison {choice.missing}.", "formulation")
+    lead = f"{choice.first} has a mean simulation fit of {quality.figures['simulation_fit'][choice.first].mean:.2f} % "
+    lead += f"on unseen samples of {of(choice.solved[choice.first], n, 'record')}"
+    if choice.kind == CANNOT_TELL:
+        text = f"The comparison {choice.missing}. So far {lead}."
+        return Statement(FAIR, "Models: cannot tell yet", text, "formulation")
+    if choice.kind == TIE:
+        each = "; ".join(f"{name} differs by {-choice.against[name].value:+.2g} points "
+                         f"(95 %: {-choice.against[name].high:+.2g} to {-choice.against[name].low:+.2g})"
+                         for name in choice.tied[:3])  # fmt: skip
+        text = f"{lead}. No difference beyond chance or 0.1 points: {each}."
+        return Statement(GOOD, f"Equal models: {listed((choice.first, *choice.tied))}", text, "formulation")
+    rivals = [name for name in choice.candidates if name != choice.first]
+    if rivals:
+        name = min(rivals, key=lambda rival: choice.against[rival].value)
+        pair = choice.against[name]
+        text = (f"{lead}; the next, {name}, stays {pair.value:.2g} points behind on {pair.n:,} records "
+                f"(95 %: {pair.low:.2g} to {pair.high:.2g}).")  # fmt: skip
+    else:
+        text = f"{lead}; no other was solved on as many."
+    return Statement(GOOD, f"Best models: {choice.first}", text, "formulation")
+
+
+def headline(overall: Section, sections: list[Section]) -> Statement:
+    """Say the verdict in one line: one solver for everything, or that it depends on the formulation."""
+    if len(sections) < 2:
+        return choice_of_solver(overall)
+    choice, n = overall.choice, len(overall.found.data)
+    if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n:
+        return choice_of_solver(overall)
+    picks = [(section, section.choice) for section in sections]
+    decided = [pick for _, pick in picks if pick.kind in (FIRST, TIE, ONLY_ONE)]
+    if not decided:
+        return choice_of_solver(overall)
+    firsts = list(dict.fromkeys(pick.first for pick in decided))
+    if len(firsts) == 1:
+        names = [section.name for section, pick in picks if pick in decided]
+        text = f"{firsts[0]} comes first, or ties for it, in {of(len(decided), len(picks), 'formulation')}: "
+        text += f"{listed(names)}."
+        return Statement(GOOD if len(decided) == len(picks) else FAIR, f"Use {firsts[0]}", text, "solver")
+    named = {first: [section.name for section, pick in picks if pick.first == first] for first in firsts}
+    best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
+    solved = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
+    text = f"{best}. No solver does everything: {solved.solver} solved most, {of(solved.solved, n)}."
+    return Statement(FAIR, "It depends on the formulation", text, "solver")

@@ -1,0 +1,98 @@
+"""Who comes first: reliability before speed, and a tie is called a tie."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optid.studies.averages import MINIMUM_PAIRS, Paired
+
+FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
+RELIABLE = 0.01  # share of the problems by which the number solved may stay behind the most reliable
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The outcome of a comparison.
+
+    Attributes:
+        kind: "first" (one is ahead), "tie" (nobody is ahead of those named), "cannot tell" (too few data; `missing`
+            says which), "only one" (nothing to compare with), "nobody" (not one problem solved).
+        first: who is ahead, of a tie the one with the best mean; "" where there is nobody.
+        tied: the others that cannot be told apart from it.
+        candidates: who solved as many problems as the most reliable, up to `RELIABLE`.
+        against: {name: it against the first, on the problems that both solved}.
+        solved: {name: problems solved}.
+        problems: their number.
+        missing: what is missing to tell.
+    """
+
+    kind: str
+    first: str = ""
+    tied: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
+    against: dict[str, Paired] = field(default_factory=dict)
+    solved: dict[str, int] = field(default_factory=dict)
+    problems: int = 0
+    missing: str = ""
+
+
+def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
+           compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0) -> Choice:
+    """Choose the least costly of the most reliable.
+
+    Args:
+        costs: (P, S), lower is better, ``nan`` where the problem was not solved.
+        names: the S names.
+        minor: a mean comparison closer to ``none`` than this is of no practical meaning.
+        compare: one column of costs against another, such as `paired_ratio`.
+        none: the comparison of equals (1 for ratios, 0 for differences).
+
+    Returns:
+        The choice. Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of
+        their comparison excludes equality and the difference is of practical meaning.
+    """  # fmt: skip
+    counts = np.isfinite(costs).sum(axis=0)
+    solved, problems = {name: int(c) for name, c in zip(names, counts)}, len(costs)
+    if not counts.any():
+        return Choice(NOBODY, solved=solved, problems=problems, missing="needs a solver that reaches the accuracy")
+    reliable = np.flatnonzero(counts >= counts.max() - int(RELIABLE * problems))
+    candidates = tuple(names[s] for s in reliable)
+    common = np.isfinite(costs[:, reliable]).all(axis=1)
+    if not common.any():
+        missing = f"needs a problem that {listed(candidates)} all solve"
+        return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
+    means = [_mean(costs[common, s], compare) for s in reliable]
+    lead = int(reliable[int(np.argmin(means))])
+    against = {names[s]: compare(costs[:, s], costs[:, lead]) for s in np.flatnonzero(counts) if s != lead}
+    tied = tuple(name for name in candidates if name in against and not _apart(against[name], minor, none))
+    kind, missing = (TIE if tied else FIRST), ""
+    if len(names) == 1:
+        kind = ONLY_ONE
+    elif problems < MINIMUM_PAIRS:
+        kind = CANNOT_TELL
+        missing = f"needs at least {MINIMUM_PAIRS} problems; there {'is' if problems == 1 else 'are'} {problems}"
+    elif any(not against[name].enough for name in tied):
+        kind = CANNOT_TELL
+        few = next(name for name in tied if not against[name].enough)
+        missing = (f"needs at least {MINIMUM_PAIRS} problems that both {names[lead]} and {few} solve; "
+                   f"there {'is' if against[few].n == 1 else 'are'} {against[few].n}")  # fmt: skip
+    return Choice(kind, names[lead], tied, candidates, against, solved, problems, missing)
+
+
+def _mean(column: np.ndarray, compare: Callable[[np.ndarray, np.ndarray], Paired]) -> float:
+    """The column against ones: a mean in the scale of the comparison."""
+    return compare(column, np.ones_like(column)).value
+
+
+def _apart(pair: Paired, minor: float, none: float) -> bool:
+    """Whether the other one is worse, for sure and by more than a trifle."""
+    threshold = none * (1 + minor) if none else minor
+    return pair.enough and pair.low > none and pair.value > threshold
+
+
+def listed(names: tuple[str, ...] | list[str], most: int = 4) -> str:
+    """Write names as "a, b and c"; of many the first ones and how many more."""
+    if len(names) > most:
+        return ", ".join(names[: most - 1]) + f" and {len(names) - most + 1} more"
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))

@@ -1,0 +1,153 @@
+"""How every solver stands on a set of problems: all of a study, or those of one formulation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.studies.averages import Paired, paired_ratio, shifted_geometric_mean
+from optid.studies.choice import Choice, choose
+from optid.studies.growth import Growth, time_growth
+from optid.studies.outcomes import CONTRADICTED, FALSE_CLAIM, SOLVED, Results, agreed_infeasible, applicable
+from optid.studies.profiles import Profile, performance_profiles, time_ratios
+from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
+from optid.studies.rows import REFUSED
+
+MINOR = 0.1  # times closer than 10 % are equal for all practical purposes
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One solver on a set of problems.
+
+    Attributes:
+        solver: its label.
+        problems: problems it was run on.
+        solved: those where it reached the verified accuracy at the best verified objective.
+        refused: problems it does not take.
+        false_claims: problems on which a claim of it was false.
+        fastest: problems on which nobody was faster.
+        time: shifted geometric mean of the seconds on what it solved; not comparable where others solved other problems.
+        penalised: the same with every failure counted as the time limit.
+        against: its time against the first choice on the problems both solved; None for the first choice itself and
+            where there is none.
+        residual: median verified residual on what it solved.
+        growth: of its time with the record length.
+        failures: {why not solved: problems}, most frequent first.
+    """
+
+    solver: str
+    problems: int
+    solved: int
+    refused: int
+    false_claims: int
+    fastest: int
+    time: float
+    penalised: float
+    against: Paired | None
+    residual: float
+    growth: Growth
+    failures: dict[str, int]
+
+    @property
+    def share(self) -> float:
+        """Solved share of the problems it was run on; ``nan`` where it was never run."""
+        return self.solved / self.problems if self.problems else float("nan")
+
+
+@dataclass(frozen=True)
+class Section:
+    """The comparison on one set of problems.
+
+    Attributes:
+        name: label of the formulation, or "" for all problems.
+        found: its problems and solvers; problems without a solution, by common consent, are taken out.
+        infeasible: how many were taken out.
+        standings: one per solver that was run, best first.
+        idle: solvers that were run on none of these problems.
+        choice: who comes first.
+        ranking: over data sets.
+        profiles: {solver: performance profile}.
+    """
+
+    name: str
+    found: Results
+    infeasible: int
+    standings: tuple[Standing, ...]
+    idle: tuple[str, ...]
+    choice: Choice
+    ranking: Ranking
+    profiles: dict[str, Profile]
+
+    def standing(self, solver: str) -> Standing:
+        """Return the standing of one solver."""
+        return next(s for s in self.standings if s.solver == solver)
+
+
+def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Section:
+    """Compare the solvers on the problems of a table.
+
+    Args:
+        found: problems and solvers.
+        name: label of the section.
+        level: significance level of the test over data sets.
+    """
+    gone = agreed_infeasible(found)
+    run = applicable(found).any(axis=0)
+    idle = tuple(s for s, there in zip(found.solvers, run) if not there)
+    kept = found.where(~gone, run)
+    choice = choose(kept.time, kept.solvers, MINOR, paired_ratio, none=1.0)
+    standings = [_standing(kept, s, choice) for s in range(len(kept.solvers))]
+    profiles = dict(zip(kept.solvers, performance_profiles(kept.time)))
+    standings.sort(key=lambda s: _order(s, choice))
+    return Section(name, kept, int(gone.sum()), tuple(standings), idle, choice, _ranking(kept, level), profiles)
+
+
+def _order(standing: Standing, choice: Choice) -> tuple:
+    """First choice, candidates by their time against it, then by what was solved."""
+    ratio = standing.against.value if standing.against is not None else 1.0
+    candidate = standing.solver in choice.candidates
+    return (standing.solver != choice.first, not candidate, ratio if candidate else -standing.solved,
+            standing.penalised if np.isfinite(standing.penalised) else np.inf, standing.solver)  # fmt: skip
+
+
+def _standing(found: Results, s: int, choice: Choice) -> Standing:
+    state, times = found.state[:, s], found.time[:, s]
+    ran, solved = applicable(found)[:, s], state == SOLVED
+    limits = np.fmax(found.limit, np.nanmax(found.time, axis=1, initial=0.0) if found.time.size else 0.0)
+    words, counts = np.unique(state[ran & ~solved].astype(str), return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    against = None
+    if choice.first and found.solvers[s] != choice.first:
+        against = paired_ratio(times, found.time[:, found.solvers.index(choice.first)])
+    known = found.residual[solved, s]
+    known = known[np.isfinite(known)]
+    labels = zip(found.formulation, found.study, found.data, found.noise)
+    groups = np.array(["\0".join((*words, f"{noise:.12g}")) for *words, noise in labels], dtype=object)
+    return Standing(
+        found.solvers[s],
+        int(ran.sum()),
+        int(solved.sum()),
+        int((state == REFUSED).sum()),
+        int(np.isin(state, (FALSE_CLAIM, CONTRADICTED)).sum()),
+        int((time_ratios(found.time)[:, s] == 1.0).sum()),
+        shifted_geometric_mean(times[solved]),
+        shifted_geometric_mean(np.where(solved, times, limits)[ran]),
+        against,
+        float(np.median(known)) if known.size else float("nan"),
+        time_growth(times, found.n, groups),
+        {str(words[i]): int(counts[i]) for i in order},
+    )
+
+
+def _ranking(found: Results, level: float) -> Ranking:
+    """Rank the solvers that ran on every data set; a failure or a refusal on a problem ranks last there."""
+    data = np.array([f"{s}\0{d}" for s, d in zip(found.study, found.data)], dtype=object)
+    ran = applicable(found)
+    labels = list(dict.fromkeys(data))
+    everywhere = np.array([all(ran[data == d, s].any() for d in labels) for s in range(len(found.solvers))], dtype=bool)
+    useful = everywhere & found.solved.any(axis=0)  # who never solved anything is last without a test
+    names = tuple(n for n, keep in zip(found.solvers, useful) if keep)
+    out = tuple(n for n, keep in zip(found.solvers, useful) if not keep)
+    if not len(data):
+        return rank_over_data_sets(np.zeros((0, len(names))), names, out, level)
+    return rank_over_data_sets(scores_by_data_set(ranks_of_problems(found.time[:, useful]), data), names, out, level)

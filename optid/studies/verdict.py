@@ -1,0 +1,205 @@
+"""The verdict of a study: who solves what, how fast, at equal verified accuracy, and what the data cannot tell."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optid.studies.advice import Statement, carries_over, choice_of_formulation, choice_of_solver, headline
+from optid.studies.agreement import Agreement, agreement_matrix
+from optid.studies.outcomes import CONTRADICTED, VALUE, Results, columns, tabulate, usual_accuracy
+from optid.studies.quality import Quality, compare_formulations
+from optid.studies.standings import Section, compare_solvers
+
+
+@dataclass(frozen=True)
+class FalseClaim:
+    """Claims of one solver that were false, of one kind.
+
+    Attributes:
+        solver, formulation: labels.
+        count: runs.
+        claimed: what the solver said.
+        reason: why it is false, of the first of them.
+    """
+
+    solver: str
+    formulation: str
+    count: int
+    claimed: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Runs of one solver that did not reach the accuracy, of one kind and reason.
+
+    Attributes:
+        solver: label.
+        state: outcome or status.
+        reason: the sentence, its numbers left out where they differ.
+        count: problems.
+    """
+
+    solver: str
+    state: str
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a study says.
+
+    Attributes:
+        table: the rows, one array per column.
+        found: problems and solvers.
+        accuracy: relative accuracy that was compared at.
+        time: measure of time: "solve", "fit" or "warm".
+        overall: comparison on all problems.
+        sections: comparison on the problems of each formulation, in alphabetical order.
+        quality: the formulations by their models.
+        agreement: of the solvers.
+        false_claims: most frequent first.
+        failures: most frequent first.
+        headline: the verdict in one line.
+        statements: further recommendations, warnings, and what cannot be told.
+    """
+
+    table: Mapping[str, np.ndarray]
+    found: Results
+    accuracy: float
+    time: str
+    overall: Section
+    sections: tuple[Section, ...]
+    quality: Quality
+    agreement: Agreement
+    false_claims: tuple[FalseClaim, ...]
+    failures: tuple[Failure, ...]
+    headline: Statement
+    statements: tuple[Statement, ...]
+
+    @property
+    def recommended(self) -> tuple[str, ...]:
+        """Solvers that come first or tie for it on all problems; empty where that cannot be told."""
+        choice = self.overall.choice
+        return (choice.first, *choice.tied) if choice.kind in ("first", "tie") else ()
+
+    def __str__(self) -> str:
+        """The verdict as text."""
+        return "\n".join(f"{s.word}: {s.text}" for s in (self.headline, *self.statements))
+
+
+def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", level: float = 0.05) -> Verdict:
+    """Draw the conclusions from the rows of a study.
+
+    Args:
+        rows: a mapping of columns, a frame, dict rows, or the path of a database.
+        accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
+        time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
+        level: significance level of the test over data sets.
+
+    Returns:
+        The verdict. A solver counts only where our residuals verified the accuracy; what the data cannot tell is said.
+
+    Raises:
+        DataError: these are no rows of a study, or an unknown measure of time.
+        DatabaseError: the database cannot be read.
+    """
+    if isinstance(rows, str | Path):
+        from optid.studies.database import read_rows
+
+        rows = read_rows(rows)
+    table = columns(rows)
+    at = usual_accuracy(table) if accuracy is None else accuracy
+    found = tabulate(table, at, time)
+    overall = compare_solvers(found, "", level)
+    formulations = sorted(set(found.formulation))
+    sections = tuple(compare_solvers(found.where(found.formulation == f), f, level) for f in formulations)
+    quality = compare_formulations(found, table)
+    head = headline(overall, list(sections))
+    return Verdict(
+        table, found, at, time, overall, sections, quality, agreement_matrix(found, table), _false_claims(table, found),
+        _failures(found), head, tuple(_statements(overall, sections, quality, found, table, head)),
+    )  # fmt: skip
+
+
+def _statements(overall: Section, sections: tuple[Section, ...], quality: Quality, found: Results,
+                table: Mapping[str, np.ndarray], head: Statement) -> list[Statement]:  # fmt: skip
+    if not len(found.data):
+        return []
+    said = [choice_of_formulation(quality)]
+    if len(sections) == 1 or head == choice_of_solver(overall):
+        said.append(carries_over(overall))
+    said += [_never(overall), _refuted(found, table), _no_truth(quality)]
+    if overall.infeasible:
+        text = f"{overall.infeasible:,} problems have no solution: solvers say so, none found one. They do not count."
+        said.append(Statement("fair", "Infeasible problems", text, "solver"))
+    return [statement for statement in said if statement is not None]
+
+
+def _never(overall: Section) -> Statement | None:
+    never = [s.solver for s in overall.standings if not s.solved]
+    if not never or len(never) == len(overall.standings):
+        return None
+    tried = "; ".join(f"{s.solver}: {s.problems:,} problems, {', '.join(f'{w} {c:,}' for w, c in s.failures.items())}"
+                      for s in overall.standings if not s.solved)  # fmt: skip
+    return Statement("bad", "Never reached the accuracy", f"{tried}.", "solver")
+
+
+def _no_truth(quality: Quality) -> Statement | None:
+    if quality.truth or not any(quality.solved.values()):
+        return None
+    text = "Errors of parameters and nonlinearity cannot be told: the truth is not known for any record."
+    return Statement("fair", "Truth unknown", text, "formulation")
+
+
+def _refuted(found: Results, table: Mapping[str, np.ndarray]) -> Statement | None:
+    """Warn where a proved lower bound lies above an objective that another run verified: then a proof is wrong."""
+    if not found.row.size:
+        return None
+    rows = np.where(found.solved | np.isfinite(found.objective), found.row, -1)
+    proved = (rows >= 0) & table["proved"][rows] & np.isfinite(table["bound"][rows])
+    bounds = np.max(np.where(proved, table["bound"][rows], -np.inf), axis=1)
+    best = np.min(np.where(np.isfinite(found.objective), found.objective, np.inf), axis=1)
+    with np.errstate(invalid="ignore"):
+        wrong = np.isfinite(bounds) & np.isfinite(best) & ((bounds - best) / found.size > max(VALUE, found.tolerance))
+    if not wrong.any():
+        return None
+    p = int(np.flatnonzero(wrong)[0])
+    text = (f"On {int(wrong.sum()):,} problems a proved lower bound lies above an objective that another run verified, "
+            f"first on {found.data[p]}, {found.formulation[p]}. One of the two is wrong: please report it.")  # fmt: skip
+    return Statement("bad", "A proof is contradicted", text, "claims")
+
+
+def _false_claims(table: Mapping[str, np.ndarray], found: Results) -> tuple[FalseClaim, ...]:
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for i in np.flatnonzero(table["false_claim"]):
+        key = (table["solver"][i], table["formulation"][i], table["status_claimed"][i])
+        groups.setdefault(key, []).append(table["reason"][i])
+    for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
+        key = (found.solvers[s], found.formulation[p], table["status_claimed"][found.row[p, s]])
+        winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
+        groups.setdefault(key, []).append(f"{winner} has a verified point")
+    claims = [FalseClaim(*key[:2], len(reasons), key[2], reasons[0]) for key, reasons in groups.items()]
+    return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
+
+
+def _failures(found: Results) -> tuple[Failure, ...]:
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for p, s in zip(*np.nonzero((found.state != "solved") & (found.state != "not run"))):
+        reason = found.reason[p, s]
+        groups.setdefault((found.solvers[s], found.state[p, s], _shape(reason)), []).append(reason)
+    failures = [
+        Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
+        for (solver, state, shape), reasons in groups.items()
+    ]
+    return tuple(sorted(failures, key=lambda f: (-f.count, f.solver, f.state, f.reason)))
+
+
+def _shape(reason: str) -> str:
+    """A sentence without its numbers, so that sentences of one kind count together."""
+    return re.sub(r"(?<![A-Za-z_])[-+]?\d[\d.,]*(?:e[-+]?\d+)?", "…", reason)
