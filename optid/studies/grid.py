@@ -1,10 +1,23 @@
 """The grid of a study as cells, each with the hash of everything that determines its result."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from optid.studies.description import DataEntry
+import numpy as np
+
+from optid.backends import find
+from optid.data import Data
+from optid.errors import SolverMissing, StudyError
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.systems import system
+from optid.studies.versions import determining
+
+KEY_VERSION = 1
+"""Part of every key: to be counted up when what a key says changes its meaning."""
 
 
 @dataclass(frozen=True)
@@ -58,3 +71,147 @@ class Cell:
     memory_limit: float
     holdout: float
     refusal: str = ""
+
+
+def cells(study: Study) -> list[Cell]:
+    """Return the cells of a study: data x formulations x solvers x accuracies x seeds x repetitions.
+
+    Cells of one record and formulation stand next to each other, so that a worker need not read or simulate it again.
+    A solver that is not installed gives cells that are refused with the reason, and a pair of solver and formulation
+    that do not fit is found out when the cell is run: what a study names always has a row.
+
+    Args:
+        study: what to expand.
+
+    Raises:
+        StudyError: data files that cannot be read, or entries that differ in nothing but their labels.
+    """
+    study.check_data()
+    found: list[Cell] = []
+    sources = [(located(entry, study.folder), content_hash(entry, study.folder)) for entry in study.data]
+    for (entry, content), samples, noise, seed in _records(sources, study.seeds):
+        for formulation in study.formulations:
+            if formulation.data and entry.name not in formulation.data:
+                continue
+            for solver in study.solvers:
+                for accuracy in solver.accuracy or study.accuracy:
+                    cell = _cell(study, entry, content, samples, noise, seed, formulation, solver, accuracy)
+                    found += [replace(cell, repetition=number) for number in range(study.repetitions)]
+    _check_distinct(found)
+    return found
+
+
+def left(all_cells: Iterable[Cell], done: Collection[tuple[str, int]]) -> list[Cell]:
+    """Return the cells that have no row yet.
+
+    Args:
+        all_cells: of the study.
+        done: (key, repetition) of the rows there are.
+    """
+    return [cell for cell in all_cells if (cell.key, cell.repetition) not in done]
+
+
+def check_unchanged(all_cells: Iterable[Cell], hashes: Mapping[tuple[str, str], Collection[str]]) -> None:
+    """Refuse a study whose data files are not those of the rows there are.
+
+    Args:
+        all_cells: of the study.
+        hashes: of the data behind the rows there are, by (study, data label).
+
+    Raises:
+        StudyError: names the files that changed.
+    """
+    changed = {}
+    for cell in all_cells:
+        if cell.data_hash and (known := hashes.get((cell.study, cell.data))) and set(known) != {cell.data_hash}:
+            changed[cell.data] = ", ".join(cell.data_source.files) or "a record in memory"
+    if changed:
+        listed = "".join(f"\n  {label}: {files}" for label, files in changed.items())
+        raise StudyError(f"data changed since the last run of study {next(iter(all_cells)).study!r}:{listed}\nRows of "
+                         "the former content are in the database. --accept-changed-data (accept_changed_data=True) "
+                         "runs these cells again and sets the former rows aside; or give another database")
+
+
+def located(entry: DataEntry, folder: Path) -> DataEntry:
+    """Return an entry with absolute file names."""
+    return replace(entry, files=tuple(str((folder / name).resolve()) for name in entry.files))
+
+
+def content_hash(entry: DataEntry, folder: Path) -> str:
+    """Return the sha256 (hex) of the bytes of the files or of the record in memory; empty for a simulated system."""
+    if entry.record is not None:
+        return _hash_of_record(entry.record)
+    digest = hashlib.sha256()
+    for name in entry.files:
+        with open(folder / name, "rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest() if entry.files else ""
+
+
+def _hash_of_record(data: Data) -> str:
+    digest = hashlib.sha256()
+    channels = (data.inputs, data.outputs, data.input_units, data.output_units, data.dt)
+    digest.update(repr((channels, data.transform)).encode())
+    for experiment in data.experiments:
+        for array in (experiment.u, experiment.y):
+            digest.update(repr(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _records(sources: list[tuple[DataEntry, str]], seeds: tuple[int, ...]
+             ) -> Iterator[tuple[tuple[DataEntry, str], int | None, float | None, int | None]]:
+    """Every record of a study: (entry and hash), samples, noise, seed; None where they do not apply."""
+    for entry, content in sources:
+        if entry.system is None:
+            yield (entry, content), None, None, None
+            continue
+        own = system(entry.system)
+        for samples in entry.samples or (own.samples,):
+            for noise in entry.noise or (own.noise,):
+                for seed in seeds:
+                    yield (entry, content), samples, noise, seed
+
+
+def _cell(study: Study, entry: DataEntry, content: str, samples: int | None, noise: float | None, seed: int | None,
+          formulation: FormulationEntry, solver: SolverEntry, accuracy: float) -> Cell:
+    determined = {
+        "key": KEY_VERSION,
+        "data": content or [entry.system, samples, noise, seed],
+        "reading": dict(entry.options),
+        "holdout": study.holdout,
+        "formulation": [formulation.formulation, dict(formulation.options), list(formulation.constraints)],
+        "solver": [solver.solver, dict(solver.options)],
+        "settings": [accuracy, study.warm, study.time_limit, study.memory_limit],
+        "versions": determining(formulation.formulation, solver.solver, entry.system is not None),
+    }
+    text = json.dumps(determined, sort_keys=True, separators=(",", ":"), default=str)
+    return Cell(
+        key=hashlib.sha256(text.encode()).hexdigest(), repetition=0, study=study.name, data=entry.name,
+        formulation=formulation.name, solver=solver.name, data_source=entry, data_hash=content, samples=samples,
+        noise=noise, seed=seed, formulation_name=formulation.formulation, options=dict(formulation.options),
+        constraints=formulation.constraints, solver_name=solver.solver, solver_options=dict(solver.options),
+        accuracy=accuracy, warm=study.warm, time_limit=study.time_limit, memory_limit=study.memory_limit,
+        holdout=study.holdout, refusal=_refusal(solver.solver),
+    )
+
+
+def _refusal(solver: str) -> str:
+    """Why a back end cannot run here; empty for one that can, and for auto."""
+    try:
+        if solver != "auto":
+            find(solver)
+    except SolverMissing as error:
+        return str(error)
+    return ""
+
+
+def _check_distinct(found: list[Cell]) -> None:
+    seen: dict[tuple[str, int], Cell] = {}
+    for cell in found:
+        other = seen.setdefault((cell.key, cell.repetition), cell)
+        if other is not cell:
+            names = [f"{axis} {getattr(other, axis)!r} and {getattr(cell, axis)!r}"
+                     for axis in ("data", "formulation", "solver") if getattr(other, axis) != getattr(cell, axis)]
+            raise StudyError(f"study {cell.study!r} has the same cell twice: {', '.join(names) or cell.data} differ in "
+                             "nothing that determines the result. Leave one of them out")

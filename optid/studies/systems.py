@@ -170,7 +170,10 @@ def _pendulum(samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
     u = plants.pendulum_input("levels", samples, seed)
     plant = plants.ReactionWheelPendulum()
     size = noise * float(np.std(plant.states(u)[:, 2]))
-    data = plants.pendulum(u, seed, measurement=size, **({} if noise else {"quantum": 0.0}))
+    if noise:
+        data = plants.pendulum(u, seed, measurement=size)
+    else:  # a perfect encoder, too
+        data = plants.pendulum(u, seed, measurement=0.0, quantum=0.0)
     return data, Truth((plant.torque,), ((-8.0, 8.0),))
 
 

@@ -115,7 +115,7 @@ def as_toml(study: "Study") -> str:
     """
     lines = [f"name = {_value(study.name)}"]
     for key in _ALONE:
-        value = plain(getattr(study, key))
+        value: Any = plain(getattr(study, key))
         if key == "seeds" and value == list(range(len(value))):
             value = len(value)
         lines.append(f"{key} = {_value(value[0] if key == 'accuracy' and len(value) == 1 else value)}")

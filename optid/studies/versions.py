@@ -1,0 +1,77 @@
+"""The versions that determine the result of a cell: packages, and the source of formulation and simulated system."""
+
+import hashlib
+import inspect
+from functools import cache
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
+
+from optid.backends import back_ends
+from optid.registry import FORMULATIONS, registered
+
+ALWAYS = ("optid", "numpy", "scipy", "cvxpy")
+"""Distributions behind every result."""
+
+
+@cache
+def determining(formulation: str, solver: str, simulated: bool = False) -> dict[str, str]:
+    """Return the versions that determine a result, by name.
+
+    Args:
+        formulation: registered name; the distribution that it comes from and its source file are looked at.
+        solver: word of the back end; the distributions that it needs are looked at, for "auto" those of the back ends
+            it chooses from.
+        simulated: whether the record is simulated: the source of the systems counts then.
+    """
+    found = {name: installed(name) for name in ALWAYS}
+    point = registered(FORMULATIONS)[formulation]
+    if point.dist is not None:
+        found[point.dist.name] = point.dist.version
+    found[f"source of {formulation}"] = source_hash(point.value.partition(":")[0])
+    for name in ("gauss_newton", "uno", "ipopt", "clarabel", "scs") if solver == "auto" else (solver,):
+        found |= _of_back_end(name)
+    if simulated:
+        found["source of the systems"] = source_hash("optid.studies.systems")
+    return found
+
+
+def installed(distribution: str) -> str:
+    """Return the version of a distribution, or "not installed"."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+@cache
+def source_hash(module: str) -> str:
+    """Return the first 16 digits of the sha256 of a module's source; "unknown" where there is none."""
+    from importlib.util import find_spec
+
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        return "unknown"
+    try:
+        with open(spec.origin, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+    except OSError:
+        return "unknown"
+
+
+def _of_back_end(name: str) -> dict[str, str]:
+    """Distributions of a back end: those it names for pip, or the one its code is in."""
+    back_end = back_ends().get(name)
+    if back_end is None:
+        return {}
+    if back_end.pip:
+        return {distribution: installed(distribution) for distribution in back_end.pip.split()}
+    module = getattr(inspect.getmodule(back_end.run), "__name__", "")
+    found = {distribution: version(distribution) for distribution in packages_of(module.partition(".")[0])}
+    if "optid" not in found:  # a third party's, which may be edited in place
+        found[f"source of {name}"] = source_hash(module)
+    return found
+
+
+@cache
+def packages_of(package: str) -> tuple[str, ...]:
+    """Return the distributions that hold a top-level package."""
+    return tuple(sorted(set(packages_distributions().get(package, ()))))
