@@ -44,6 +44,7 @@ _HOME = {
     "RecursiveARX": "recursion",
     "Fault": "faults",
     "bootstrap": "resampling",
+    "Study": "studies.description",
     "design": "experiment",
     "frequency_response": "experiment",
 }

@@ -110,9 +110,10 @@ def shown(value: Any) -> str:
 
 
 def written(path: Path) -> str:
-    """Write a path as Python does: data[0].noise."""
+    """Write a path as Python does: data[0].noise, formulations[1].na."""
+    axes = {"formulation": "formulations", "solver": "solvers"}
     text = ""
-    for part in path:
+    for part in (axes.get(str(path[0]), path[0]), *path[1:]):
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
     return text
 

@@ -1,0 +1,442 @@
+"""Studies: what they are made of, their files, the grid and its keys, simulated systems and their truth."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import optid
+from optid.errors import LookupFailed, StudyError
+from optid.examples import EXAMPLES
+from optid.studies import grid
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.positions import locate
+from optid.studies.records import load
+from optid.studies.systems import SYSTEMS, simulate
+from optid.studies.truth import Truth
+
+SMALL = """
+name = "small"
+seeds = 2
+solvers = ["clarabel", "gauss_newton"]
+
+[[data]]
+system = "thruster"
+samples = [100, 200]
+noise = [0.0, 0.1]
+
+[[formulation]]
+formulation = "arx"
+na = 2
+nb = 1
+
+[[formulation]]
+name = "monotone"
+formulation = "hammerstein_arx.exact"
+constraints = ["monotone:increasing"]
+na = 2
+nb = 1
+basis = "triangular:6"
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A folder with a record."""
+    u = np.random.default_rng(0).uniform(-1, 1, 40)
+    y = np.convolve(u, [0.5, 0.2])[:40]
+    rows = "\n".join(f"{a:.6f},{b:.6f}" for a, b in zip(u, y))
+    (tmp_path / "rig.csv").write_text("current,thrust\n" + rows + "\n")
+    return tmp_path
+
+
+def problems(text, folder="."):
+    """The lines of what is refused, without the heading."""
+    with pytest.raises(StudyError) as caught:
+        Study.from_text(text, folder)
+    return [line.strip() for line in str(caught.value).splitlines()[1:]]
+
+
+# -- the file ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_becomes_a_study():
+    study = Study.from_text(SMALL)
+    assert study.name == "small" and study.seeds == (0, 1) and study.accuracy == (1e-8,)
+    assert study.data == (DataEntry("thruster", system="thruster", samples=(100, 200), noise=(0.0, 0.1)),)
+    assert study.formulations[1] == FormulationEntry("monotone", "hammerstein_arx.exact", ("monotone:increasing",),
+                                                     {"na": 2, "nb": 1, "basis": "triangular:6"})
+    assert study.solvers == (SolverEntry("clarabel", "clarabel"), SolverEntry("gauss_newton", "gauss_newton"))
+
+
+BAD = [
+    ("acuracy = 1e-8", 1, 1, "Did you mean 'accuracy'"),
+    ("accuracy = 2.0", 1, 12, "between 0 and 1"),
+    ("accuracy = [1e-4,\n  'tight']", 2, 3, "between 0 and 1"),
+    ("time_limit = '60'", 1, 14, "the text '60' is not"),
+    ("time_limit = inf", 1, 14, "positive number of seconds"),
+    ("memory_limit = 0", 1, 16, "positive number of MB"),
+    ("repetitions = 1.5", 1, 15, "whole number from 1"),
+    ("warm = 1", 1, 8, "true or false"),
+    ("seeds = [1, -2]", 1, 13, "whole number from 0"),
+    ("seeds = []", 1, 9, "seeds is empty"),
+    ("holdout = 1", 1, 11, "below 1"),
+    ("name = ''", 1, 8, "name is a text"),
+    ("solvers = ['clarabel', 'gausnewton']", 1, 24, "Did you mean 'gauss_newton'"),
+    ("[[solver]]\nname = 'x'", 1, 1, "needs solver"),
+    ("[[solver]]\nsolver = 'scs'\nmax_iter = 3", 3, 1, "options = { ... }"),
+    ("[[solver]]\nsolver = 'scs'\noptions = 3", 3, 11, "options is a table"),
+    ("[[solver]]\nsolver = 'scs'\n[[solver]]\nsolver = 'scs'", 3, 1, "two entries are called 'scs'"),
+    ("[[data]]\nsystem = 'trhuster'", 2, 10, "Did you mean 'thruster'"),
+    ("[[data]]\nname = 'x'", 1, 1, "a file or a system"),
+    ("[[data]]\nsystem = 'thruster'\nfile = 'x.csv'\nname='x'", 1, 1, "only one of file and system"),
+    ("[[data]]\nname = 'x'\nsystem = 'thruster'\ninputs = ['u']", 4, 1, "for a file"),
+    ("[[data]]\nname = 'x'\nsystem = 'thruster'\nsamples = [100, 0]", 4, 17, "whole number from 1"),
+    ("[[data]]\nname = 'x'\nsystem = 'thruster'\nnoise = -0.1", 4, 9, "from 0"),
+    ("[[data]]\nsystems = 'thruster'", 2, 1, "Did you mean 'system'"),
+    ("[[data]]\nname = 'x'\nrecord = 1", 3, 1, "unknown key 'record'"),
+    ("[[data]]\nfile = 'rag.csv'", 2, 8, "rig.csv"),
+    ("[[data]]\nfile = 'rig.csv'\ninputs = ['curent']\noutputs = 'thrust'", 3, 10, "Did you mean 'current'"),
+    ("[[data]]\nfile = 'rig.csv'\ninputs = ['current']\noutputs = ['trust']", 4, 11, "Did you mean 'thrust'"),
+    ("[[data]]\nfile = 'rig.csv'\ninputs = 3\noutputs = 'thrust'", 3, 10, "a text or a list of texts"),
+    ("[[data]]\nfile = 'rig.csv'\ninputs = 'current'\noutputs = 'thrust'\nsamples = 3", 5, 1, "simulated system"),
+    ("[[formulation]]\nformulation = 'axr'", 2, 15, "no formulation is called 'axr'"),
+    ("[[formulation]]\nname = 'x'", 1, 1, "needs formulation"),
+    ("[[formulation]]\nformulation = 'arx'\nna = 2\nnb = 1\nnc = 1\nname = 'x'", 5, 1, "no argument 'nc'"),
+    ("[[formulation]]\nformulation = 'arx'\nna = 2\nname = 'x'", 1, 1, "needs nb"),
+    ("[[formulation]]\nformulation = 'arx'\nna = 2.5\nnb = 1\nname = 'x'", 3, 6, "whole number"),
+    ("[[formulation]]\nformulation = 'arx'\nna = 2\nnb = 1\nname = 'x'\nconstraints = ['stabel']", 6, 16, "'stable'"),
+    ("[[formulation]]\nformulation = 'arx'\nna = 2\nnb = 1\nname = 'x'\ndata = 'thrust'", 6, 8, "'thruster'"),
+    ("[[formulation]]\nformulation = 'hammerstein_arx.exact'\nna = 2\nnb = 1\nbasis = 'triangel:8'", 5, 9,
+     "'triangular'"),
+    ("[[formulation]]\nformulation = 'hammerstein_arx.exact'\nna = 2\nnb = 1\nbasis = [8]", 5, 10, "triangular:10"),
+]
+
+
+@pytest.mark.parametrize("text, line, column, words", BAD, ids=[text.replace("\n", " ")[:60] for text, *_ in BAD])
+def test_everything_wrong_has_its_place(rig, text, line, column, words):
+    whole = {"[[data]]": "[[data]]\nsystem = 'thruster'\n", "[[formulation]]": "[[formulation]]\nformulation = 'arx'\n"
+             "na = 2\nnb = 1\n", "solver": "[[solver]]\nname = 'other'\nsolver = 'auto'\n"}
+    text += "\n" + "".join(part for key, part in whole.items() if key not in text or key == "[[data]]")
+    found = problems(text, rig)
+    assert any(told.startswith(f"line {line}, column {column}: ") and words in told for told in found), found
+    assert len(found) == 1 + ("a file or a system" in " ".join(found) and words != "a file or a system"), found
+
+
+def test_all_problems_are_listed_at_once_in_the_order_of_the_file():
+    found = problems("acuracy = 1\nholdout = 3\n" + SMALL.replace("thruster", "truster").replace("nb", "bn"))
+    places = [tuple(map(int, line.removeprefix("line ").split(":")[0].split(", column "))) for line in found]
+    assert len(found) == 7 and places == sorted(places)
+
+
+def test_what_is_missing_altogether():
+    found = problems("name = 'empty'")
+    assert [word for word in ("[[data]]", "[[formulation]]", "solvers = \"all\"") for line in found if word in line] == [
+        "[[data]]", "[[formulation]]", "solvers = \"all\""]
+
+
+@pytest.mark.parametrize("text, place", [
+    ("name = \n", "line 1, column 8"), ("a = 1\nb = 'x\n", "line 2, column 7"), ("[[data]\n", "line 1, column 7"),
+    ("a = [1, 2", "line 1, column 10"), ("a = 1\na = 2\n", "line 2"),
+])
+def test_what_is_not_toml_has_its_place(text, place):
+    assert problems(text)[0].startswith(place)
+
+
+def test_files_that_are_not_there_or_not_text(tmp_path):
+    with pytest.raises(StudyError, match="cannot be read"):
+        Study.from_toml(tmp_path / "nothing.toml")
+    with pytest.raises(StudyError, match="cannot be read"):
+        Study.from_toml(tmp_path)
+    (tmp_path / "latin.toml").write_bytes("name = 'a'\n# f\xfcr".encode("latin-1"))
+    with pytest.raises(StudyError, match="line 2, column 4: this is not UTF-8"):
+        Study.from_toml(tmp_path / "latin.toml")
+    (tmp_path / "windows.toml").write_bytes(b"\xef\xbb\xbf" + SMALL.replace("\n", "\r\n").encode())
+    assert Study.from_toml(tmp_path / "windows.toml") == Study.from_text(SMALL)
+
+
+def test_a_study_without_a_title_is_called_as_its_file(tmp_path):
+    (tmp_path / "rigs.toml").write_text(SMALL.replace('name = "small"', ""))
+    assert Study.from_toml(tmp_path / "rigs.toml").name == "rigs"
+
+
+def test_a_broken_formulation_of_a_third_party_is_told(monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    from optid.registry import FORMULATIONS, registered
+
+    known = {**registered(FORMULATIONS), "mine": EntryPoint("mine", "no_such_package:mine", FORMULATIONS)}
+    monkeypatch.setattr("optid.studies.entries.registered", lambda group: known if group == FORMULATIONS else {})
+    found = problems(SMALL.replace('"arx"', '"mine"').replace('constraints = ["monotone:increasing"]', ""))
+    assert found == ["line 12, column 15: formulation 'mine' cannot be loaded: ModuleNotFoundError: No module named "
+                     "'no_such_package'"]
+
+
+def test_positions_of_every_kind_of_key():
+    text = ('a = 1 # [x]\nb.c = "]"\n"d e" = [1, # one\n  """two\n]""", {f = 2, g.h = [3]}]\n[t]\n i = 1979-05-27\n'
+            "[t.u]\nj='''\n[[v]]'''\n[[v]]\nk = 1\n[[v]]\n[v.w]\nl = -1.5e3\n[[v.z]]\nm = true\n")
+    found = locate(text)
+    assert found.keys[("a",)] == (1, 1) and found.values[("a",)] == (1, 5)
+    assert found.keys[("b", "c")] == (2, 1) and found.values[("b", "c")] == (2, 7)
+    assert found.values[("d e", 0)] == (3, 10) and found.values[("d e", 1)] == (4, 3)
+    assert found.keys[("d e", 2, "f")] == (5, 8) and found.values[("d e", 2, "g", "h", 0)] == (5, 22)
+    assert found.keys[("t", "i")] == (7, 2) and found.keys[("t", "u", "j")] == (9, 1)
+    assert found.keys[("v", 0)] == (11, 1) and found.keys[("v", 1, "w", "l")] == (15, 1)
+    assert found.keys[("v", 1, "z", 0, "m")] == (17, 1)
+    assert found.of(("v", 1, "w", "nothing")) == (14, 1) and found.of(("nothing",)) == (1, 1)
+
+
+# -- round trips and Python --------------------------------------------------------------------------------------------
+
+
+def test_round_trip_of_the_small_study():
+    study = Study.from_text(SMALL)
+    assert Study.from_text(study.to_toml()) == study
+
+
+_NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\r"), min_size=1, max_size=12).filter(str.strip)
+_SHARES = st.floats(1e-12, 0.5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(name=_NAMES, labels=st.lists(_NAMES, min_size=2, max_size=2, unique=True), accuracy=st.lists(_SHARES, min_size=1),
+       seeds=st.lists(st.integers(0, 2**40), min_size=1, max_size=5), noise=st.lists(st.floats(0, 1e3)), warm=st.booleans(),
+       options=st.dictionaries(_NAMES, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()))
+def test_round_trip_of_any_study(name, labels, accuracy, seeds, noise, warm, options):
+    study = Study(
+        name, data=[{"system": "linear", "name": labels[0], "noise": noise}, {"system": "linear", "name": labels[1]}],
+        formulations={"formulation": "arx", "na": 1, "nb": [1], "ridge": accuracy[0]}, accuracy=accuracy, seeds=seeds,
+        solvers={"solver": "clarabel", "name": labels[0], "options": options}, warm=warm, holdout=accuracy[0])
+    assert Study.from_text(study.to_toml()) == study
+
+
+def test_python_takes_what_is_simplest(rig):
+    data = simulate("thruster", 50)[0]
+    study = Study("t", data={"in memory": data, "simulated": "thruster", "on disk": {
+        "file": "rig.csv", "inputs": "current", "outputs": "thrust"}}, formulations={"a": {
+            "formulation": "arx", "na": 2, "nb": 1}}, solvers="clarabel", accuracy=1e-6, seeds=3, folder=rig)
+    assert [entry.name for entry in study.data] == ["in memory", "simulated", "on disk"]
+    assert study.data[0].record is data and study.data[2].files == ("rig.csv",)
+    assert study.seeds == (0, 1, 2) and study.accuracy == (1e-6,) and study.formulations[0].name == "a"
+    assert replace(study, seeds=range(2)).seeds == (0, 1)
+    with pytest.raises(StudyError, match="in memory"):
+        study.to_toml()
+    assert optid.Study is Study
+
+
+def test_all_solvers_are_those_installed():
+    from optid.backends import back_ends
+
+    study = replace(Study.from_text(SMALL), solvers="all")
+    assert {entry.solver for entry in study.solvers} == {n for n, b in back_ends().items() if b.installed}
+
+
+def test_python_hears_all_problems_with_their_places():
+    with pytest.raises(StudyError) as caught:
+        Study("t", data=["thruster", {"system": "linea"}], formulations=[{"formulation": "arx", "na": 2}, 3],
+              solvers=["scs", {"solver": "clarabel", "acuracy": 1}], warm="yes", seeds=np.int64(0))
+    lines = [line.strip().split(":")[0] for line in str(caught.value).splitlines()]
+    assert set(lines[1:]) == {"warm", "seeds", "data[1].system", "formulations[0]", "formulations[1]",
+                              "solvers[1].acuracy"}
+
+
+def test_files_are_looked_for_before_a_run(rig):
+    study = Study("t", data=["rig.csv", "none.csv"], formulations={"formulation": "arx", "na": 2, "nb": 1},
+                  solvers="auto", folder=rig)
+    with pytest.raises(StudyError, match=r"(?s)data\[0\].inputs: .*no column 'u'.*data\[1\].file\[0\]: no file"):
+        grid.cells(study)
+
+
+# -- the grid ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_grid_has_every_combination_once():
+    cells = grid.cells(replace(Study.from_text(SMALL), repetitions=2, accuracy=(1e-4, 1e-8)))
+    assert len(cells) == 2 * 2 * 2 * 2 * 2 * 2 * 2
+    assert len({(cell.key, cell.repetition) for cell in cells}) == len(cells)
+    assert {(c.samples, c.noise, c.seed, c.formulation, c.solver, c.accuracy, c.repetition) for c in cells} == {
+        (s, n, e, f, v, a, r) for s in (100, 200) for n in (0.0, 0.1) for e in (0, 1) for f in ("arx", "monotone")
+        for v in ("clarabel", "gauss_newton") for a in (1e-4, 1e-8) for r in (0, 1)}
+    assert pickle.loads(pickle.dumps(cells)) == cells
+    done = {(cell.key, cell.repetition) for cell in cells[::2]}
+    assert grid.left(cells, done) == cells[1::2]
+
+
+def test_a_formulation_may_be_for_some_of_the_data():
+    text = SMALL.replace("na = 2\nnb = 1\n\n", 'na = 2\nnb = 1\ndata = "linear"\n\n') + '[[data]]\nsystem = "linear"\n'
+    pairs = {(cell.data, cell.formulation) for cell in grid.cells(Study.from_text(text))}
+    assert pairs == {("thruster", "monotone"), ("linear", "arx"), ("linear", "monotone")}
+
+
+@pytest.mark.parametrize("change", [
+    {"accuracy": 1e-7}, {"warm": True}, {"time_limit": 30.0}, {"memory_limit": 500.0}, {"holdout": 0.0},
+    {"data": {"system": "thruster", "samples": [100, 200], "noise": [0.0, 0.2]}},
+    {"formulations": [{"formulation": "arx", "na": 3, "nb": 1}]}, {"solvers": ["scs"]}, {"seeds": [7]},
+    {"solvers": {"solver": "clarabel", "options": {"max_iter": 9}}},
+    {"formulations": [{"formulation": "arx", "na": 2, "nb": 1, "constraints": "stable"}]},
+])
+def test_whatever_determines_the_result_changes_the_key(change):
+    study = replace(Study.from_text(SMALL), formulations=[{"formulation": "arx", "na": 2, "nb": 1}],
+                    solvers="clarabel", seeds=1)
+    before, after = ({cell.key for cell in grid.cells(s)} for s in (study, replace(study, **change)))
+    assert len(before - after) == (2 if "data" in change else 4)
+
+
+def test_labels_and_title_do_not_change_the_key():
+    study = Study.from_text(SMALL)
+    other = replace(study, name="other", data={**{"system": "thruster", "name": "x"}, "samples": [100, 200],
+                                               "noise": [0.0, 0.1]})
+    assert [cell.key for cell in grid.cells(study)] == [cell.key for cell in grid.cells(other)]
+
+
+def test_versions_change_the_key(monkeypatch):
+    from optid.studies import versions
+
+    study = Study.from_text(SMALL)
+    before = {cell.key for cell in grid.cells(study)}
+    versions.determining.cache_clear()
+    monkeypatch.setattr(versions, "installed", lambda name: "99")
+    assert not before & {cell.key for cell in grid.cells(study)}
+    monkeypatch.undo()
+    versions.determining.cache_clear()
+    assert before == {cell.key for cell in grid.cells(study)}
+
+
+def test_the_same_cell_twice_is_refused():
+    study = replace(Study.from_text(SMALL), solvers={"one": "clarabel", "two": "clarabel"})
+    with pytest.raises(StudyError, match="solver 'one' and 'two'"):
+        grid.cells(study)
+
+
+def test_a_solver_that_is_not_installed_is_refused_with_its_remedy():
+    study = replace(Study.from_text(SMALL), solvers=["mosek", "auto"])
+    refusals = {cell.solver: cell.refusal for cell in grid.cells(study)}
+    assert refusals["auto"] == "" and "pip install Mosek" in refusals["mosek"]
+
+
+def test_data_that_changed_are_refused(rig):
+    study = Study("t", data={"file": "rig.csv", "inputs": "current", "outputs": "thrust"}, solvers="auto",
+                  formulations={"formulation": "arx", "na": 2, "nb": 1}, folder=rig)
+    before = grid.cells(study)
+    hashes = {("t", "rig"): {before[0].data_hash}}
+    grid.check_unchanged(before, hashes)
+    grid.check_unchanged(before, {("t", "another"): {"0"}, ("another", "rig"): {"0"}})
+    with open(rig / "rig.csv", "a") as file:
+        file.write("0.5,0.5\n")
+    after = grid.cells(study)
+    assert after[0].key != before[0].key
+    with pytest.raises(StudyError, match=r"(?s)rig: .*rig.csv.*--accept-changed-data"):
+        grid.check_unchanged(after, hashes)
+
+
+def test_records_in_memory_have_a_content():
+    data = simulate("thruster", 60)[0]
+    make = {"formulations": {"formulation": "arx", "na": 2, "nb": 1}, "solvers": "auto"}
+    one, same, other = (grid.cells(Study("t", data=d, **make))[0] for d in (data, simulate("thruster", 60)[0],
+                                                                            simulate("thruster", 60, seed=1)[0]))
+    assert one.key == same.key != other.key and one.data == "thruster"
+
+
+# -- records -----------------------------------------------------------------------------------------------------------
+
+
+def _cell(study, **changes):
+    return replace(grid.cells(study)[0], **changes)
+
+
+def test_files_are_cut_and_simulated_records_keep_their_length(rig):
+    study = Study("t", data=[{"file": "rig.csv", "inputs": "current", "outputs": "thrust"}, "thruster"],
+                  solvers="auto", formulations={"formulation": "arx", "na": 2, "nb": 1}, folder=rig, holdout=0.25)
+    cells = grid.cells(study)
+    record = load(cells[0])
+    assert (record.data.n_samples, record.holdout.n_samples, record.truth) == (30, 10, None)
+    record = load(cells[1])
+    assert (record.data.n_samples, record.holdout.n_samples) == (600, 200)
+    assert not np.array_equal(record.data.y[:200], record.holdout.y)
+    assert load(replace(cells[0], holdout=0.0)).holdout is None
+    assert load(replace(cells[1], holdout=0.0)).data.n_samples == 600
+
+
+def test_relative_file_names_start_at_the_study_file(rig, monkeypatch, tmp_path_factory):
+    text = SMALL.replace('system = "thruster"\nsamples = [100, 200]\nnoise = [0.0, 0.1]',
+                         'file = "rig.csv"\ninputs = "current"\noutputs = "thrust"')
+    (rig / "study.toml").write_text(text)
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    cell = grid.cells(Study.from_toml(rig / "study.toml"))[0]
+    assert Path(cell.data_source.files[0]) == (rig / "rig.csv").resolve()
+    assert load(cell).data.inputs == ("current",)
+
+
+# -- systems and truth -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_has_the_noise_asked_for(name):
+    chosen, n = SYSTEMS[name], 3000
+    clean, noisy = simulate(name, n, 0.0, seed=5)[0], simulate(name, n, 0.2, seed=5)[0]
+    assert noisy.y.shape == (n, clean.l) and np.array_equal(clean.u, noisy.u) and chosen.samples > 0
+    assert np.array_equal(noisy.y, simulate(name, n, 0.2, seed=5)[0].y)
+    assert not np.array_equal(noisy.u, simulate(name, n, 0.2, seed=6)[0].u)
+    size = np.sqrt(np.mean(np.var(noisy.y - clean.y, axis=0)) / np.mean(np.var(clean.y, axis=0)))
+    if name in ("vanderpol", "pendulum", "example1"):  # the noise enters the state, or there is one output without any
+        assert size > 0.05
+    else:
+        assert size == pytest.approx(0.2, rel=0.12)
+
+
+@pytest.mark.parametrize("name", sorted(set(SYSTEMS) & set(EXAMPLES) - {"vanderpol", "pendulum"}))
+def test_built_in_records_are_the_same_systems(name):
+    np.testing.assert_allclose(simulate(name, seed=3)[0].y, EXAMPLES[name](seed=3).data.y, rtol=1e-12)
+
+
+def test_simulations_that_cannot_be():
+    with pytest.raises(LookupFailed, match="'thruster'"):
+        simulate("truster")
+    for samples, noise in ((0, 0.1), (10, -1.0), (10, float("nan"))):
+        with pytest.raises(optid.errors.DataError, match="at least one sample"):
+            simulate("thruster", samples, noise)
+
+
+IN_CLASS = [("dead_zone_in_span", "hammerstein_arx.exact"), ("ding_chen", "hammerstein_armax.exact"),
+            ("linear", "oe.exact"), ("two_modes", "hammerstein_ss.sid")]
+
+
+@pytest.mark.parametrize("name, formulation", IN_CLASS)
+def test_a_model_of_the_class_has_no_error_without_noise(name, formulation):
+    from optid.cli.arguments import suited
+
+    data, truth = simulate(name, 800, 0.0, seed=1)
+    arguments = suited(SYSTEMS[name].suggestion, formulation)
+    if name == "dead_zone_in_span":  # its basis, on the interval of its nodes
+        arguments["basis"] = optid.Triangular(8, interval=(-1.0, 1.0))
+    with np.errstate(all="ignore"):
+        model = optid.fit(data, formulation, prove=False, **arguments).model
+    assert truth.parameter_error(model) < 1e-8 and truth.nonlinearity_error(model) < 1e-8
+
+
+def test_errors_do_not_depend_on_the_gauge_and_are_what_they_say():
+    data, truth = simulate("dead_zone", 500, 0.1)
+    fit = {gauge: optid.fit(data, na=2, nb=2, basis="triangular:6", gauge=gauge).model for gauge in ("norm", "b0")}
+    errors = [(truth.parameter_error(model), truth.nonlinearity_error(model)) for model in fit.values()]
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
+    model = fit["norm"]
+    u = np.linspace(-1, 1, 401)
+    line = np.polyfit(model.f(u), truth.f[0](u), 1)  # independent: scale and offset by polyfit
+    left = np.polyval(line, model.f(u)) - truth.f[0](u)
+    assert errors[0][1] == pytest.approx(np.sqrt(np.mean(left**2)) / np.std(truth.f[0](u)), rel=1e-9)
+    found = model.impulse_response(200)[:, 0, 0] / line[0]
+    true = truth.response[:, 0, 0]
+    assert errors[0][0] == pytest.approx(np.linalg.norm(found - true) / np.linalg.norm(true), rel=1e-9)
+
+
+def test_errors_that_cannot_be_told():
+    data, _ = simulate("linear", 300, 0.1)
+    model = optid.fit(data, "arx", na=2, nb=2).model
+    other = Truth((np.sin, np.sin), ((-1, 1),) * 2, np.ones((200, 1, 2)))
+    assert np.isnan(other.parameter_error(model)) and np.isnan(other.nonlinearity_error(model))
+    fed_back = Truth((np.sin,), ((-1, 1),))
+    assert np.isnan(fed_back.parameter_error(model)) and fed_back.nonlinearity_error(model) < 0.1
