@@ -2,9 +2,10 @@
 
 Windows of 200 samples hold one fault of deflection d at an onset drawn from 60 to 140; the six candidates take turns (a
 jump of the state in a random direction). The search knows neither. Printed beside the goals: detected; named rightly
-of those detected; error of the onset and relative error of the magnitude where it is named rightly (and the onset
-whatever the name); and which rivals take the wrong answers. "Best possible" is the rate of the Bayes rule that is told
-the deflection and the range of the onsets: no other rule can name more of these faults rightly.
+of those detected, by the largest gain and by the posterior with which `diagnose` ranks its answers; error of the onset
+and relative error of the magnitude where the largest gain names it rightly (and the onset whatever the name); and which
+rivals take the wrong answers. "Best possible" is the rate of the Bayes rule that is told the deflection and the range
+of the onsets: no other rule can name more of these faults rightly (`bayes_limit.py` has it more precisely).
 
     python benchmarks/faults/isolation.py [--runs 1200] [--plant $OPTID_DATA/fault_plant.json]
 """
@@ -19,6 +20,7 @@ from plants import PLANT, deflected, rate, standard_plant, windows
 from scipy.special import gammaln, ive, logsumexp
 
 from optid.faults import dictionary, scan, thresholds
+from optid.faults.diagnosis.posterior import single
 
 WINDOW = 200
 ONSETS = 60, 140
@@ -56,7 +58,7 @@ def main() -> None:
         for run in range(options.runs):
             label, onset = found.labels[run % len(found.labels)], int(rng.integers(*ONSETS))
             truth.append((label, onset, *deflected(found, label, WINDOW, onset, d, rng)))
-        detected, right, possible, errors, any_errors, sizes, wrong = 0, 0, 0, [], [], [], Counter()
+        detected, right, ranked, possible, errors, any_errors, sizes, wrong = 0, 0, 0, 0, [], [], [], Counter()
         dimensions = np.array([c.dimension for c in found.candidates])
         for (label, onset, _, size), window in zip(truth, windows(model, [t[2] for t in truth], WINDOW, load=load,
                                                                   seed=int(10 * d))):
@@ -69,6 +71,9 @@ def main() -> None:
                 continue
             detected += 1
             possible += found.labels[told(result.statistic, dimensions, d)] == label
+            explained = [single(result, candidate) for candidate in found.candidates]
+            best = np.argmax([-np.inf if e is None else e.log_evidence for e in explained])
+            ranked += found.labels[int(best)] == label
             any_errors.append(abs(at - onset))
             if found.labels[c] != label:
                 wrong[f"{label} -> {found.labels[c]}"] += 1
@@ -81,6 +86,7 @@ def main() -> None:
         print(f"deflection {d:g}: {options.runs} windows, {1e3 * spent / options.runs:.2f} ms of CPU time each")
         rows = [("4 detected", rate(detected, options.runs), "detected"),
                 ("5 named rightly of those detected", rate(right, detected) if detected else "-", "right"),
+                ("5 by the posterior of diagnose", rate(ranked, detected) if detected else "-", "right"),
                 ("  best possible", rate(possible, detected) if detected else "-", "")]
         if errors:
             rows += [("8 onset, median error", f"{np.median(errors):.1f}", "median"),
