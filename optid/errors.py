@@ -36,6 +36,10 @@ class SolverMissing(OptidError, RuntimeError):  # noqa: N818
     """The solver exists but is not installed; the message has the pip line."""
 
 
+class SolverRefused(StructureError):  # noqa: N818
+    """The solver cannot take this programme; the message names the part, or what solves such a programme."""
+
+
 class SolverFailed(OptidError, RuntimeError):  # noqa: N818
     """The solver crashed, ran out of time or returned a point that our residuals refuse."""
 
@@ -46,6 +50,10 @@ class ClusterError(OptidError, RuntimeError):
 
 class StudyError(OptidError, ValueError):
     """The description of a study is wrong, or its database belongs to another; the message lists every problem."""
+
+
+class DatabaseError(OptidError, RuntimeError):
+    """The database of a study cannot be used: missing, another's, of another version, in use, or the disk is full."""
 
 
 class ModelFileError(OptidError, ValueError):

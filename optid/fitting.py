@@ -204,7 +204,8 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     built_at = time.perf_counter()
     outcome = run(problem, solver, **settings)
     outcome = replace(outcome, solution=replace(
-        outcome.solution, times=replace(outcome.solution.times, build=built_at - started)))
+        outcome.solution, times=replace(outcome.solution.times,
+                                        build=outcome.solution.times.build + built_at - started)))
     if raises:
         _raise_failure(outcome)
     model = outcome.model

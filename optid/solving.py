@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, choose, find
-from optid.errors import StructureError
+from optid.errors import SolverRefused, StructureError
 from optid.isolated import run_isolated
 from optid.judging import judge, measure_violation, value_size
 from optid.program import Program, Values
@@ -17,6 +17,7 @@ from optid.solution import Bound, Residuals, Solution, Status, Times, relative_g
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
 GRADIENT = 10.0  # gradients are less sharp than values: at a smooth minimum an error e in f is one of sqrt(e) in them
 
 
@@ -42,7 +43,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     Raises:
         LookupFailed: no such solver.
         SolverMissing: not installed (with the pip line).
-        StructureError: the solver cannot take this class of programme; the message names the nonconvex part.
+        SolverRefused: the solver cannot take this class of programme; the message names the nonconvex part.
     """
     chosen = ""
     if solver == "auto":
@@ -54,7 +55,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
             getattr(solver, "__name__", "callable"), frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"}), solver)
     refusal = back_end.refuses(program)
     if refusal:
-        raise StructureError(refusal)
+        raise SolverRefused(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
 
     separate = (time_limit is not None) if isolate is None else isolate
@@ -71,8 +72,8 @@ def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: 
         program.assign(program.start)
     try:
         return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
-    except StructureError:  # a refusal says what to change, so it must reach the user
-        raise
+    except StructureError as refusal:  # it says what to change, so it must reach the user
+        raise SolverRefused(str(refusal)) from refusal
     except Exception as error:  # a solver that crashes is an outcome, not a traceback
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
 
@@ -87,7 +88,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
         status, reason = _without_point(program, answer, back_end.name)
         return replace(base, status=status, reason=reason)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
-        return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned non-finite numbers")
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
     if missing := set(program.variables) - set(values) - set(program.derived):
         return replace(base, status=Status.FAILED,
                        reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
@@ -258,6 +259,8 @@ class Outcome:
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
     """Solve a programme, or drive a procedure that yields programmes, with one solver.
 
+    The time that a procedure itself takes, between its programmes, counts as building.
+
     Args:
         problem: a `Program`, or a generator that yields programmes, receives their solutions and returns the model.
         solver: as in `solve`.
@@ -270,15 +273,21 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         constrained = dict.fromkeys(problem.user_constraints, (problem, solution))
         return Outcome(model, solution, problem, ((problem.name, solution),), constrained=constrained)
     steps: list[tuple[str, Solution]] = []
+    clock = time.perf_counter()
     program = next(problem)
+    building = time.perf_counter() - clock
     while True:
         solution = solve(program, solver, **settings)
         steps.append((program.name, solution))
         constrained |= dict.fromkeys(program.user_constraints, (program, solution))
+        clock = time.perf_counter()
         try:
             program = problem.send(solution)
+            building += time.perf_counter() - clock
         except StopIteration as stop:
             found = stop.value
+            building += time.perf_counter() - clock
+            solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), constrained=constrained)
             solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
