@@ -5,33 +5,27 @@ all that a least-squares objective needs. Statistics add up, over chunks, experi
 """
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from optid.bases.basis import Array, Basis
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.regressors.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.regressors.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
+from optid.regressors.factors import Factor, add_to_root, conditioning, dependent_column, root_of_gram
 from optid.regressors.layout import Layout
-from optid.regressors.sums import FORMED, Block, Sums, dense_rows, make_block, rows_present, stretches
+from optid.regressors.sums import Sums, rows_present, stretches
 from optid.regressors.workers import available_threads, mapped
 
 if TYPE_CHECKING:
     from optid.data import Data
     from optid.streams import Stream
 
-CHUNK = 32768
-"""Samples evaluated at a time: their basis functions stay in the processor's cache."""
-
 CONDITION_LIMIT = 1e7
 """Condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left."""
-
-BLOCKS = 4
-"""Chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record."""
 
 RETAINED = 1 << 23
 """Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
@@ -190,10 +184,10 @@ def accumulate(
     This is for parts of a record that are to be added; arguments and errors as `collect`.
     """
     threads = available_threads(threads)
-    sums = _sum(data, layout, weights, chunk, threads, direct=False)
+    sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout))
     complete = sums.complete()
     if sums.cancelled(complete):
-        sums = _sum(data, layout, weights, chunk, threads, direct=True)
+        sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout, direct=True))
         complete = sums.complete()
     gram = layout.contrasted(layout.contrasted(complete).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
@@ -206,18 +200,8 @@ def factorise(
 
     Arguments and errors as `collect`, without its checks of rank.
     """
-    n = layout.n_columns + layout.l
-    root, rows, candidates = np.zeros((n, n)), 0, 0
-    for block in chain.from_iterable(_blocks(part, layout, chunk) for part in _parts(data, layout, weights, chunk)):
-        used = np.flatnonzero(block.valid)
-        rows, candidates = rows + used.size, candidates + block.candidates
-        for start in range(0, used.size, FORMED):
-            part = used[start : start + FORMED]
-            formed = layout.contrasted(dense_rows(block, part, layout.n_complete))
-            if block.weights is not None:
-                formed *= np.sqrt(block.weights[part])[:, None]
-            root = add_to_root(root, formed)
-    return Statistics(layout, root.T @ root, rows, candidates, root)
+    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout))
+    return Statistics(layout, total.root.T @ total.root, total.rows, total.candidates, total.root)
 
 
 def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) -> list[Array]:
@@ -235,7 +219,7 @@ def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) ->
     theta = np.asarray(theta, dtype=float)
     if theta.shape != (layout.n_columns, layout.l):
         raise StructureError(f"theta has shape {theta.shape}; this layout needs ({layout.n_columns}, {layout.l}).")
-    _check_channels(data, layout)
+    check_channels(data, layout)
     return [_residuals_of(e.u, e.y, layout, theta, chunk) for e in data.experiments]
 
 
@@ -264,105 +248,28 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
     return result
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Part of a record: [u, y] or [u, y, weights] with the samples before its rows, and where it begins."""
+def _total(
+    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Any]
+) -> Any:
+    """Return the sums, of what `start` begins, over all rows of a record."""
+    np.empty(RETAINED, dtype=np.uint8)  # freed at once
+    if getattr(data, "parts", ()):
+        from optid.regressors.joining import total_of_parts
 
-    arrays: list[Array]
-    record: str
-    position: int
+        if weights is not None:
+            raise DataError(NO_WEIGHTS)
+        return total_of_parts(data, layout, start, chunk, threads)
 
-
-def _sum(
-    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, direct: bool
-) -> Sums:
-    def sum_part(part: _Part) -> Sums:
-        sums = Sums(layout, direct)
-        for block in _blocks(part, layout, chunk):
+    def sum_part(part: Stretch) -> Any:
+        sums = start()
+        for block in blocks_of(part, layout, chunk):
             sums.add(block)
         return sums
 
-    np.empty(RETAINED, dtype=np.uint8)  # freed at once
-    total = Sums(layout, direct)
-    for sums in mapped(sum_part, _parts(data, layout, weights, chunk), threads):
+    total = start()
+    for sums in mapped(sum_part, cut(data, layout, weights, chunk), threads):
         total.merge(sums)
     return total
-
-
-def _parts(data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int) -> Iterator[_Part]:
-    size = _block_size(layout, chunk)
-    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
-    for name, chunks in _records(data, layout, weights):
-        for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
-            yield _Part(arrays, name, i * length)
-
-
-def _blocks(part: _Part, layout: Layout, chunk: int) -> Iterator[Block]:
-    size = _block_size(layout, chunk)
-    for i, (u, y, *weights) in enumerate(stretches([part.arrays], layout.first_row, size)):
-        _check_inside(u, layout, part.record, part.position + i * size)
-        yield make_block(u, y, weights[0] if weights else None, layout)
-
-
-def _block_size(layout: Layout, chunk: int) -> int:
-    """New samples of a block; with those before them they are a chunk, so that chunks of a file are cut evenly."""
-    return max(chunk - layout.first_row, 32 * layout.first_row, 1)
-
-
-def _records(
-    data: Any, layout: Layout, weights: Sequence[Array] | None
-) -> Iterator[tuple[str, Iterable[Sequence[Array]]]]:
-    """Yield the name and the chunks (u, y) or (u, y, weights) of every experiment."""
-    _check_channels(data, layout)
-    if not hasattr(data, "experiments"):
-        if weights is not None:
-            raise DataError("weights are for records in memory; a stream has none.")
-        yield "", data
-        return
-    if weights is not None and len(weights) != len(data.experiments):
-        raise DataError(f"{len(weights)} arrays of weights for {len(data.experiments)} experiments: give one each.")
-    for i, experiment in enumerate(data.experiments):
-        name = f"experiment {i + 1}: " if len(data.experiments) > 1 else ""
-        count = len(experiment.y)
-        if count <= layout.first_row:
-            raise RankError(
-                f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. Leave it out, "
-                "or use fewer lags."
-            )
-        if weights is None:
-            yield name, [(experiment.u, experiment.y)]
-        else:
-            yield name, [(experiment.u, experiment.y, _checked_weights(weights[i], count, name))]
-
-
-def _checked_weights(weights: Any, count: int, name: str) -> Array:
-    weights = np.asarray(weights, dtype=float)
-    if weights.shape != (count,):
-        raise DataError(f"{name}weights have shape {weights.shape}; one per sample is needed, ({count},).")
-    bad = ~(np.isfinite(weights) & (weights >= 0))
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise DataError(f"{name}weight of sample {k} is {weights[k]}: weights are finite and not negative.")
-    return weights
-
-
-def _check_channels(data: Any, layout: Layout) -> None:
-    for kind, given, wanted in (("inputs", data.inputs, layout.inputs), ("outputs", data.outputs, layout.outputs)):
-        if len(given) != len(wanted):
-            raise DataError(
-                f"The data have {len(given)} {kind} ({', '.join(given)}), the model {len(wanted)} "
-                f"({', '.join(wanted)})."
-            )
-
-
-def _check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
-    for c, basis in enumerate(layout.bases):
-        if basis.outside == "error" and basis.n_outside(u[:, c]):
-            k = next(k for k in range(len(u)) if basis.n_outside(u[k : k + 1, c]))
-            raise DataError(
-                f"{name}input {layout.inputs[c]!r}, sample {position + k}: {u[k, c]:g} is outside the interval "
-                f"{basis.interval} of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
-            )
 
 
 def _explain_silence(basis: Basis, channel: str, function: int, lag: int) -> str:

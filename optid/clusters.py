@@ -1,0 +1,193 @@
+"""Dask clusters: reach a scheduler, refuse workers that run other programs, and say in words why a task was lost."""
+
+import re
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+from optid.errors import ClusterError
+
+DISTRIBUTED = 'pip install "optid[distributed]"'
+
+REACH = 3.0
+"""Seconds to reach the machine of a scheduler."""
+
+ANSWER = 10.0
+"""Seconds a scheduler has to answer once its machine is reached."""
+
+PACKAGES = ("optid", "numpy", "scipy", "numba")
+"""What workers and this process must have alike: they exchange objects of these, and compute the same digits."""
+
+SOURCES = ("optid", "formulations")
+"""Packages that are compared by their source files as well: an editable installation keeps its version number."""
+
+
+@contextmanager
+def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[Any]:
+    """Give a `distributed.Client` whose workers all run the same versions as this process.
+
+    Args:
+        scheduler: address ("tcp://host:8786", "host:8786"), path of a scheduler file (.json), or an open Client, which
+            stays open; for a cluster with certificates open the Client yourself.
+        packages: names of distributions to compare.
+
+    Raises:
+        ClusterError: Dask is not installed, nothing or something else answers at the address, no worker is there, or
+            workers have other versions; the message has the difference.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ClusterError(f"a scheduler needs dask and distributed: {DISTRIBUTED}") from None
+    if isinstance(scheduler, Client):
+        if scheduler.asynchronous:
+            raise ClusterError("an asynchronous Client cannot be waited for here: open Client(address).")
+        if scheduler.status != "running":
+            raise ClusterError(f"the Client is {scheduler.status}, not running: open it again.")
+        check_workers(scheduler, packages)
+        yield scheduler
+        return
+    with _opened(Client, scheduler) as client:
+        check_workers(client, packages)
+        yield client
+
+
+def _opened(client: Callable[..., Any], scheduler: Any) -> Any:
+    if not isinstance(scheduler, str) and not hasattr(scheduler, "__fspath__"):
+        raise ClusterError(f"scheduler={scheduler!r}: give an address such as 'tcp://host:8786', the path of a "
+                           "scheduler file, or a distributed.Client.")
+    text = str(scheduler)
+    if text.endswith(".json"):
+        try:
+            with open(text) as file:
+                file.read(1)
+        except OSError as error:
+            raise ClusterError(f"scheduler file {text!r} cannot be read: {error.strerror}.") from error
+        arguments = {"scheduler_file": text}
+    else:
+        arguments = {"address": _reached(text)}
+    try:
+        return client(**arguments, timeout=ANSWER, set_as_default=False)
+    except Exception as error:  # whatever the handshake with something else than a scheduler comes to
+        raise ClusterError(
+            f"no Dask scheduler answers at {text!r} within {ANSWER:g} s ({type(error).__name__}). Is this the port of "
+            "the scheduler (8786 by default), not of its dashboard (8787), and does it run the same version of Dask?"
+        ) from error
+
+
+def _reached(text: str) -> str:
+    """Return the complete address of a scheduler whose machine accepts a connection at that port."""
+    address = text if "://" in text else f"tcp://{text}"
+    try:
+        parts = urlsplit(address)
+        kind, host, port = parts.scheme, parts.hostname, parts.port
+    except ValueError:
+        kind = host = port = None
+    if not kind or not host or not port or not re.fullmatch(r"tcp|tls|ws|wss|ucxx?", kind):
+        raise ClusterError(f"{text!r} is not the address of a scheduler: write tcp://host:8786.")
+    try:
+        socket.create_connection((host, port), timeout=REACH).close()
+    except OSError as error:
+        why = error.strerror or ("no answer" if isinstance(error, TimeoutError) else str(error))
+        raise ClusterError(f"no scheduler can be reached at {address} ({why}). Is it running (dask scheduler), and is "
+                           "the port open from here?") from error
+    return address
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Return the versions that this process has: Python, each distribution, and a digest of optid's source files."""
+    return _reader(packages)()
+
+
+def _reader(packages: Sequence[str]) -> Callable[[], dict[str, str]]:
+    names, sources = tuple(packages), SOURCES
+
+    def read() -> dict[str, str]:  # nested: it travels by value, and so runs where optid is not installed
+        import hashlib
+        import sys
+        from importlib.metadata import PackageNotFoundError, version
+        from importlib.util import find_spec
+        from pathlib import Path
+
+        found = {"python": "{}.{}".format(*sys.version_info)}
+        for name in names:
+            try:
+                found[name] = version(name)
+            except PackageNotFoundError:
+                found[name] = "not installed"
+        for name in sources:
+            spec = find_spec(name)
+            if spec is None or spec.origin is None:
+                found[f"source files of {name}"] = "none"
+                continue
+            digest, folder = hashlib.sha256(), Path(spec.origin).parent
+            for path in sorted(folder.rglob("*.py")):
+                digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+            found[f"source files of {name}"] = digest.hexdigest()[:12]
+        return found
+
+    return read
+
+
+def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """Return what differs in words, "" where nothing does."""
+    return ", ".join(f"{name}: {here[name]} here, {there.get(name, 'not installed')} there"
+                     for name in here if there.get(name) != here[name])
+
+
+def check_workers(client: Any, packages: Sequence[str]) -> dict[str, str]:
+    """Return the versions of this process once every worker is known to have the same.
+
+    Raises:
+        ClusterError: no worker, or the first one that differs, with the difference.
+    """
+    reader = _reader(packages)
+    here = reader()
+    there = client.run(reader, on_error="return")
+    if not there:
+        address = client.scheduler.address
+        raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
+    for worker, found in there.items():
+        if isinstance(found, BaseException):
+            raise ClusterError(f"worker {worker} cannot say which versions it has: {type(found).__name__}: {found}")
+        if text := difference(here, found):
+            same = sum(difference(here, other) == text for other in there.values() if isinstance(other, dict))
+            others = f" ({same} of {len(there)} workers)" if len(there) > 1 else ""
+            raise ClusterError(f"worker {worker}{others} has other packages: {text}. Install the same versions there.")
+    return here
+
+
+def result_of(client: Any, task: Any) -> Any:
+    """Return the computed result of a delayed task; errors of the task itself are raised as they are.
+
+    Raises:
+        ClusterError: the workers that ran it died, or the scheduler went away.
+    """
+    with lost_in_words():
+        future = client.compute(task)
+        try:
+            return future.result()
+        finally:
+            future.release()
+
+
+@contextmanager
+def lost_in_words() -> Iterator[None]:
+    """Turn what Dask raises when workers or the scheduler are gone into a `ClusterError`."""
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm.core import CommClosedError
+
+    try:
+        yield
+    except KilledWorker as error:
+        raise ClusterError(
+            f"{error.allowed_failures + 1} workers died one after the other over the same task, the last at "
+            f"{error.last_worker.address}. Most often memory ran out: give workers more, or open the record with a "
+            "smaller chunk or smaller partitions."
+        ) from error
+    except (CancelledError, CommClosedError) as error:
+        raise ClusterError(
+            f"the scheduler went away while it was waited for ({type(error).__name__}: {error})."
+        ) from error
