@@ -12,17 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.errors import OptidError
+from optid.errors import DatabaseError, OptidError
 from optid.studies.rows import COLUMNS, NAMES, SCHEMA_VERSION, complete
 
 if TYPE_CHECKING:
     import duckdb
 
+FORMATS: dict[str, str] = {".parquet": "FORMAT parquet", ".csv": "FORMAT csv, HEADER"}
 PATIENCE = 10.0  # seconds to wait for another process that has the file open for a moment
-
-
-class DatabaseError(OptidError, RuntimeError):
-    """The database cannot be used: missing, not a study's, of another version, locked, or the disk is full."""
 
 
 @contextmanager
@@ -77,7 +74,7 @@ def _create(connection: "duckdb.DuckDBPyConnection") -> None:
     from optid import __version__
 
     connection.execute("BEGIN")
-    connection.execute(f"CREATE TABLE rows ({columns}, PRIMARY KEY (key, repetition))")
+    connection.execute(f"CREATE TABLE rows ({columns}, PRIMARY KEY (study, key, repetition))")
     connection.execute(f"CREATE TABLE superseded ({columns})")
     connection.execute("CREATE TABLE studies (study VARCHAR PRIMARY KEY, description VARCHAR)")
     connection.execute("CREATE TABLE meta (name VARCHAR PRIMARY KEY, value VARCHAR)")
@@ -100,7 +97,10 @@ def _check(path: Path, connection: "duckdb.DuckDBPyConnection") -> None:
 
 
 def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows in one transaction; an older row of the same place in the grid moves to the table ``superseded``.
+    """Append rows in one transaction.
+
+    A row whose place in the grid is taken by one of another key (other data, options or versions), or whose key stands
+    at another place of the study (other labels), moves the older one to the table ``superseded``.
 
     Args:
         path: the database; made when it is not there.
@@ -118,10 +118,10 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
         connection.register("batch", {c.name: _packed([row[c.name] for row in whole], c.kind) for c in COLUMNS})
         names = ", ".join(f'"{name}"' for name in NAMES)
         casts = ", ".join(f'CAST("{c.name}" AS {c.sql})' for c in COLUMNS)
-        older = ("SELECT {} FROM rows WHERE place IN (SELECT place FROM batch) "
-                 "AND (key, repetition) NOT IN (SELECT (key, repetition) FROM batch)")
-        connection.execute(f"INSERT INTO superseded {older.format(names)}")
-        connection.execute(f"DELETE FROM rows WHERE (key, repetition) IN ({older.format('(key, repetition)')})")
+        older = ("EXISTS (SELECT 1 FROM batch AS b WHERE b.study = rows.study AND ((b.place = rows.place) <> "
+                 "(b.key = rows.key AND b.repetition = rows.repetition)))")
+        connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {older}")
+        connection.execute(f"DELETE FROM rows WHERE {older}")
         connection.execute(f"INSERT INTO rows ({names}) SELECT {casts} FROM batch")
 
 
@@ -191,8 +191,12 @@ def _unpacked(values: Any, kind: str, always: bool) -> np.ndarray:
     return np.asarray(np.ma.filled(np.ma.asarray(values, dtype=float), np.nan), dtype=float)
 
 
-def finished(path: str | Path) -> set[tuple[str, int]]:
+def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
     """Return (key, repetition) of every row; empty where there is no database yet.
+
+    Args:
+        path: the database.
+        study: only rows of this study.
 
     Raises:
         DatabaseError: as in `opened`.
@@ -200,7 +204,9 @@ def finished(path: str | Path) -> set[tuple[str, int]]:
     if not Path(path).exists():
         return set()
     with opened(path) as connection:
-        return {(key, int(number)) for key, number in connection.execute("SELECT key, repetition FROM rows").fetchall()}
+        condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
+        found = connection.execute(f"SELECT key, repetition FROM rows {condition}", values).fetchall()
+    return {(key, int(repetition)) for key, repetition in found}
 
 
 def data_hashes(path: str | Path) -> dict[tuple[str, str], set[str]]:
@@ -219,6 +225,18 @@ def data_hashes(path: str | Path) -> dict[tuple[str, str], set[str]]:
     return hashes
 
 
+def check_target(target: str | Path) -> Path:
+    """Return the path of a file that rows can be exported to, before there are any.
+
+    Raises:
+        DatabaseError: another ending than .parquet or .csv.
+    """
+    target = Path(target)
+    if target.suffix.lower() not in FORMATS:
+        raise DatabaseError(f"{target}: rows are exported to a file that ends in {' or '.join(FORMATS)}")
+    return target
+
+
 def export(path: str | Path, target: str | Path) -> int:
     """Write the rows to a Parquet or CSV file and return how many there are.
 
@@ -229,10 +247,7 @@ def export(path: str | Path, target: str | Path) -> int:
     Raises:
         DatabaseError: another ending, the target cannot be written, or as in `opened`.
     """
-    target = Path(target)
-    formats: dict[str, str] = {".parquet": "FORMAT parquet", ".csv": "FORMAT csv, HEADER"}
-    if target.suffix.lower() not in formats:
-        raise DatabaseError(f"{target}: rows are exported to a file that ends in .parquet or .csv")
+    target = check_target(target)
     names = ", ".join(f'"{name}"' for name in NAMES)
     with opened(path) as connection:
         import duckdb
@@ -240,7 +255,7 @@ def export(path: str | Path, target: str | Path) -> int:
         try:
             count = connection.execute(
                 f"COPY (SELECT {names} FROM rows ORDER BY started, key, repetition) "
-                f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({formats[target.suffix.lower()]})").fetchone()
+                f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({FORMATS[target.suffix.lower()]})").fetchone()
         except duckdb.Error as error:
             raise DatabaseError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
     return int(count[0]) if count else 0
