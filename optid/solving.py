@@ -94,7 +94,11 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
                        reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
 
     clock = time.perf_counter()
-    point = _judged(program, answer)
+    try:
+        point = _judged(program, answer)
+    except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
+        why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     bound: Bound | None = None
@@ -122,8 +126,16 @@ class _Judged:
 
 
 def _judged(program: Program, answer: Answer) -> _Judged:
-    objective, residuals = judge(program, answer.values, answer.duals)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
+        objective, residuals = judge(program, answer.values, answer.duals)
     return _Judged(program.values(), dict(answer.duals), objective, residuals)
+
+
+def _overflowed(program: Program) -> bool:
+    """Whether quantities that follow from the assigned variables are not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = [np.asarray(expression.value) for expression in program.derived.values()]
+    return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
 
 
 def _tolerance(accuracy: float) -> float:

@@ -36,6 +36,12 @@ def test_a_claim_that_is_taken_back_is_false(status, x, false):
     assert solution.claim is status and solution.false_claim is false
 
 
+@pytest.mark.parametrize("x, words", [([1e200, 1.0], "inf"), ([1.0, 2.0, 3.0], "cannot be judged: cannot reshape")])
+def test_a_point_of_another_shape_or_beyond_numbers_is_a_failure(x, words):
+    solution = solve(_program(), _claiming(Status.OPTIMAL, {"x": np.array(x)}))
+    assert solution.status is Status.FAILED and words in solution.reason + str(solution.objective)
+
+
 def test_nothing_claimed_is_not_false():
     assert not Solution(Status.FAILED, "", "").false_claim
 

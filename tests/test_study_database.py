@@ -66,6 +66,24 @@ def test_a_newer_row_of_the_same_place_moves_the_older_aside(path):
         assert connection.execute("SELECT key FROM superseded").fetchall() == [(made[3]["key"],)]
 
 
+def test_a_cell_under_another_label_moves_the_former_row_aside(path):
+    made = rows(10)
+    append(path, made)
+    append(path, [{**made[3], "solver": "renamed", "place": "p" * 32}])
+    found = read_rows(path)
+    assert len(found["key"]) == 10 and "renamed" in found["solver"]
+    with opened(path) as connection:
+        assert connection.execute("SELECT solver FROM superseded").fetchall() == [(made[3]["solver"],)]
+
+
+def test_studies_in_one_database_do_not_touch_each_other(path):
+    made = rows(10)
+    append(path, made)
+    append(path, [{**row, "study": "another", "place": row["place"][::-1]} for row in made[:4]])
+    assert [read_rows(path, name)["key"].size for name in ("synthetic", "another")] == [10, 4]
+    assert len(finished(path, "another")) == 4 and read_rows(path)["key"].size == 14
+
+
 @pytest.mark.parametrize("ending", ["parquet", "csv"])
 def test_export_has_every_row_and_column(path, tmp_path, ending):
     import pandas as pd

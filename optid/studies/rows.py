@@ -61,7 +61,7 @@ class Column:
 COLUMNS: tuple[Column, ...] = (
     # which cell
     Column("key", "text", "SHA-256 of everything that determines the result, the machine excepted", always=True),
-    Column("repetition", "integer", "counted from 0; (key, repetition) identifies a row", always=True),
+    Column("repetition", "integer", "counted from 0; (study, key, repetition) identifies a row", always=True),
     Column("place", "text", "hash of the labels below: the place in the grid, the same for other versions and options",
            always=True),
     Column("study", "text", "title of the study", always=True),
@@ -86,7 +86,6 @@ COLUMNS: tuple[Column, ...] = (
     Column("time_limit", "number", "longest time a cell may take", "s", always=True),
     Column("memory_limit", "number", "largest memory a cell may take", "MB", always=True),
     # the record
-    Column("record_hash", "text", "SHA-256 of the samples and channel names that the cell saw"),
     Column("n_samples", "integer", "samples of the record, all experiments together"),
     Column("n_estimation", "integer", "samples that the fit saw"),
     Column("n_inputs", "integer", "inputs of the record"),

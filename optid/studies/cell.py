@@ -1,0 +1,239 @@
+"""Run one cell of a study: load its record, fit, judge the model on what the fit did not see, and return the row.
+
+Nothing that a fit does is an exception here. What even a row cannot survive (an endless loop, a segmentation fault) is
+for whoever runs the worker: `lost_row` makes the row of a cell that could not make its own.
+"""
+
+import time
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from optid.errors import SolverMissing, SolverRefused
+from optid.fitting import Fit, fit
+from optid.solution import Solution, Times
+from optid.solving import NOT_FINITE, solve
+from optid.studies.environment import machine
+from optid.studies.grid import Cell
+from optid.studies.memory import Peak
+from optid.studies.records import Record, load
+from optid.studies.rows import (
+    DONE,
+    ERROR,
+    MEMORY_LIMIT,
+    NON_FINITE,
+    REFUSED,
+    SUCCESS,
+    as_json,
+    complete,
+    place,
+)
+from optid.studies.versions import determining
+
+KEPT = 3
+"""Records that a worker keeps, so that cells of one data set load it once."""
+
+_records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
+
+
+def run_cell(cell: Cell) -> dict[str, Any]:
+    """Run a cell and return its row, whatever the fit does.
+
+    The solver's own clock is set to the time limit, and it runs in this process: whoever calls this stops a process
+    that does not keep its limits.
+
+    Args:
+        cell: what to run.
+    """
+    started, clock = datetime.now(UTC), time.perf_counter()
+    if cell.refusal:
+        return lost_row(cell, REFUSED, cell.refusal, started=started)
+    peak = Peak()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what weakens an answer is in the figures of the row
+            found = _ran(cell)
+    except (SolverRefused, SolverMissing) as refusal:
+        found = {"outcome": REFUSED, "reason": str(refusal)}
+    except MemoryError as error:
+        found = {"outcome": MEMORY_LIMIT, "reason": f"MemoryError: {error}"}
+    except (Exception, SystemExit) as error:
+        found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
+    return complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
+                     "base_mb": peak.start, "total_s": time.perf_counter() - clock})
+
+
+def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None,
+             peak_mb: float | None = None) -> dict[str, Any]:
+    """Return the row of a cell that made none itself.
+
+    Args:
+        cell: which.
+        outcome: one of `rows.OUTCOMES`.
+        reason: one sentence.
+        started: when it was started; now when not given.
+        total_s: seconds until it was stopped.
+        peak_mb: largest memory seen.
+    """
+    return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s, "peak_mb": peak_mb,
+                     "started": (started or datetime.now(UTC)).isoformat()})
+
+
+def known(cell: Cell) -> dict[str, Any]:
+    """Return the columns of a cell that are known before it runs."""
+    labels = (cell.study, cell.data, cell.formulation, cell.solver, cell.samples, cell.noise, cell.seed, cell.accuracy,
+              cell.repetition)
+    entry = cell.data_source
+    versions = determining(cell.formulation_name, cell.solver_name, entry.system is not None)
+    return {
+        "key": cell.key, "repetition": cell.repetition, "place": place(*labels), "study": cell.study,
+        "data": cell.data, "formulation": cell.formulation, "solver": cell.solver, "system": entry.system,
+        "file": ", ".join(map(str, entry.files)) or None, "data_hash": cell.data_hash or None,
+        "samples": cell.samples, "n_estimation": cell.samples, "noise": cell.noise, "seed": cell.seed,
+        "formulation_name": cell.formulation_name,
+        "options": as_json(cell.options), "constraints": as_json(cell.constraints), "solver_name": cell.solver_name,
+        "solver_options": as_json(cell.solver_options), "accuracy": cell.accuracy, "warm": cell.warm,
+        "holdout": cell.holdout, "time_limit": cell.time_limit, "memory_limit": cell.memory_limit,
+        "machine": machine(), "versions": as_json(versions),
+    }
+
+
+def _ran(cell: Cell) -> dict[str, Any]:
+    clock = time.perf_counter()
+    record = _loaded(cell)
+    data = record.data
+    held = 0 if record.holdout is None else _length(record.holdout)
+    row: dict[str, Any] = {"load_s": time.perf_counter() - clock, "n_samples": _length(data) + held,
+                           "n_estimation": _length(data), "n_inputs": data.m, "n_outputs": data.l}
+    fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy,
+                 time_limit=cell.time_limit, isolate=False, constraints=cell.constraints,
+                 solver_options=dict(cell.solver_options), raises=False, **cell.options)
+    row |= _verdict(fitted) | _times(fitted)
+    if cell.warm and not fitted.procedure and len(fitted.steps) == 1 and fitted.solution.has_point:
+        row |= _warm(cell, fitted)
+    remarks = [row["reason"]]
+    if fitted.model is not None:
+        row |= _figures(fitted.model, record, remarks)
+    row["reason"] = "; ".join(filter(None, remarks)) or None
+    return row | _finiteness(fitted, row)
+
+
+def _loaded(cell: Cell) -> Record:
+    """The record of a cell, from the last few that this worker loaded where it is among them."""
+    entry = cell.data_source
+    identity = (cell.data_hash, entry.system, cell.samples, cell.noise, cell.seed, cell.holdout, as_json(entry.options))
+    if identity not in _records:
+        _records[identity] = load(cell)
+        while len(_records) > KEPT:
+            _records.popitem(last=False)
+    _records.move_to_end(identity)
+    return _records[identity]
+
+
+def _length(data: Any) -> int:
+    return sum(experiment.n_samples for experiment in data.experiments)
+
+
+def _verdict(fitted: Fit) -> dict[str, Any]:
+    """Why it stopped, whether there is a point, whether it is proved, and the residuals."""
+    solution, program = fitted.solution, fitted.program
+    bound, residuals = solution.bound, solution.residuals
+    steps = [step for _, step in fitted.steps]
+    counts = [step.iterations for step in steps]
+    row = {
+        "outcome": DONE, "status_claimed": solution.claimed, "status_verified": str(solution.status),
+        "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
+        "false_claim": any(step.false_claim for step in steps), "solver_used": solution.solver,
+        "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
+        "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
+        "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
+    }
+    if residuals is not None:
+        row |= {"violation": residuals.violation, "stationarity": residuals.stationarity,
+                "complementarity": residuals.complementarity}
+    return row
+
+
+def _times(fitted: Fit) -> dict[str, Any]:
+    phases = [step.times for _, step in fitted.steps]
+    return {"build_s": fitted.solution.times.build, **_compiled(phases), "judge_s": sum(t.judge for t in phases),
+            "prove_s": sum(t.prove for t in phases), "fit_s": fitted.seconds}
+
+
+def _compiled(phases: list[Times]) -> dict[str, Any]:
+    """Compilation, where it was told apart in at least one programme, and the rest of the solving."""
+    told = [t.compile for t in phases if np.isfinite(t.compile)]
+    return {"compile_s": sum(told) if told else None, "solve_s": sum(t.solve for t in phases) - sum(told)}
+
+
+def _warm(cell: Cell, fitted: Fit) -> dict[str, Any]:
+    """Solve once more from the solution; the programme and what was compiled of it are at hand."""
+    program = replace(fitted.program, start=dict(fitted.solution.values))
+    again: Solution = solve(program, cell.solver_name, accuracy=cell.accuracy, time_limit=cell.time_limit,
+                            isolate=False, prove=False, **cell.solver_options)
+    return {"warm_s": again.times.solve, "warm_status": str(again.status),
+            "warm_iterations": again.iterations if again.iterations >= 0 else None}
+
+
+def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str, Any]:
+    """The figures of a model; one that cannot be had is left out, with a remark where that is a failure."""
+    from optid.validation import fit_percent
+    from optid.validation.predictions import one_step, simulated
+
+    def attempt(what: str, compute: Callable[[], Any]) -> Any:
+        try:
+            with np.errstate(all="ignore"):
+                return compute()
+        except Exception as error:
+            remarks.append(f"no {what}: {error}")
+            return None
+
+    row: dict[str, Any] = {}
+    if record.holdout is not None:
+        raw = record.holdout.raw()
+        measured = np.vstack([e.y for e in raw.experiments])
+        for name, what, outputs in (("one_step_fit", "one-step fit", lambda: one_step(model, raw)),
+                                    ("simulation_fit", "simulation fit", lambda: simulated(model, raw))):
+            fits = attempt(what, lambda outputs=outputs: fit_percent(measured, np.vstack(outputs())))
+            if fits is not None:
+                row |= {name: float(np.mean(fits)), f"{name}s": as_json(fits)}
+    truth = record.truth
+    if truth is not None:
+        row["parameter_error"] = attempt("parameter error", lambda: truth.parameter_error(model))
+        row["nonlinearity_error"] = attempt("nonlinearity error", lambda: truth.nonlinearity_error(model))
+    poles = attempt("poles", lambda: np.atleast_1d(np.asarray(model.poles, dtype=complex)))
+    if poles is not None:
+        row |= {"poles": as_json([[p.real, p.imag] for p in poles.tolist()]), "stable": bool(np.all(np.abs(poles) < 1))}
+    parameters = attempt("parameters", lambda: _parameters(model))
+    return row | {"parameters": None if parameters is None else as_json(parameters)}
+
+
+def _parameters(model: Any) -> Mapping[str, Any]:
+    from optid.models.functions import static_functions
+
+    named: dict[str, Any] = {name: float(value) for name, value in model.coefficients()}
+    for function in static_functions(model):
+        word = function.word.partition("_")[0].replace("f", "mu", 1).replace("g", "nu", 1)
+        named[f"{word}[{function.name}]"] = function.nonlinearity.mu.tolist()
+    return named
+
+
+def _finiteness(fitted: Fit, row: Mapping[str, Any]) -> dict[str, Any]:
+    """The outcome of a fit whose point, objective or model holds numbers that are not finite; else nothing."""
+    solution = fitted.solution
+    if any(step.reason.endswith(NOT_FINITE) for _, step in fitted.steps):
+        return {"outcome": NON_FINITE}
+    wrong = []
+    if solution.has_point and not np.isfinite(solution.objective):
+        wrong.append(f"the objective is {solution.objective}")
+    if np.isinf(row.get("one_step_fit") or 0.0):
+        wrong.append("the predictions of the model are not finite")
+    if fitted.model is not None and "null" in (row.get("parameters") or ""):
+        wrong.append("the model has parameters that are not finite")
+    return {"outcome": NON_FINITE, "reached": False, "proved": False,
+            "reason": "; ".join(filter(None, [*wrong, row["reason"]]))} if wrong else {}

@@ -1,0 +1,46 @@
+"""Resident memory of this process: now, and at its largest since a moment."""
+
+import resource
+import sys
+from pathlib import Path
+
+MB = 1e6
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def resident_mb() -> float:
+    """Return the resident memory of this process now, in MB."""
+    import psutil
+
+    return psutil.Process().memory_info().rss / MB
+
+
+class Peak:
+    """Largest resident memory of this process since the object was made.
+
+    Linux keeps the figure and lets a process reset it. Elsewhere it is the largest of the whole life of the process
+    where that grew meanwhile, and the larger of start and end where it did not.
+    """
+
+    def __init__(self) -> None:
+        self.start = resident_mb()
+        try:
+            _CLEAR.write_text("5")
+            self._exact = True
+        except OSError:
+            self._exact = False
+            self._before = _lifetime_mb()
+
+    def mb(self) -> float:
+        """Return the peak until now, in MB."""
+        if self._exact:
+            for line in _STATUS.read_text().splitlines():
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) * 1024 / MB
+        lifetime = _lifetime_mb()
+        return lifetime if lifetime > self._before else max(self.start, resident_mb())
+
+
+def _lifetime_mb() -> float:
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest / MB if sys.platform == "darwin" else largest * 1024 / MB

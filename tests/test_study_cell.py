@@ -1,0 +1,183 @@
+"""One cell: whatever the fit does is a row."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from optid import Data, fit
+from optid.backends import Answer, BackEnd, back_ends
+from optid.solution import Status
+from optid.studies import cell as cells
+from optid.studies.cell import lost_row, run_cell
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.grid import cells as expand
+from optid.studies.rows import NAMES
+
+OPTIONS = {"na": 2, "nb": 2, "basis": "triangular:6"}
+
+
+def one(solver="gauss_newton", formulation="hammerstein_arx.exact", *, entry=None, options=OPTIONS, constraints=(),
+        solver_options=None, **settings):
+    entry = entry or DataEntry("dead zone", system="dead_zone", samples=(300,), noise=(0.1,))
+    study = Study("small", (entry,), (FormulationEntry("f", formulation, constraints, options),),
+                  (SolverEntry("s", solver, options=solver_options or {}),), **settings)
+    return expand(study)[0]
+
+
+@pytest.fixture
+def solver(monkeypatch):
+    """Register a back end for the test."""
+
+    def register(run, classes=("rank-one",)):
+        monkeypatch.setitem(back_ends(), "mine", BackEnd("mine", frozenset(classes), run))
+        return "mine"
+
+    return register
+
+
+def test_a_row_has_what_the_fit_says():
+    cell = one(holdout=0.25)
+    row = run_cell(cell)
+    assert tuple(row) == NAMES
+    assert (row["outcome"], row["status_verified"], row["reached"], row["proved"]) == ("done", "optimal", True, True)
+    record = cells.load(cell)
+    direct = fit(record.data, cell.formulation_name, solver="gauss_newton", **OPTIONS)
+    assert row["objective"] == pytest.approx(direct.solution.objective, rel=1e-12)
+    assert json.loads(row["parameters"])["a1"] == pytest.approx(direct.model.a[0], rel=1e-12)
+    poles = [complex(*pole) for pole in json.loads(row["poles"])]
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(direct.model.poles), rtol=1e-9)
+    assert row["n_estimation"] == 300 and row["n_samples"] == 400
+    y, predicted = record.holdout.y, direct.model.predict(record.holdout)
+    here = ~np.isnan(predicted[:, 0])
+    e, y = (y - predicted)[here, 0], y[here, 0]
+    expected = 100 * (1 - np.linalg.norm(e) / np.linalg.norm(y - y.mean()))
+    assert row["one_step_fit"] == pytest.approx(expected, rel=1e-9)
+    assert row["simulation_fit"] < row["one_step_fit"]
+    assert 0.0 < row["parameter_error"] < 0.2 and 0.0 < row["nonlinearity_error"] < 0.2
+    assert row["build_s"] > 0.0 and row["solve_s"] > 0.0 and row["total_s"] >= row["fit_s"]
+    assert row["peak_mb"] >= row["base_mb"] > 10.0
+
+
+def test_the_record_is_loaded_once_per_worker(monkeypatch):
+    cells._records.clear()
+    calls = []
+    monkeypatch.setattr(cells, "load", lambda cell, real=cells.load: calls.append(cell.seed) or real(cell))
+    study_cells = [one(seeds=(seed,)) for seed in (1, 2, 1, 3, 4, 1)]
+    for cell in study_cells:
+        cells._loaded(cell)
+    assert calls == [1, 2, 3, 4]
+    assert len(cells._records) == cells.KEPT
+
+
+def test_warm_is_a_second_solve_from_the_solution():
+    row = run_cell(one("ipopt", warm=True))
+    assert row["warm_s"] > 0.0 and row["warm_status"] == "locally optimal"
+    assert row["warm_iterations"] <= row["iterations"]
+    assert run_cell(one("ipopt"))["warm_s"] is None
+
+
+def test_a_procedure_has_its_steps_and_their_times():
+    row = run_cell(one("auto", "subspace.nuclear", options={"nx": 2}, warm=True))
+    assert row["outcome"] == "done" and row["n_programs"] > 1 and row["warm_s"] is None
+    assert row["build_s"] > 0.0
+    assert row["build_s"] + row["compile_s"] + row["solve_s"] + row["judge_s"] + row["prove_s"] <= row["fit_s"] * 1.01
+
+
+def test_a_file_without_truth(tmp_path):
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 400)
+    y = np.convolve(u, [0.0, 0.5, 0.3])[:400] + 0.01 * rng.standard_normal(400)
+    np.savetxt(tmp_path / "x.csv", np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+    entry = DataEntry("mine", files=("x.csv",), options={"inputs": ["u"], "outputs": ["y"], "dt": 0.1})
+    row = run_cell(one("clarabel", "arx", entry=entry, options={"na": 1, "nb": 2, "nk": 1}, folder=tmp_path))
+    assert row["outcome"] == "done" and row["parameter_error"] is None and row["data_hash"]
+    assert row["n_samples"] == 400 and row["n_estimation"] == 280
+    assert row["one_step_fit"] > 95.0 and row["samples"] is None and row["seed"] is None
+
+
+def test_nothing_held_out():
+    row = run_cell(one(holdout=0.0))
+    assert row["one_step_fit"] is row["simulation_fit"] is None and row["parameter_error"] is not None
+
+
+@pytest.mark.parametrize("cell, outcome, words", [
+    (lambda: one("clarabel"), "refused", "not convex in constraint"),
+    (lambda: replace(one(), refusal="gurobi is not installed"), "refused", "not installed"),
+    (lambda: replace(one(), solver_name="gurobi"), "refused", "pip install gurobipy"),
+    (lambda: replace(one(), options={**OPTIONS, "na": -1}), "error", "StructureError.*na"),
+    (lambda: replace(one(), options={**OPTIONS, "nab": 1}), "error", "takes no argument 'nab'"),
+    (lambda: one(options={**OPTIONS, "na": 200, "nb": 200}), "error", "RankError"),
+    (lambda: replace(one(), constraints=("monoton:increasing",)), "error", "Did you mean 'monotone'"),
+    (lambda: one(entry=DataEntry("flat", record=Data(np.ones(100), np.arange(100.0)))), "error", "RankError|DataError"),
+    (lambda: replace(one(), formulation_name="hammerstein_arx.exact", samples=None), "error", "needs a length"),
+])
+def test_what_cannot_be_run_is_a_row_with_its_reason(cell, outcome, words):
+    import re
+
+    row = run_cell(cell())
+    assert row["outcome"] == outcome and re.search(words, row["reason"])
+    assert not row["reached"] and row["objective"] is None
+
+
+@pytest.mark.parametrize("error, outcome", [
+    (MemoryError("Unable to allocate 3 TiB"), "memory limit"), (SystemExit(3), "error"),
+    (ZeroDivisionError("x"), "error"),
+])
+def test_errors_outside_the_solver(monkeypatch, error, outcome):
+    def broken(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr(cells, "fit", broken)
+    row = run_cell(one())
+    assert row["outcome"] == outcome and str(error) in row["reason"]
+
+
+def _values(program, change):
+    return {name: change(np.array(value, dtype=float)) for name, value in program.start.items()}
+
+
+def test_a_solver_that_returns_nan_is_an_outcome(solver):
+    name = solver(lambda program, settings: Answer(
+        Status.OPTIMAL, "solved!", _values(program, lambda v: np.full_like(v, np.nan))))
+    row = run_cell(one(name))
+    assert (row["outcome"], row["status_verified"], row["false_claim"]) == ("non-finite", "failed", True)
+    assert "non-finite" in row["reason"] and row["objective"] is None and row["one_step_fit"] is None
+
+
+@pytest.mark.parametrize("factor", [1e100, 1e200])
+def test_a_solver_whose_point_overflows_is_an_outcome(solver, factor):
+    name = solver(lambda program, settings: Answer(
+        Status.OPTIMAL, "solved!", _values(program, lambda v: v * factor)))
+    row = run_cell(one(name))
+    assert row["outcome"] == "non-finite" and not row["reached"] and row["false_claim"]
+    assert all(value is None or not isinstance(value, float) or np.isfinite(value) for value in row.values())
+
+
+def test_a_solver_that_lies_is_caught(solver):
+    name = solver(lambda program, settings: Answer(Status.OPTIMAL, "solved!", _values(program, lambda v: v + 0.5)))
+    row = run_cell(one(name))
+    assert row["outcome"] == "done" and row["status_claimed"] == "solved!"
+    assert row["false_claim"] and not row["reached"] and not row["proved"]
+
+
+def test_a_solver_that_raises_is_judged_not_lost(solver):
+    def run(program, settings):
+        raise RuntimeError("segment lost")
+
+    row = run_cell(one(solver(run)))
+    assert (row["outcome"], row["status_verified"]) == ("done", "failed") and "segment lost" in row["reason"]
+    assert not row["false_claim"]
+
+
+def test_an_infeasible_cell_is_done():
+    row = run_cell(one("ipopt", constraints=("monotone:increasing", "slope:-5,-4")))
+    assert row["outcome"] == "done" and not row["reached"], row["reason"]
+    assert row["status_verified"] in ("infeasible", "failed", "inaccurate")
+
+
+def test_the_row_of_a_cell_that_made_none():
+    row = lost_row(one(), "crashed", "the worker died: signal SIGSEGV", total_s=1.5, peak_mb=300.0)
+    assert tuple(row) == NAMES and row["reason"].endswith("SIGSEGV") and row["n_estimation"] == 300
+    assert (row["key"], row["place"]) == tuple(run_cell(one())[name] for name in ("key", "place"))
