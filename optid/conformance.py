@@ -1,20 +1,25 @@
-"""Conformance of a back end: it is run over the zoo and judged by our residuals; third parties can run it too.
+"""Conformance of back ends and formulations, judged by our residuals; third parties can run it too.
 
-    from optid.conformance import check_back_end
+    from optid.conformance import check_back_end, check_formulation
     check_back_end(my_back_end)
+    check_formulation(my_formulation, data, na=2, nb=2)
 
 A conformant back end never makes a claim that the known answer or our residuals contradict. It may fail honestly on
-cases marked hard, and need not recognise infeasible or unbounded programmes as such.
+cases marked hard, and need not recognise infeasible or unbounded programmes as such. A conformant formulation gives a
+model that predicts, leaves the caller's record alone, and refuses what it cannot take with a named error.
 """
 
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from optid.backends import BackEnd
-from optid.errors import OptidError
+from optid.data import Data
+from optid.errors import DataWarning, OptidError
 from optid.program import Program
 from optid.solution import Solution, Status
 from optid.solving import solve
@@ -27,7 +32,7 @@ DUAL = 1e-4
 
 
 class ConformanceError(OptidError, AssertionError):
-    """A back end does not do what it claims; the message lists every complaint."""
+    """A back end or a formulation does not do what it claims; the message lists every complaint."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,84 @@ def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
     if complaints:
         raise ConformanceError(f"{back_end.name} is not conformant:\n  " + "\n  ".join(complaints))
     return rows
+
+
+def check_formulation(formulation: str | Callable[..., Any], data: Data, **arguments: Any) -> None:
+    """Pose a formulation on a record, on damaged copies of it, and on what it must refuse.
+
+    Args:
+        formulation: registered name, or the function itself.
+        data: a record that the model should describe, with at least 100 samples.
+        arguments: of the formulation.
+
+    Raises:
+        ConformanceError: lists all complaints.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        complaints = list(_about_formulation(formulation, data, arguments))
+    if complaints:
+        name = formulation if isinstance(formulation, str) else getattr(formulation, "__name__", "formulation")
+        raise ConformanceError(f"{name} is not conformant:\n  " + "\n  ".join(complaints))
+
+
+def _about_formulation(formulation: str | Callable[..., Any], data: Data, arguments: dict[str, Any]) -> Iterator[str]:
+    from optid.fitting import fit
+
+    def attempt(record: Data, **more: Any) -> Any:
+        try:
+            return fit(record, formulation, prove=False, **{**arguments, **more})
+        except Exception as error:
+            return error
+
+    before = [(e.u.copy(), e.y.copy()) for e in data.experiments]
+    found = attempt(data)
+    if isinstance(found, Exception):
+        yield f"the record: {type(found).__name__}: {found}"
+        return
+    if not all(np.array_equal(a, b, equal_nan=True) for e, pair in zip(data.experiments, before)
+               for a, b in zip((e.u, e.y), pair)):
+        yield "the caller's record was changed"
+    if found.solution.status not in SUCCESS:
+        yield f"the record: {found.solution.status}: {found.solution.reason}"
+    yield from _about_model(found.model, data)
+    whole = data.experiments[0]
+    holes = whole.y.copy()
+    holes[len(holes) // 2 :: 17] = np.nan
+    half = len(holes) // 2
+    damaged = {
+        "missing samples": Data(whole.u, holes, data.dt),
+        "two experiments": Data([whole.u[:half], whole.u[half:]], [whole.y[:half], whole.y[half:]], data.dt),
+    }
+    short, still = Data(whole.u[:3], whole.y[:3], data.dt), Data(0 * whole.u, whole.y, data.dt)
+    for what, record in {**damaged, "3 samples": short, "an input that never moves": still}.items():
+        again = attempt(record)
+        if isinstance(again, Exception) and not isinstance(again, OptidError):
+            yield f"{what}: {type(again).__name__}: {again} (an error of optid.errors is asked for, with the remedy)"
+        elif what not in damaged and not isinstance(again, Exception):
+            yield f"{what}: accepted"
+    if not isinstance(again := attempt(data, no_such_argument=1), OptidError):
+        yield f"an unknown argument is not refused by name: {type(again).__name__}"
+
+
+def _about_model(model: Any, data: Data) -> Iterator[str]:
+    """What the rest of optid asks of a model."""
+    for name in ("inputs", "outputs", "dt", "nonlinearities", "memory", "poles", "kind"):
+        if not hasattr(model, name):
+            yield f"the model has no {name}"
+    whole = data.experiments[0]
+    for name in ("predict", "simulate"):
+        try:
+            found = np.asarray(getattr(model, name)(Data(whole.u, whole.y, data.dt)), dtype=float)
+        except Exception as error:
+            yield f"model.{name}: {type(error).__name__}: {error}"
+            continue
+        if found.shape != whole.y.shape:
+            yield f"model.{name} returns shape {found.shape} for a record with outputs {whole.y.shape}"
+        elif name == "predict":
+            error, size = np.nanstd(found - whole.y), np.nanstd(whole.y)
+            if not error < size:
+                yield f"model.predict is no better than a constant: error {error:.3g}, output {size:.3g}"
 
 
 def value_error(case: Case, solution: Solution) -> float:
