@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 
 from optid.showing.wording import seconds
+from optid.studies.averages import Paired
 from optid.studies.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
 from optid.studies.quality import Quality
 from optid.studies.standings import Section, Standing
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
+RARE = 0.01  # share of the problems that a solver may refuse and still be called the one to use
+LONGEST = 90  # characters of a headline
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,36 @@ def choice_of_solver(section: Section) -> Statement:
         each = "; ".join(f"{name} {_against(section, name)}" for name in choice.tied[:3])
         text = f"{solved}. No difference in time beyond chance or 10 %: {each}.{_claims(section, names)}"
         return Statement(_tone(lead, n), f"A tie: {listed(names)}", text, "solver")
-    return Statement(_tone(lead, n), f"Use {choice.first}",
-                     f"{solved}. {_runner_up(section)}{_quicker(section)}{_claims(section, (choice.first,))}".rstrip(),
-                     "solver")  # fmt: skip
+    text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (choice.first,))}"
+    word = f"Solves most: {choice.first}" if lead.refused > RARE * n else f"Use {choice.first}"
+    return Statement(_tone(lead, n), word, text.rstrip(), "solver")
+
+
+def _refusals(lead: Standing) -> str:
+    return f" (it does not take {lead.refused:,} of the others)" if lead.refused else ""
+
+
+def evidence(section: Section) -> str:
+    """Say in a few words what the choice rests on: the distance to the next."""
+    choice = section.choice
+    if choice.kind not in (FIRST, TIE):
+        return choice.missing or ("nothing to compare with" if choice.kind == ONLY_ONE else "")
+    if choice.kind == TIE:
+        pairs = [f"{name} {_times(choice.against[name])}" for name in choice.tied[:2]]
+        return "no difference beyond chance or 10 %: " + ", ".join(pairs)
+    rivals = [name for name in choice.candidates if name != choice.first]
+    if rivals:
+        name = min(rivals, key=lambda rival: choice.against[rival].value)
+        return f"next: {name} {_times(choice.against[name])}"
+    others = [s for s in section.standings if s.solver != choice.first]
+    most = max(others, key=lambda s: s.solved)
+    ratio = choice.against.get(most.solver)
+    speed = f", {_times(ratio)}" if ratio is not None and ratio.enough else ""
+    return f"next: {most.solver} solved {most.solved:,}{speed}" if most.solved else "nobody else solved any"
+
+
+def _times(pair: Paired) -> str:
+    return f"{pair.value:.3g} × the time ({pair.low:.3g} to {pair.high:.3g})"
 
 
 def _tone(lead: Standing, n: int) -> str:
@@ -88,7 +118,7 @@ def times_as(value: float) -> str:
 
 def _against(section: Section, name: str) -> str:
     pair = section.choice.against[name]
-    return f"takes {times_as(pair.value)} (95 %: {pair.low:.2g} to {pair.high:.2g}, {pair.n:,} problems)"
+    return f"takes {times_as(pair.value)} (95 %: {pair.low:.3g} to {pair.high:.3g}, {pair.n:,} problems)"
 
 
 def _runner_up(section: Section) -> str:
@@ -121,8 +151,8 @@ def _quicker(section: Section) -> str:
 
 def _claims(section: Section, names: tuple[str, ...]) -> str:
     false = [(name, section.standing(name).false_claims) for name in names if section.standing(name).false_claims]
-    return "".join(f" Mind that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false: "
-                   "let them be verified." for name, k in false)  # fmt: skip
+    return "".join(f" Mind that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false."
+                   for name, k in false)  # fmt: skip
 
 
 def carries_over(section: Section) -> Statement:
@@ -198,5 +228,8 @@ def headline(overall: Section, sections: list[Section]) -> Statement:
     named = {first: [section.name for section, pick in picks if pick.first == first] for first in firsts}
     best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
     solved = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    text = f"{best}. No solver does everything: {solved.solver} solved most, {of(solved.solved, n)}."
-    return Statement(FAIR, "It depends on the formulation", text, "solver")
+    text = f"No solver does everything: {solved.solver} solved most, {of(solved.solved, n)}."
+    tone = GOOD if len(decided) == len(picks) else FAIR
+    if len(best) <= LONGEST:
+        return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
+    return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")

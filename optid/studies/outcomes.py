@@ -109,6 +109,7 @@ class Results:
         solvers: labels, S of them, in alphabetical order.
         state: `SOLVED` or the word for why not, (P, S).
         reason: sentence of the first run that did not solve it, (P, S).
+        false: whether a claim was false, of any repetition, or contradicted, (P, S).
         time: median over the repetitions in seconds, (P, S); ``nan`` unless solved.
         objective: (P, S), of the runs whose verified accuracy was reached, local minima included; ``nan`` otherwise.
         size: yardstick of differences of objectives, (P,).
@@ -128,6 +129,7 @@ class Results:
     solvers: tuple[str, ...]
     state: np.ndarray
     reason: np.ndarray
+    false: np.ndarray
     time: np.ndarray
     objective: np.ndarray
     size: np.ndarray
@@ -201,12 +203,14 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     first = np.array([m[0] for m in members], dtype=int)
     shape = (len(problems), len(solvers))
     state, reason = np.full(shape, NOT_RUN, dtype=object), np.full(shape, "", dtype=object)
+    false = np.zeros(shape, dtype=bool)
     row, numbers = np.full(shape, -1), {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
     for (p, s), runs in entries.items():
         bad = next((i for i in runs if states[i] != SOLVED), None)
         speaks = runs[0] if bad is None else bad
         row[p, s], state[p, s] = speaks, states[speaks]
         reason[p, s] = "" if bad is None else table["reason"][speaks]
+        false[p, s] = table["false_claim"][runs].any()
         numbers["residual"][p, s] = np.max(residual[runs])
         if bad is None:
             numbers["time"][p, s] = np.median(seconds[runs])
@@ -216,7 +220,7 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
         n=np.array([_largest(table["n_samples"][m], table["samples"][m]) for m in members]),
         size=np.array([_largest(table["scale"][m]) for m in members]),
         limit=np.array([_largest(table["time_limit"][m]) for m in members]),
-        solvers=tuple(solvers), state=state, reason=reason, row=row, tolerance=limit, **numbers,
+        solvers=tuple(solvers), state=state, reason=reason, false=false, row=row, tolerance=limit, **numbers,
     )  # fmt: skip
     return _against_the_best(found, limit)
 
@@ -270,8 +274,21 @@ def _against_the_best(found: Results, limit: float) -> Results:
     denied = np.isin(found.state, (INFEASIBLE, "unbounded")) & solved.any(axis=1)[:, None]
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
     values = {f.name: getattr(found, f.name) for f in fields(found)}
-    values |= {"state": state, "time": np.where(worse, np.nan, found.time), "size": size}
+    values |= {"state": state, "false": found.false | denied, "time": np.where(worse, np.nan, found.time), "size": size}
     return Results(**values)
+
+
+def states_of_rows(table: Mapping[str, np.ndarray], found: Results) -> np.ndarray:
+    """Return `SOLVED` or the word for why not for every row, (rows,).
+
+    Args:
+        table: the rows.
+        found: what `tabulate` made of them.
+    """
+    states = _row_states(table, _worst_residual(table), found.tolerance)
+    for word in (WORSE_MINIMUM, CONTRADICTED):
+        states[found.row[found.state == word]] = word
+    return states
 
 
 def agreed_infeasible(found: Results) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from optid.studies.averages import Paired, paired_ratio, shifted_geometric_mean
 from optid.studies.choice import Choice, choose
 from optid.studies.growth import Growth, time_growth
-from optid.studies.outcomes import CONTRADICTED, FALSE_CLAIM, SOLVED, Results, agreed_infeasible, applicable
+from optid.studies.outcomes import SOLVED, Results, agreed_infeasible, applicable
 from optid.studies.profiles import Profile, performance_profiles, time_ratios
 from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 from optid.studies.rows import REFUSED
@@ -26,7 +26,8 @@ class Standing:
         refused: problems it does not take.
         false_claims: problems on which a claim of it was false.
         fastest: problems on which nobody was faster.
-        time: shifted geometric mean of the seconds on what it solved; not comparable where others solved other problems.
+        time: shifted geometric mean of the seconds on what it solved; not comparable where others solved other
+            problems.
         penalised: the same with every failure counted as the time limit.
         against: its time against the first choice on the problems both solved; None for the first choice itself and
             where there is none.
@@ -91,8 +92,8 @@ def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Sect
         name: label of the section.
         level: significance level of the test over data sets.
     """
-    gone = agreed_infeasible(found)
-    run = applicable(found).any(axis=0)
+    gone: np.ndarray = agreed_infeasible(found)
+    run: np.ndarray = np.any(applicable(found), axis=0)
     idle = tuple(s for s, there in zip(found.solvers, run) if not there)
     kept = found.where(~gone, run)
     choice = choose(kept.time, kept.solvers, MINOR, paired_ratio, none=1.0)
@@ -128,7 +129,7 @@ def _standing(found: Results, s: int, choice: Choice) -> Standing:
         int(ran.sum()),
         int(solved.sum()),
         int((state == REFUSED).sum()),
-        int(np.isin(state, (FALSE_CLAIM, CONTRADICTED)).sum()),
+        int(found.false[:, s].sum()),
         int((time_ratios(found.time)[:, s] == 1.0).sum()),
         shifted_geometric_mean(times[solved]),
         shifted_geometric_mean(np.where(solved, times, limits)[ran]),

@@ -170,29 +170,29 @@ def _refuted(found: Results, table: Mapping[str, np.ndarray]) -> Statement | Non
     if not wrong.any():
         return None
     p = int(np.flatnonzero(wrong)[0])
-    text = (f"On {int(wrong.sum()):,} problems a proved lower bound lies above an objective that another run verified, "
-            f"first on {found.data[p]}, {found.formulation[p]}. One of the two is wrong: please report it.")  # fmt: skip
+    text = f"On {int(wrong.sum()):,} problems a proved lower bound lies above an objective that another run verified, "
+    text += f"first on {found.data[p]}, {found.formulation[p]}. One of the two is wrong: please report it."
     return Statement("bad", "A proof is contradicted", text, "claims")
 
 
 def _false_claims(table: Mapping[str, np.ndarray], found: Results) -> tuple[FalseClaim, ...]:
-    groups: dict[tuple[str, str, str], list[str]] = {}
+    groups: dict[tuple[str, ...], list[str]] = {}
     for i in np.flatnonzero(table["false_claim"]):
-        key = (table["solver"][i], table["formulation"][i], table["status_claimed"][i])
+        key = tuple(str(table[c][i]) for c in ("solver", "formulation", "status_claimed"))
         groups.setdefault(key, []).append(table["reason"][i])
     for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
-        key = (found.solvers[s], found.formulation[p], table["status_claimed"][found.row[p, s]])
+        key = (found.solvers[s], str(found.formulation[p]), str(table["status_claimed"][found.row[p, s]]))
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
         groups.setdefault(key, []).append(f"{winner} has a verified point")
-    claims = [FalseClaim(*key[:2], len(reasons), key[2], reasons[0]) for key, reasons in groups.items()]
+    claims = [FalseClaim(key[0], key[1], len(reasons), key[2], reasons[0]) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
 
 
 def _failures(found: Results) -> tuple[Failure, ...]:
     groups: dict[tuple[str, str, str], list[str]] = {}
     for p, s in zip(*np.nonzero((found.state != "solved") & (found.state != "not run"))):
-        reason = found.reason[p, s]
-        groups.setdefault((found.solvers[s], found.state[p, s], _shape(reason)), []).append(reason)
+        reason = str(found.reason[p, s])
+        groups.setdefault((found.solvers[s], str(found.state[p, s]), _shape(reason)), []).append(reason)
     failures = [
         Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
         for (solver, state, shape), reasons in groups.items()

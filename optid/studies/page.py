@@ -1,0 +1,177 @@
+"""The page of a study: one HTML file that opens offline, with its figures, its tables and every run."""
+
+import base64
+import hashlib
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from optid import __version__
+from optid.showing.page import template, versions
+from optid.showing.wording import Table, number, seconds
+from optid.studies.advice import Statement, choice_of_solver, evidence, of
+from optid.studies.outcomes import MEANINGS, TIMES
+from optid.studies.payload import page_payload
+from optid.studies.quality import FIGURES, Quality
+from optid.studies.rows import OUTCOMES
+from optid.studies.verdict import Verdict, conclude
+
+SCRIPTS = ("plot.js", "grid.js", "study.js")
+TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
+LISTED = 40  # false claims on the page; the database has them all
+WIDEST = 120  # characters of a text in a table
+
+
+def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: str = "",
+               accuracy: float | None = None, time: str = "solve") -> Path:
+    """Write the page of a study: verdict, tables, figures and all runs in one file that makes no request.
+
+    Args:
+        rows_or_db: path of a database, a mapping of columns, a frame (pandas, polars), dict rows, or a `Verdict`.
+        path: the file, replaced when it exists.
+        title: heading; unless given, the title of the study.
+        command: the command line behind it, for the section that says how to reproduce it.
+        accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
+        time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
+
+    Returns:
+        The path.
+
+    Raises:
+        DataError: these are no rows of a study, or an unknown measure of time.
+        DatabaseError: the database cannot be read.
+        OSError: the file cannot be written.
+    """  # fmt: skip
+    given = isinstance(rows_or_db, Verdict)
+    verdict = rows_or_db if given else conclude(rows_or_db, accuracy=accuracy, time=time)
+    path = Path(path)
+    path.write_text(render(verdict, title=title, command=command), encoding="utf-8", errors="replace")
+    return path
+
+
+def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
+    """Return the page that `write_page` writes."""
+    return template("study.html.j2").render(_content(verdict, title, command))
+
+
+def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
+    head = verdict.headline
+    studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
+    script = "\n".join((files("optid") / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    several = len(verdict.sections) > 1
+    return {
+        "version": __version__,
+        "title": title or " · ".join(_short(name) for name in studies[:3]) or "Study",
+        "lead": _lead(verdict),
+        "tone": head.tone,
+        "word": head.word,
+        "sentence": head.text,
+        "cards": _cards(verdict),
+        "picks": _picks(verdict) if several else None,
+        "statements": verdict.statements,
+        "claims": _claims(verdict),
+        "quality": _quality_table(verdict.quality) if verdict.quality.records else None,
+        "formulations": [section.name for section in verdict.sections],
+        "requested": f"{verdict.accuracy:.0e}",
+        "tolerance": f"{verdict.found.tolerance:.0e}",
+        "measure": f"{' + '.join(TIMES[verdict.time])}: {TIME_WORDS[verdict.time]}",
+        "states": [*OUTCOMES.items(), *MEANINGS.items()],
+        "call": command or "optid study report STUDY.duckdb -o study.html",
+        "versions": [*versions(), *_machines(verdict)],
+        "text": str(verdict),
+        "style": Markup((files("optid") / "templates" / "study.css").read_text(encoding="utf-8")),
+        "script": Markup(script),
+        "digest": digest,
+        "payload": embedded(page_payload(verdict)),
+        "several": several,
+        "sections": [("verdict", "Verdict"), ("solvers", "Solvers"), ("figures", "Figures"), ("failures", "Failures"),
+                     ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
+    }  # fmt: skip
+
+
+def embedded(payload: Any) -> Markup:
+    """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
+    text = json.dumps(payload, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+                  .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))  # fmt: skip
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= WIDEST else text[: WIDEST - 1] + "…"
+
+
+def _lead(verdict: Verdict) -> str:
+    runs, found = len(verdict.table["solver"]), verdict.found
+    parts = [(runs, "run"), (len(found.data), "problem"), (len(found.solvers), "solver"),
+             (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]  # fmt: skip
+    return " · ".join(f"{count:,} {noun}{'' if count == 1 else 's'}" for count, noun in parts)
+
+
+def _cards(verdict: Verdict) -> list[dict[str, str]]:
+    """The figures of the first glance."""
+    section, table = verdict.overall, verdict.table
+    runs = sum(s.problems for s in section.standings)
+    solved = sum(s.solved for s in section.standings)
+    by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
+    false = sum(claim.count for claim in verdict.false_claims)
+    proved = int(table["proved"].sum())
+    cards = [
+        (f"{by_anyone:,} of {len(section.found.data):,}", "problems that some solver solved"),
+        (f"{100 * solved / runs:.1f} %" if runs else "none", f"of {runs:,} attempts reached the accuracy"),
+        (f"{proved:,}", "runs proved globally optimal"),
+        (f"{false:,}", "claims that were false"),
+    ]
+    return [{"value": value, "label": label} for value, label in cards]
+
+
+def _picks(verdict: Verdict) -> list[dict[str, Any]]:
+    """One line per formulation: who to use there, and why."""
+    lines = []
+    for section in verdict.sections:
+        said: Statement = choice_of_solver(section)
+        first = section.choice.first
+        lead = section.standing(first) if first else None
+        lines.append({
+            "name": section.name, "tone": said.tone, "word": said.word, "text": said.text,
+            "solved": of(lead.solved, len(section.found.data)) if lead else "-",
+            "time": seconds(lead.time) if lead and np.isfinite(lead.time) else "-", "evidence": evidence(section),
+        })  # fmt: skip
+    return lines
+
+
+def _claims(verdict: Verdict) -> Table | None:
+    claims = verdict.false_claims
+    if not claims:
+        return None
+    rows = [(_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", _short(c.reason) or "-")
+            for c in claims[:LISTED]]  # fmt: skip
+    note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
+    return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)
+
+
+def _quality_table(quality: Quality) -> Table:
+    """Mean figures of the models of every formulation."""
+    head = ("formulation", "records solved", "simulation fit", "one-step fit", "parameter error", "nonlinearity error")
+    rows = []
+    for name in quality.formulations:
+        figures = [quality.figures[c][name].mean for c in FIGURES]
+        fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
+        errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]
+        rows.append((_short(name), f"{quality.solved[name]:,} of {quality.records:,}", *fits, *errors))
+    note = ("Means over the records that the formulation solved, of the model with the best verified objective; fits "
+            "on samples the fit did not see. Means over different records do not compare: the verdict pairs them."
+            )  # fmt: skip
+    return Table("Models", head, rows, note)
+
+
+def _machines(verdict: Verdict) -> list[tuple[str, str]]:
+    names = [name for name in dict.fromkeys(verdict.table["machine"]) if name]
+    shown = [_short(name) for name in names[:5]] + ([f"{len(names) - 5} more"] if len(names) > 5 else [])
+    runs = sorted(str(v)[:16].replace("T", " ") for v in verdict.table["started"] if v and v != "NaT")
+    spans = [("Runs", f"{runs[0]} to {runs[-1]} UTC")] if runs else []
+    return [("Machine" if len(names) == 1 else "Machines", "; ".join(shown)), *spans] if names else spans

@@ -1,0 +1,275 @@
+"use strict";
+// A small plot: lines, steps and dots as SVG. It zooms by dragging, by buttons, keys, pinching, and the wheel with Ctrl.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function element(name, attributes = {}, ...children) {
+  const made = name.startsWith("svg:") ? document.createElementNS(SVG, name.slice(4)) : document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value === true) made.setAttribute(key, "");
+    else if (value !== false && value !== null && value !== undefined) made.setAttribute(key, value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+function significant(value, digits = 3) {
+  if (value === null || value === undefined) return "-";
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size < 1e-3 || size >= 1e6) return value.toExponential(Math.max(0, digits - 1)).replace("e+", "e").replace(/\.0+e/, "e");
+  return String(Number(value.toPrecision(digits)));
+}
+
+function duration(value) {
+  if (value === null || value === undefined) return "-";
+  if (value < 9.995e-4) return significant(value * 1e6) + " µs";
+  return value < 0.9995 ? significant(value * 1e3) + " ms" : significant(value) + " s";
+}
+
+function niceStep(span, most) {
+  const rough = span / most, power = 10 ** Math.floor(Math.log10(rough));
+  return power * [1, 2, 5, 10].find((m) => m * power >= rough * 0.999);
+}
+
+// Ticks of an axis between two transformed ends: [transformed place, label].
+function ticksOf(axis, low, high, most) {
+  if (axis.categories) return axis.categories.map((name, k) => [k, name]).filter(([k]) => k >= low && k <= high);
+  const write = axis.format || ((v) => significant(v));
+  if (axis.log && high - low >= 0.7) {
+    const factors = high - low < 2.2 && most > 4 ? [1, 2, 5] : [1], step = Math.max(1, Math.ceil((high - low) / most)), found = [];
+    for (let d = Math.floor(low); d <= high; d++) {
+      if (d % step === 0) for (const f of factors) found.push([d + Math.log10(f), write(f * 10 ** d)]);
+    }
+    return found.filter(([at]) => at >= low - 1e-9 && at <= high + 1e-9);
+  }
+  const from = axis.log ? 10 ** low : low, to = axis.log ? 10 ** high : high, step = niceStep(to - from, most), found = [];
+  if (!(step > 0)) return [];
+  for (let k = Math.ceil(from / step - 1e-9); k * step <= to * (1 + 1e-12) + 1e-12; k++) {
+    const value = Number((k * step).toPrecision(12));
+    if (!axis.log || value > 0) found.push([axis.log ? Math.log10(value) : value, write(value)]);
+  }
+  return found;
+}
+
+let plots = 0;
+
+// spec: label, x and y axes {title, log, categories, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
+// rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off.
+function makePlot(host, spec, hidden) {
+  const id = "plot" + ++plots, box = element("div", { class: "plot" });
+  const svg = element("svg:svg", { role: "img", tabindex: "0", "aria-label": spec.label, "aria-describedby": id + "-keys" });
+  const tip = element("div", { class: "tip", hidden: true });
+  const keys = element("span", { id: id + "-keys", hidden: true },
+    "Keys: plus and minus zoom, arrows move, 0 shows everything. The numbers stand below the figure.");
+  const buttons = [["+", "Zoom in", () => zoom(0.6)], ["\u2212", "Zoom out", () => zoom(1 / 0.6)], ["\u21ba", "Show everything", reset]];
+  const bar = element("div", { class: "zoom" }, ...buttons.map(([text, label, act]) =>
+    element("button", { type: "button", "aria-label": `${label}: ${spec.title}`, title: label, onclick: act }, text)));
+  box.append(bar, svg, tip, keys);
+  host.append(box);
+
+  const axes = [spec.x, spec.y];
+  const series = spec.series.map((one) => ({ ...one, tx: transformed(one.xs, spec.x), ty: transformed(one.ys, spec.y) }));
+  const whole = extent();
+  let view = [...whole], frame = null, drag = null;
+  const touches = new Map();
+
+  function transformed(values, axis) {
+    return axis.log ? values.map((v) => (v > 0 ? Math.log10(v) : NaN)) : values;
+  }
+
+  function extent() {
+    return axes.flatMap((axis, a) => {
+      if (axis.categories) return [-0.6, axis.categories.length - 0.4];
+      let low = Infinity, high = -Infinity;
+      for (const one of series) {
+        const values = a ? one.ty : one.tx;
+        values.forEach((v, i) => {
+          if (!Number.isFinite(v)) return;
+          const half = a === 0 && one.halves ? one.halves[i] : 0;
+          low = Math.min(low, v - half); high = Math.max(high, v + half);
+        });
+      }
+      for (const rule of a ? spec.rules || [] : []) { low = Math.min(low, Math.log10(rule.y)); high = Math.max(high, Math.log10(rule.y)); }
+      if (low > high) [low, high] = [0, 1];
+      const room = (high - low) * 0.04 || 0.5;
+      const at = (v) => (axis.log ? Math.log10(v) : v);
+      return [axis.low === undefined ? low - room : at(axis.low), axis.high === undefined ? high + room : Math.max(at(axis.high), low + 1e-6)];
+    });
+  }
+
+  function measure() {
+    const width = Math.max(280, Math.round(box.clientWidth || 560));
+    const rows = spec.y.categories ? 70 + 30 * spec.y.categories.length : Math.min(380, Math.max(260, 0.56 * width));
+    const longest = spec.y.categories ? Math.max(...spec.y.categories.map((n) => n.length)) : 0;
+    return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 62, right: 14, top: 10, bottom: 44 };
+  }
+
+  function draw() {
+    const f = (frame = measure());
+    const inner = { w: f.width - f.left - f.right, h: f.height - f.top - f.bottom };
+    f.x = (v) => f.left + ((v - view[0]) / (view[1] - view[0])) * inner.w;
+    f.y = (v) => f.top + (1 - (v - view[2]) / (view[3] - view[2])) * inner.h;
+    f.unx = (p) => view[0] + ((p - f.left) / inner.w) * (view[1] - view[0]);
+    f.uny = (p) => view[2] + (1 - (p - f.top) / inner.h) * (view[3] - view[2]);
+    svg.setAttribute("viewBox", `0 0 ${f.width} ${f.height}`);
+    const parts = [], bottom = f.top + inner.h, right = f.left + inner.w;
+    for (const [at, label] of ticksOf(spec.x, view[0], view[1], Math.max(3, Math.floor(inner.w / 75)))) {
+      const x = f.x(at);
+      parts.push(element("svg:line", { class: "line", x1: x, x2: x, y1: f.top, y2: bottom }),
+        element("svg:text", { x, y: bottom + 16, "text-anchor": "middle" }, label));
+    }
+    for (const [at, label] of ticksOf(spec.y, view[2], view[3], Math.max(3, Math.floor(inner.h / 38)))) {
+      const y = f.y(at), room = Math.floor((f.left - 10) / 7);
+      const cut = label.length > room ? label.slice(0, room - 1) + "…" : label;
+      parts.push(element("svg:line", { class: "line", x1: f.left, x2: right, y1: y, y2: y }),
+        element("svg:text", { x: f.left - 7, y: y + 4, "text-anchor": "end", class: spec.y.categories ? "name" : null }, cut));
+    }
+    parts.push(element("svg:text", { x: f.left + inner.w / 2, y: f.height - 8, "text-anchor": "middle" }, spec.x.title));
+    if (spec.y.title) parts.push(element("svg:text", { transform: `translate(13 ${f.top + inner.h / 2}) rotate(-90)`, "text-anchor": "middle" }, spec.y.title));
+    const clip = element("svg:clipPath", { id: id + "-clip" }, element("svg:rect", { x: f.left, y: f.top - 4, width: inner.w + 4, height: inner.h + 8 }));
+    const body = element("svg:g", { "clip-path": `url(#${id}-clip)` });
+    for (const rule of spec.rules || []) {
+      const y = f.y(Math.log10(rule.y));
+      body.append(element("svg:line", { class: "rule", x1: f.left, x2: right, y1: y, y2: y }),
+        element("svg:text", { x: right - 4, y: y - 5, "text-anchor": "end" }, rule.label));
+    }
+    for (const one of series) if (!hidden.has(one.name)) body.append(...drawn(one, f, right));
+    svg.replaceChildren(element("svg:defs", {}, clip), ...parts, body);
+  }
+
+  function drawn(one, f, right) {
+    const style = { fill: "none", stroke: one.colour, "stroke-dasharray": one.dash, "data-series": one.name };
+    const seen = [...one.tx.keys()].filter((i) => Number.isFinite(one.tx[i]) && Number.isFinite(one.ty[i]));
+    const px = (i) => f.x(one.tx[i]).toFixed(1), py = (i) => f.y(one.ty[i]).toFixed(1);
+    if (one.kind === "step") {
+      const path = seen.map((i, k) => (k ? `H${px(i)}V${py(i)}` : `M${px(i)} ${f.y(0).toFixed(1)}V${py(i)}`)).join("");
+      return seen.length ? [element("svg:path", { ...style, "stroke-width": 2, d: `${path}H${right}` })] : [];
+    }
+    const dots = (d, width) => element("svg:path", { ...style, "stroke-dasharray": null, "stroke-width": width, "stroke-linecap": "round", d });
+    if (one.kind === "interval") {
+      return seen.flatMap((i) => {
+        const [a, b] = [f.x(one.tx[i] - one.halves[i]), f.x(one.tx[i] + one.halves[i])];
+        return [element("svg:path", { ...style, "stroke-dasharray": null, "stroke-width": 6, "stroke-opacity": 0.35, d: `M${a} ${py(i)}H${b}` }), dots(`M${px(i)} ${py(i)}h0`, 11)];
+      });
+    }
+    if (one.kind === "crosses") {
+      const d = seen.map((i) => `M${px(i) - 3} ${py(i) - 3}l6 6m0 -6l-6 6`).join("");
+      return [element("svg:path", { ...style, "stroke-dasharray": null, "stroke-width": 1.5, d })];
+    }
+    const points = dots(seen.map((i) => `M${px(i)} ${py(i)}h0`).join(""), one.kind === "dots" ? 5 : 7);
+    if (one.kind === "dots") { points.setAttribute("stroke-opacity", "0.55"); return [points]; }
+    return [element("svg:path", { ...style, "stroke-width": 2, d: seen.map((i, k) => `${k ? "L" : "M"}${px(i)} ${py(i)}`).join("") }), points];
+  }
+
+  function setView(next) {
+    const tiny = axes.some((_, a) => !(next[2 * a + 1] - next[2 * a] > 1e-6 * (whole[2 * a + 1] - whole[2 * a])));
+    const huge = axes.some((_, a) => next[2 * a + 1] - next[2 * a] > 20 * (whole[2 * a + 1] - whole[2 * a]));
+    if (tiny || huge) return;
+    view = next;
+    svg.dataset.view = view.map((v) => v.toPrecision(6)).join(" ");
+    hideTip();
+    draw();
+  }
+  function reset() { setView([...whole]); }
+  function zoom(factor, cx = (view[0] + view[1]) / 2, cy = (view[2] + view[3]) / 2) {
+    const ends = (low, high, c) => [c + (low - c) * factor, c + (high - c) * factor];
+    setView([...ends(view[0], view[1], cx), ...(spec.y.categories ? view.slice(2) : ends(view[2], view[3], cy))]);
+  }
+  function move(dx, dy) {
+    const [w, h] = [(view[1] - view[0]) * dx, spec.y.categories ? 0 : (view[3] - view[2]) * dy];
+    setView([view[0] + w, view[1] + w, view[2] + h, view[3] + h]);
+  }
+  function place(event) {
+    const area = svg.getBoundingClientRect(), scale = frame.width / area.width;
+    return [(event.clientX - area.left) * scale, (event.clientY - area.top) * scale];
+  }
+  function hideTip() { tip.hidden = true; }
+
+  function nearest(x, y) {
+    let best = null, least = 24 * 24;
+    for (const one of series) {
+      if (hidden.has(one.name)) continue;
+      for (let i = 0; i < one.tx.length; i++) {
+        const d = (f_x(one, i) - x) ** 2 + (frame.y(one.ty[i]) - y) ** 2;
+        if (d < least) { least = d; best = [one, i]; }
+      }
+    }
+    return best;
+  }
+  function f_x(one, i) { return frame.x(one.tx[i]); }
+
+  function showTip(x, y) {
+    const found = spec.tip && nearest(x, y);
+    if (!found) return hideTip();
+    const scale = box.clientWidth / frame.width, [one, i] = found;
+    tip.textContent = spec.tip(one, i);
+    tip.hidden = false;
+    const left = f_x(one, i) * scale, room = box.clientWidth - tip.offsetWidth;
+    tip.style.left = Math.max(0, Math.min(room, left - tip.offsetWidth / 2)) + "px";
+    const above = frame.y(one.ty[i]) * scale - tip.offsetHeight - 10;
+    tip.style.top = (above > -10 ? above : frame.y(one.ty[i]) * scale + 12) + "px";
+  }
+
+  svg.addEventListener("pointerdown", (event) => {
+    touches.set(event.pointerId, place(event));
+    if (event.pointerType === "touch") return;
+    drag = { from: place(event), box: null };
+    svg.setPointerCapture(event.pointerId);
+  });
+  svg.addEventListener("pointermove", (event) => {
+    const at = place(event);
+    if (touches.size === 2 && touches.has(event.pointerId)) {
+      const [one, two] = [...touches.values()], before = Math.hypot(one[0] - two[0], one[1] - two[1]);
+      touches.set(event.pointerId, at);
+      const [a, b] = [...touches.values()], after = Math.hypot(a[0] - b[0], a[1] - b[1]);
+      if (after > 5) zoom(before / after, frame.unx((a[0] + b[0]) / 2), frame.uny((a[1] + b[1]) / 2));
+      return;
+    }
+    if (!drag) return showTip(...at);
+    const [x0, y0] = drag.from;
+    if (!drag.box && Math.hypot(at[0] - x0, at[1] - y0) > 5) svg.append((drag.box = element("svg:rect", { class: "select" })));
+    if (drag.box) {
+      const [x, y, w, h] = [Math.min(x0, at[0]), Math.min(y0, at[1]), Math.abs(at[0] - x0), Math.abs(at[1] - y0)];
+      const high = spec.y.categories ? { y: frame.top, height: frame.height - frame.top - frame.bottom } : { y, height: h };
+      for (const [key, value] of Object.entries({ x, width: w, ...high })) drag.box.setAttribute(key, value);
+    }
+  });
+  svg.addEventListener("pointerup", (event) => {
+    touches.delete(event.pointerId);
+    const done = drag, at = place(event);
+    drag = null;
+    if (event.pointerType === "touch") return showTip(...at);
+    if (!done) return;
+    if (!done.box) {
+      const found = spec.open && nearest(...at);
+      if (found) spec.open(...found);
+      return;
+    }
+    done.box.remove();
+    const xs = [frame.unx(done.from[0]), frame.unx(at[0])].sort((a, b) => a - b);
+    const ys = spec.y.categories ? view.slice(2) : [frame.uny(done.from[1]), frame.uny(at[1])].sort((a, b) => a - b);
+    setView([...xs, ...ys]);
+  });
+  svg.addEventListener("pointercancel", (event) => { touches.delete(event.pointerId); drag = null; draw(); });
+  svg.addEventListener("pointerleave", hideTip);
+  svg.addEventListener("dblclick", reset);
+  svg.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && !event.metaKey) return;
+    event.preventDefault();
+    const [x, y] = place(event);
+    zoom(event.deltaY > 0 ? 1.25 : 0.8, frame.unx(x), frame.uny(y));
+  }, { passive: false });
+  svg.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const acts = { "+": () => zoom(0.6), "=": () => zoom(0.6), "-": () => zoom(1 / 0.6), 0: reset, Escape: reset,
+      ArrowLeft: () => move(-0.15, 0), ArrowRight: () => move(0.15, 0), ArrowUp: () => move(0, 0.15), ArrowDown: () => move(0, -0.15) };
+    if (!acts[event.key]) return;
+    event.preventDefault();
+    acts[event.key]();
+  });
+  new ResizeObserver(() => { if (frame && Math.abs(measure().width - frame.width) > 1) draw(); }).observe(box);
+  draw();
+  return { draw, svg };
+}

@@ -1,0 +1,180 @@
+"""A headless Chromium driven through its DevTools pipe: keys, mouse, colours, console, requests, pictures."""
+
+import base64
+import json
+import os
+import select
+import shlex
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NO_BROWSER = "no chromium, chromium-browser or google-chrome on PATH"
+QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+         "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
+         "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe")
+KEYS = {"Enter": (13, "\r"), "Tab": (9, ""), "Escape": (27, ""), "ArrowLeft": (37, ""), "ArrowRight": (39, ""),
+        "ArrowUp": (38, ""), "ArrowDown": (40, ""), " ": (32, " ")}
+
+
+class BrowserError(RuntimeError):
+    """The browser does not answer, or the page threw an exception."""
+
+
+class Browser:
+    """One page of one browser; use it in a ``with`` statement."""
+
+    def __init__(self, profile: Path, patience: float = 60.0) -> None:
+        assert CHROMIUM is not None, NO_BROWSER
+        self.patience, self.events, self.buffer, self.number = patience, [], b"", 0
+        read, self.to = os.pipe()
+        self.back, write = os.pipe()
+        line = shlex.join([CHROMIUM, *QUIET, f"--user-data-dir={profile}", "about:blank"])
+        self.process = subprocess.Popen(["bash", "-c", f"exec {line} 3<&{read} 4>&{write}"], pass_fds=(read, write),
+                                        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        os.close(read)
+        os.close(write)
+        self.session = None
+        targets = self.send("Target.getTargets")["targetInfos"]
+        page = next(t["targetId"] for t in targets if t["type"] == "page")
+        self.session = self.send("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.send(f"{domain}.enable")
+
+    def __enter__(self) -> "Browser":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        try:
+            self.session = None
+            self.send("Browser.close")
+            self.process.wait(10)
+        except (BrowserError, OSError, subprocess.TimeoutExpired):
+            self.process.kill()
+            self.process.wait()
+        os.close(self.to)
+        os.close(self.back)
+
+    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command and return its result."""
+        self.number += 1
+        message = {"id": self.number, "method": method, "params": parameters}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.to, json.dumps(message).encode() + b"\0")
+        end = time.monotonic() + self.patience
+        while True:
+            answer = self._receive(end)
+            if answer.get("id") == self.number:
+                if "error" in answer:
+                    raise BrowserError(f"{method}: {answer['error']}")
+                return answer["result"]
+            self.events.append(answer)
+
+    def _receive(self, end: float) -> dict[str, Any]:
+        while b"\0" not in self.buffer:
+            if not select.select([self.back], [], [], max(0.0, end - time.monotonic()))[0]:
+                raise BrowserError("the browser does not answer")
+            part = os.read(self.back, 1 << 20)
+            if not part:
+                raise BrowserError("the browser went away")
+            self.buffer += part
+        message, self.buffer = self.buffer.split(b"\0", 1)
+        return json.loads(message)
+
+    def run(self, script: str) -> Any:
+        """Evaluate an expression in the page and return its value."""
+        result = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in result:
+            details = result["exceptionDetails"]
+            raise BrowserError(details.get("exception", {}).get("description", details["text"]))
+        return result["result"].get("value")
+
+    def wait(self, condition: str, patience: float = 30.0) -> None:
+        """Wait until an expression is true."""
+        end = time.monotonic() + patience
+        while not self.run(f"!!({condition})"):
+            if time.monotonic() > end:
+                raise BrowserError(f"not true after {patience:g} s: {condition}")
+            time.sleep(0.02)
+
+    def open(self, path: Path, ready: str = "document.documentElement?.dataset.ready") -> float:
+        """Open a file, wait until it is ready, and return the seconds from the command on."""
+        self.events.clear()
+        clock = time.perf_counter()
+        self.send("Page.navigate", url=Path(path).absolute().as_uri())
+        self.wait(ready)
+        return time.perf_counter() - clock
+
+    def complaints(self) -> list[str]:
+        """Console messages, exceptions and log entries since the page was opened."""
+        self.run("1")
+        found = []
+        for event in self.events:
+            if event.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"):
+                found.append(json.dumps(event["params"])[:500])
+        return found
+
+    def requests(self) -> list[str]:
+        """Addresses asked for since the page was opened, the page itself and what it carries left out."""
+        self.run("1")
+        asked = [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        return [url for url in asked[1:] if not url.startswith(("data:", "blob:"))]
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after the other, as a person would."""
+        for key in keys:
+            code, text = KEYS.get(key, (ord(key.upper()) if len(key) == 1 else 0, key if len(key) == 1 else ""))
+            pressed = {"key": key, "windowsVirtualKeyCode": code, **({"text": text} if text else {})}
+            self.send("Input.dispatchKeyEvent", type="keyDown", **pressed)
+            self.send("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+    def write(self, text: str) -> None:
+        """Write text into what has the focus."""
+        self.send("Input.insertText", text=text)
+
+    def where(self, selector: str) -> dict[str, float]:
+        """Scroll an element into view and return its place in the window."""
+        return self.run(f"(() => {{ const e = document.querySelector({json.dumps(selector)}); "
+                        "e.scrollIntoView({block: 'center', behavior: 'instant'}); const r = e.getBoundingClientRect();"
+                        "return {x: r.x, y: r.y, width: r.width, height: r.height}; })()")
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """Send a mouse event: mouseMoved, mousePressed, mouseReleased, mouseWheel."""
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def click(self, selector: str) -> None:
+        """Click into the middle of an element."""
+        place = self.where(selector)
+        x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+        self.mouse("mousePressed", x, y, button="left", clickCount=1)
+        self.mouse("mouseReleased", x, y, button="left", clickCount=1)
+
+    def drag(self, selector: str, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Drag inside an element, between two places as shares of its width and height."""
+        place = self.where(selector)
+        ends = ((place["x"] + a * place["width"], place["y"] + b * place["height"]) for a, b in (start, end))
+        (x0, y0), (x1, y1) = ends
+        self.mouse("mousePressed", x0, y0, button="left", clickCount=1)
+        self.mouse("mouseMoved", (x0 + x1) / 2, (y0 + y1) / 2, button="left")
+        self.mouse("mouseMoved", x1, y1, button="left")
+        self.mouse("mouseReleased", x1, y1, button="left", clickCount=1)
+
+    def window(self, width: int, height: int, *, dark: bool = False, phone: bool = False) -> None:
+        """Set the size of the window and the colours that the person prefers."""
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.send("Emulation.setEmulatedMedia",
+                  features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}])
+
+    def picture(self, path: Path, whole: bool = False) -> Path:
+        """Write a picture of the window, or of the whole page, as PNG."""
+        area = {}
+        if whole:
+            size = self.send("Page.getLayoutMetrics")["cssContentSize"]
+            area = {"clip": {"x": 0, "y": 0, "width": size["width"], "height": min(size["height"], 8000), "scale": 1}}
+        shot = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole, **area)
+        path.write_bytes(base64.b64decode(shot["data"]))
+        return path
