@@ -1,0 +1,91 @@
+"""Run an entry over records in its interpreter, each fit with a time limit, and keep what came out."""
+
+import hashlib
+import json
+import os
+import selectors
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1",
+               "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1", "MPLBACKEND": "Agg"}
+
+
+def digest(entry: Path, also: Sequence[Path] = ()) -> str:
+    """Hash of everything a result depends on: the entry, what runs and judges it, the records, the code under test."""
+    files = [entry, *(HERE / name for name in ("harness.py", "judging.py", "records.py")), *sorted(also)]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+
+
+def run(python: str, entry: Path, kind: str, paths: Sequence[Path], kept: Path, limit: float, budget: float
+        ) -> dict[str, dict]:
+    """Return what came of every record, from `kept` where it is there.
+
+    Args:
+        python: the interpreter.
+        entry: the file of the peer.
+        kind: the function in it.
+        paths: the records.
+        kept: JSON file of results so far; written after every record.
+        limit: wall seconds after which a fit is stopped; records after it are not tried.
+        budget: wall seconds after which no further record is begun.
+    """
+    found: dict[str, dict] = json.loads(kept.read_text()) if kept.exists() else {}
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic() - sum(one.get("wall", 0.0) for one in found.values())
+    while left := [path for path in paths if path.stem not in found]:
+        if time.monotonic() - started > budget or any("stopped" in one for one in found.values()):
+            break
+        before = len(found)
+        _session(python, entry, kind, left, found, kept, limit, started + budget)
+        if len(found) == before:
+            break
+    return {path.stem: found[path.stem] for path in paths if path.stem in found}
+
+
+def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: dict[str, dict], kept: Path,
+             limit: float, until: float) -> None:
+    """One process over records until it ends, a fit takes too long, or the budget is spent."""
+    noise = kept.with_suffix(".stderr.txt")
+    with noise.open("wb") as stderr:
+        process = subprocess.Popen(
+            [python, str(HERE / "harness.py"), str(entry), kind, *map(str, paths)], stdout=subprocess.PIPE,
+            stderr=stderr, bufsize=0, env=os.environ | ENVIRONMENT)
+        name, began = "", time.monotonic()
+        try:
+            while (line := _line(process, limit)) is not None:
+                if not line:
+                    break
+                told = json.loads(line)
+                if "record" in told:
+                    name, began = told["record"], time.monotonic()
+                    continue
+                found[name] = told | {"wall": time.monotonic() - began}
+                kept.write_text(json.dumps(found, indent=1))
+                name = ""
+                if time.monotonic() > until:
+                    return
+            if line is None:
+                found[name or paths[0].stem] = {"stopped": f"no answer in {limit:.0f} s", "wall": limit}
+            elif name or process.wait() != 0:
+                code = process.wait()
+                ended = f"signal {-code}" if code < 0 else f"exit code {code}"
+                found[name or paths[0].stem] = {"stopped": f"the process ended: {ended}", "wall": 0.0,
+                                                "message": noise.read_text(errors="replace")[-400:]}
+            kept.write_text(json.dumps(found, indent=1))
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _line(process: subprocess.Popen, limit: float) -> bytes | None:
+    """The next line of a process, empty at its end, None when there is none within the limit."""
+    assert process.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        if not selector.select(limit):
+            return None
+    return process.stdout.readline()
