@@ -1,9 +1,11 @@
 """Dask clusters: reach a scheduler, refuse workers that run other programs, and say in words why a task was lost."""
 
+import json
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -16,6 +18,14 @@ REACH = 3.0
 
 ANSWER = 10.0
 """Seconds a scheduler has to answer once its machine is reached."""
+
+LOOKS = 3
+"""Times that versions are compared before a difference counts: source files may be edited while workers look."""
+
+NO_SCHEDULER = (
+    "what answers at {} is no Dask scheduler, or one of another version. Is this the port of the scheduler (8786 by "
+    "default), not of its dashboard (8787)?"
+)
 
 PACKAGES = ("optid", "numpy", "scipy", "numba")
 """What workers and this process must have alike: they exchange objects of these, and compute the same digits."""
@@ -61,20 +71,15 @@ def _opened(client: Callable[..., Any], scheduler: Any) -> Any:
     text = str(scheduler)
     if text.endswith(".json"):
         try:
-            with open(text) as file:
-                file.read(1)
-        except OSError as error:
-            raise ClusterError(f"scheduler file {text!r} cannot be read: {error.strerror}.") from error
-        arguments = {"scheduler_file": text}
-    else:
-        arguments = {"address": _reached(text)}
+            text = json.loads(Path(text).read_text())["address"]
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise ClusterError(f"{text!r} is not the scheduler file of a running scheduler "
+                               f"({type(error).__name__}: {error}).") from error
+    address = _reached(text)
     try:
-        return client(**arguments, timeout=ANSWER, set_as_default=False)
+        return client(address, timeout=ANSWER, set_as_default=False)
     except Exception as error:  # whatever the handshake with something else than a scheduler comes to
-        raise ClusterError(
-            f"no Dask scheduler answers at {text!r} within {ANSWER:g} s ({type(error).__name__}). Is this the port of "
-            "the scheduler (8786 by default), not of its dashboard (8787), and does it run the same version of Dask?"
-        ) from error
+        raise ClusterError(f"{NO_SCHEDULER.format(text)} ({type(error).__name__})") from error
 
 
 def _reached(text: str) -> str:
@@ -88,12 +93,26 @@ def _reached(text: str) -> str:
     if not kind or not host or not port or not re.fullmatch(r"tcp|tls|ws|wss|ucxx?", kind):
         raise ClusterError(f"{text!r} is not the address of a scheduler: write tcp://host:8786.")
     try:
-        socket.create_connection((host, port), timeout=REACH).close()
+        with socket.create_connection((host, port), timeout=REACH) as connection:
+            if kind == "tcp" and not _greets(connection):
+                raise ClusterError(NO_SCHEDULER.format(address))
     except OSError as error:
         why = error.strerror or ("no answer" if isinstance(error, TimeoutError) else str(error))
         raise ClusterError(f"no scheduler can be reached at {address} ({why}). Is it running (dask scheduler), and is "
                            "the port open from here?") from error
     return address
+
+
+def _greets(connection: socket.socket) -> bool:
+    """Say whether what answers speaks as Dask does: at once, and first the length of a short message.
+
+    A Client would wait for ever at most other servers.
+    """
+    try:
+        greeting = connection.recv(8, socket.MSG_WAITALL)
+    except TimeoutError:
+        return False
+    return len(greeting) == 8 and int.from_bytes(greeting, "little") < 1 << 20
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
@@ -143,20 +162,27 @@ def check_workers(client: Any, packages: Sequence[str]) -> dict[str, str]:
     Raises:
         ClusterError: no worker, or the first one that differs, with the difference.
     """
-    reader = _reader(packages)
-    here = reader()
-    there = client.run(reader, on_error="return")
-    if not there:
-        address = client.scheduler.address
-        raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
-    for worker, found in there.items():
-        if isinstance(found, BaseException):
-            raise ClusterError(f"worker {worker} cannot say which versions it has: {type(found).__name__}: {found}")
-        if text := difference(here, found):
-            same = sum(difference(here, other) == text for other in there.values() if isinstance(other, dict))
-            others = f" ({same} of {len(there)} workers)" if len(there) > 1 else ""
-            raise ClusterError(f"worker {worker}{others} has other packages: {text}. Install the same versions there.")
-    return here
+    reader, refusal = _reader(packages), ""
+    for _ in range(LOOKS):
+        here, there = reader(), client.run(reader, on_error="return")
+        if not there:
+            address = client.scheduler.address
+            raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
+        if not (refusal := _differences(here, there)):
+            return here
+    raise ClusterError(refusal)
+
+
+def _differences(here: Mapping[str, str], workers: Mapping[str, Any]) -> str:
+    """Return a sentence on the first worker that differs, "" where none does."""
+    for worker, there in workers.items():
+        if isinstance(there, BaseException):
+            return f"worker {worker} cannot say which versions it has: {type(there).__name__}: {there}"
+        if text := difference(here, there):
+            same = sum(other == there for other in workers.values())
+            others = f" ({same} of {len(workers)} workers)" if len(workers) > 1 else ""
+            return f"worker {worker}{others} has other packages: {text}. Install the same versions there."
+    return ""
 
 
 def result_of(client: Any, task: Any) -> Any:
@@ -182,10 +208,10 @@ def lost_in_words() -> Iterator[None]:
     try:
         yield
     except KilledWorker as error:
+        count = error.allowed_failures + 1
         raise ClusterError(
-            f"{error.allowed_failures + 1} workers died one after the other over the same task, the last at "
-            f"{error.last_worker.address}. Most often memory ran out: give workers more, or open the record with a "
-            "smaller chunk or smaller partitions."
+            f"{count} worker{'s' * (count > 1)} died over the same task, the last at {error.last_worker.address}. Most "
+            "often memory ran out: give workers more, or open the record with a smaller chunk or smaller partitions."
         ) from error
     except (CancelledError, CommClosedError) as error:
         raise ClusterError(

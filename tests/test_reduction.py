@@ -90,6 +90,10 @@ def test_tree_of_a_pass_is_the_tree_of_tasks(count):
 
 @pytest.fixture(scope="module")
 def record():
+    return two_experiments()
+
+
+def two_experiments():
     """Two experiments of a dead zone before dynamics of the second order, 2 % missing, with a clock."""
     rng = np.random.default_rng(5)
     us, ys = [], []
@@ -110,6 +114,10 @@ def frame_of(experiment):
 
 @pytest.fixture
 def folders(record, tmp_path):
+    return record_folders(record, tmp_path)
+
+
+def record_folders(record, tmp_path):
     """One folder per experiment: 12 files, so that part.10 sorts before part.2 as text; several row groups each."""
     for i, e in enumerate(record.experiments):
         (tmp_path / f"run{i}").mkdir()
