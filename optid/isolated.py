@@ -48,14 +48,19 @@ def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Ans
         return Answer(Status.LIMIT, f"stopped after {time.monotonic() - started:.1f} s: it did not keep its time limit")
     except EOFError:
         child.join()
-        code = child.exitcode or 0
-        word = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-        return Answer(Status.FAILED, f"the solver's process died: {word}")
+        return Answer(Status.FAILED, f"the solver's process died: {death(child.exitcode or 0)}")
     finally:
         if child.is_alive():
             child.kill()
         child.join()
         receiver.close()
+
+
+def death(code: int) -> str:
+    """Return the exit code of a process in words: the name of the signal where one killed it."""
+    if code >= 0:
+        return f"exit code {code}"
+    return f"signal {signal.Signals(-code).name}" if -code in set(signal.Signals) else f"signal {-code}"
 
 
 def _work(sender: Connection, back_end: BackEnd, program: Program, settings: Settings) -> None:

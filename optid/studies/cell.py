@@ -38,11 +38,18 @@ from optid.studies.versions import determining
 KEPT = 3
 """Records that a worker keeps, so that cells of one data set load it once."""
 
+REHEARSED = 0.25
+"""Share of the time limit up to which the first cell of its kind in a process is run twice."""
+
 _records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
+_rehearsed: set[tuple[str, str, bool]] = set()
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Run a cell and return its row, whatever the fit does.
+
+    The first cell of a formulation and solver in a process is run twice when it is quick, and the second run counts:
+    importing a solver and loading compiled kernels are not in the times.
 
     The solver's own clock is set to the time limit, and it runs in this process: whoever calls this stops a process
     that does not keep its limits.
@@ -50,6 +57,15 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     Args:
         cell: what to run.
     """
+    row = _run(cell)
+    kind = (cell.formulation_name, cell.solver_name, cell.warm)
+    if kind not in _rehearsed and row["outcome"] == DONE and row["total_s"] < REHEARSED * cell.time_limit:
+        row = _run(cell)
+    _rehearsed.add(kind)
+    return row
+
+
+def _run(cell: Cell) -> dict[str, Any]:
     started, clock = datetime.now(UTC), time.perf_counter()
     if cell.refusal:
         return lost_row(cell, REFUSED, cell.refusal, started=started)
@@ -64,7 +80,10 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         found = {"outcome": MEMORY_LIMIT, "reason": f"MemoryError: {error}"}
     except (Exception, SystemExit) as error:
         found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
-    return complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
+    largest = peak.mb()
+    if largest > cell.memory_limit:  # it went unseen by who watches the process: what is above the limit is no answer
+        found = {"outcome": MEMORY_LIMIT, "reason": f"held {largest:.0f} MB; the limit is {cell.memory_limit:g} MB"}
+    return complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": largest,
                      "base_mb": peak.start, "total_s": time.perf_counter() - clock})
 
 

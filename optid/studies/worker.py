@@ -1,0 +1,53 @@
+"""What a worker process does: receive cells one after another and send back what the function returns.
+
+It ends when its parent does, whatever it is doing.
+"""
+
+import ctypes
+import faulthandler
+import os
+import pickle
+import signal
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+READY, ROW, RAISED = "ready", "row", "raised"
+"""First word of every message to the parent."""
+
+
+def main(descriptor: int, parent: int) -> None:
+    """Work until the parent closes the connection.
+
+    Args:
+        descriptor: of one end of a pair of sockets, inherited; the function comes first, then the cells.
+        parent: its process id.
+    """
+    faulthandler.enable()  # a segmentation fault then says where
+    _die_with(parent)
+    connection = Connection(descriptor)
+    function = pickle.loads(connection.recv_bytes())
+    connection.send((READY, os.getpid()))
+    while True:
+        try:
+            cell = connection.recv_bytes()
+        except EOFError:
+            return
+        connection.send(_answer(function, cell))
+
+
+def _answer(function: Callable[[Any], Any], packed: bytes) -> tuple[str, Any]:
+    try:
+        return ROW, dict(function(pickle.loads(packed)))
+    except BaseException as error:  # the function makes rows of errors; this is one in the function itself
+        return RAISED, f"{type(error).__name__}: {error}"
+
+
+def _die_with(parent: int) -> None:
+    """Let the system kill this process when its parent ends, even in the middle of a solver's loop."""
+    if sys.platform == "linux":
+        die = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
+        ctypes.CDLL(None).prctl(die, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)

@@ -1,0 +1,142 @@
+"""A worker process as its parent sees it: start, give it a cell, look at it, end it."""
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from multiprocessing.connection import Connection
+from typing import Any
+
+import psutil
+
+from optid.isolated import death
+from optid.studies.cell import lost_row
+from optid.studies.grid import Cell
+from optid.studies.memory import MB
+
+PROGRAM = "import sys; sys.path[:] = {path!r}; from optid.studies.worker import main; main({descriptor}, {parent})"
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+TOLD = 4000  # bytes of a dead worker's last words that are looked at
+TALK = 10_000_000  # bytes of them that are kept on the disk
+
+
+class WorkerProcess:
+    """One process, its connection, and the cell it has in hand.
+
+    A fresh interpreter, never a fork of a process with threads; it imports nothing of the caller's main module. It
+    leads a session of its own, so that Ctrl-C in the terminal does not reach it and a kill takes its children along.
+
+    Attributes:
+        connection: to it.
+        ready: whether it has imported everything.
+        fresh_mb: its resident memory then.
+        cell: what it has in hand, or None.
+        peak_mb: largest memory seen since it was given the cell.
+    """
+
+    def __init__(self, function: bytes) -> None:
+        ours, theirs = socket.socketpair()
+        self._words = tempfile.TemporaryFile("ab+")
+        program = PROGRAM.format(path=sys.path, descriptor=theirs.fileno(), parent=os.getpid())
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", program], pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL, stderr=self._words, start_new_session=True,
+                env={**dict.fromkeys(THREADS, "1"), **os.environ})
+        self.connection = Connection(ours.detach())
+        self.ready, self.fresh_mb = False, 0.0
+        self.cell: Cell | None = None
+        self._begin(None)
+        self._send(function)
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def seconds(self) -> float:
+        """Time since it was started, or given the cell in hand."""
+        return time.monotonic() - self._clock
+
+    def give(self, cell: Cell) -> None:
+        """Hand it a cell.
+
+        Raises:
+            Exception: whatever the cell raises when it is pickled; the worker stays idle then.
+        """
+        packed = pickle.dumps(cell)
+        self._begin(cell)
+        self._send(packed)
+
+    def take(self) -> None:
+        """Take the cell out of its hands; its row is there."""
+        self.cell = None
+
+    def resident_mb(self, family: bool = False) -> float:
+        """Return its resident memory, that of its children with it where asked for; 0 when it is gone."""
+        try:
+            process = psutil.Process(self.pid)
+            members = [process, *process.children(recursive=True)] if family else [process]
+            return sum(member.memory_info().rss for member in members) / MB
+        except psutil.Error:
+            return 0.0
+
+    def shorten_words(self) -> None:
+        """Forget what it wrote when that fills the disk."""
+        if os.fstat(self._words.fileno()).st_size > TALK:
+            self._words.truncate(0)
+
+    def lost(self, outcome: str, reason: str) -> dict[str, Any]:
+        """Return the row of the cell in hand, which it will not make."""
+        if self.cell is None:
+            raise ValueError("this worker has no cell in hand")
+        return lost_row(self.cell, outcome, reason, started=self._started, total_s=self.seconds,
+                        peak_mb=self.peak_mb or None)
+
+    def end(self, patience: float = 0.0) -> str:
+        """Kill it with its children and return how it ended, in words.
+
+        Args:
+            patience: seconds to wait first for a process that is about to end by itself, whose exit code says why.
+        """
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(patience)
+        children: Sequence[psutil.Process] = ()
+        with suppress(psutil.Error):
+            children = psutil.Process(self.pid).children(recursive=True)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+        for child in children:
+            with suppress(psutil.Error):
+                child.kill()
+        self.connection.close()
+        code = self._process.wait()
+        words = self._last_words()
+        self._words.close()
+        return f"{death(code)}, {words}" if words else death(code)
+
+    def _begin(self, cell: Cell | None) -> None:
+        self.cell, self.peak_mb = cell, 0.0
+        self._started, self._clock = datetime.now(UTC), time.monotonic()
+        self._words.truncate(0)
+
+    def _send(self, packed: bytes) -> None:
+        with suppress(OSError):  # it died; the end of the connection tells
+            self.connection.send_bytes(packed)
+
+    def _last_words(self) -> str:
+        """What it wrote last to its standard error: where Python says it crashed, or the last line."""
+        self._words.seek(max(0, self._words.seek(0, os.SEEK_END) - TOLD))
+        lines = [line.strip() for line in self._words.read().decode(errors="replace").splitlines() if line.strip()]
+        if any(line.startswith("Fatal Python error") for line in lines):
+            places = [line for line in lines if line.startswith("File ")]
+            return f"at {places[0]}" if places else ""
+        return lines[-1] if lines else ""

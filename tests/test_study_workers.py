@@ -1,0 +1,187 @@
+"""Workers: whatever a cell does to its process is a row, and the others go on."""
+
+import re
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+import study_trouble
+from study_trouble import behave, cell
+
+from optid.errors import StudyError
+from optid.studies import workers
+from optid.studies.rows import NAMES
+from optid.studies.workers import execute
+
+
+def by_key(cells, **settings):
+    """Rows by number of the cell; every cell has exactly one."""
+    rows = list(execute(cells, behave, **settings))
+    found = {int(row["key"], 16): row for row in rows}
+    assert len(rows) == len(cells) == len(found) and set(found) == {int(c.key, 16) for c in cells}
+    assert all(tuple(row) == NAMES for row in rows)
+    return found
+
+
+def gone(pid):
+    with suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    return True
+
+
+def wait_for(condition, seconds=20.0):
+    until = time.monotonic() + seconds
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.02)
+    assert condition()
+
+
+def test_workers_are_reused():
+    rows = by_key([cell(k) for k in range(40)], workers=2)
+    assert len({row["unknowns"] for row in rows.values()}) <= 2
+    assert all(row["outcome"] == "done" for row in rows.values())
+    assert all(gone(row["unknowns"]) for row in rows.values())
+
+
+FAILURES = {
+    "segfault": ("crashed", "signal SIGSEGV, at File .* in string_at"),
+    "abort": ("crashed", "signal SIGABRT"),
+    "leave": ("crashed", "exit code 3"),
+    "complain": ("crashed", "exit code 134, terminate called after throwing an instance of 'std::bad_alloc'"),
+    "raise": ("error", "KeyError: 'no such thing'"),
+    "garbage": ("error", "TypeError"),
+    "partial": ("error", "is no row: .*needs a value in every row"),
+    "other": ("error", "is no row: it is of another cell"),
+}
+
+
+def test_a_worker_that_fails_is_a_row_and_the_next_cell_runs():
+    ways = [way for failure in FAILURES for way in (failure, "fine")]
+    rows = by_key([cell(k, do) for k, do in enumerate(ways)], workers=1)
+    for k, do in enumerate(ways):
+        outcome, words = FAILURES.get(do, ("done", ""))
+        assert rows[k]["outcome"] == outcome and re.search(words, rows[k]["reason"] or ""), rows[k]["reason"]
+        if outcome == "error":  # nothing is wrong with the worker
+            assert rows[k - 1]["unknowns"] == rows[k + 1]["unknowns"]
+
+
+@pytest.mark.parametrize("do", ["loop", "stuck"])
+def test_an_endless_cell_is_stopped(do):
+    clock = time.monotonic()
+    rows = by_key([cell(0, do, time_limit=0.5), cell(1)], workers=1)
+    assert rows[0]["outcome"] == "time limit" and "the limit is 0.5 s" in rows[0]["reason"]
+    assert 0.5 < rows[0]["total_s"] < time.monotonic() - clock
+    assert rows[1]["outcome"] == "done"
+
+
+def test_a_memory_hog_is_stopped():
+    rows = by_key([cell(0, "hog", memory_limit=500.0), cell(1)], workers=1)
+    assert rows[0]["outcome"] == "memory limit" and "the limit is 500 MB" in rows[0]["reason"]
+    assert rows[0]["peak_mb"] > 500.0
+    assert rows[1]["outcome"] == "done"
+
+
+def test_children_count_and_go_with_their_worker(tmp_path):
+    pids = tmp_path / "pids"
+    hog = "held = bytearray(400_000_000)\nimport time\ntime.sleep(60)"
+    sleeper = "import os, time\nos.setsid()\ntime.sleep(60)"  # left the session of the worker
+    rows = by_key([cell(0, "family", memory_limit=400.0, program=hog, pids=str(pids)),
+                   cell(1, "family", time_limit=1.0, program=sleeper, pids=str(pids))], workers=1)
+    assert (rows[0]["outcome"], rows[1]["outcome"]) == ("memory limit", "time limit")
+    children = [int(line) for line in pids.read_text().split()]
+    assert len(children) == 2
+    wait_for(lambda: all(map(gone, children)))
+
+
+def test_nan_of_a_function_is_empty_in_its_row():
+    row = by_key([cell(0, "nan")])[0]
+    assert row["objective"] is None and row["gap"] is None
+
+
+def test_a_noisy_solver_disturbs_nobody(capfd):
+    rows = by_key([cell(0, "noisy"), cell(1)], workers=1)
+    assert [row["outcome"] for row in rows.values()] == ["done", "done"]
+    out, err = capfd.readouterr()
+    assert not out and not err
+
+
+def test_a_worker_that_keeps_memory_is_replaced(monkeypatch):
+    monkeypatch.setattr(workers, "KEPT_MB", 100.0)
+    cells = [cell(0, "keep", memory_limit=500.0, megabytes=300), cell(1, memory_limit=500.0), cell(2)]
+    rows = by_key(cells, workers=1)
+    assert rows[0]["unknowns"] != rows[1]["unknowns"] == rows[2]["unknowns"]
+
+
+def test_a_cell_that_cannot_be_sent_is_a_row():
+    bad = cell(0, how=lambda: None)
+    rows = by_key([bad, cell(1)], workers=1)
+    assert rows[0]["outcome"] == "error" and "cannot be sent to a worker" in rows[0]["reason"]
+    assert rows[1]["outcome"] == "done"
+
+
+def test_closing_ends_the_workers_at_once():
+    rows = execute([cell(0), cell(1, "loop"), cell(2, "loop")], behave, workers=2)
+    pid = next(rows)["unknowns"]
+    clock = time.monotonic()
+    rows.close()
+    assert gone(pid) and time.monotonic() - clock < 2.0
+    assert not [p for p in psutil.Process().children(recursive=True) if "optid.studies.worker" in " ".join(p.cmdline())]
+
+
+def test_workers_die_with_a_parent_that_is_killed(tmp_path):
+    program = f"""
+import sys
+sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+from study_trouble import behave, cell
+from optid.studies.workers import execute
+for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behave, workers=2):
+    print(row["unknowns"], flush=True)
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        parent.stdout.readline(), parent.stdout.readline()
+        children = psutil.Process(parent.pid).children()
+        assert len(children) == 2
+        time.sleep(0.2)
+        parent.kill()
+    wait_for(lambda: all(gone(child.pid) for child in children))
+
+
+def test_no_guard_of_the_main_module_is_needed(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import sys
+sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+from study_trouble import behave, cell
+from optid.studies.workers import execute
+print("once", [row["outcome"] for row in execute([cell(0)], behave)])
+""")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "once ['done']\n", done.stderr
+
+
+@pytest.mark.parametrize("number", [0, -2])
+def test_no_workers_are_refused(number):
+    with pytest.raises(StudyError, match="at least one process"):
+        list(execute([cell(0)], behave, workers=number))
+
+
+def test_a_function_without_a_name_is_refused():
+    with pytest.raises(StudyError, match="workers cannot import"):
+        list(execute([cell(0)], lambda cell: {}))
+
+
+def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
+    monkeypatch.setattr("optid.studies.worker_process.PROGRAM", "import no_such_module_{parent}  # {path} {descriptor}")
+    with pytest.raises(StudyError, match="3 workers, one after another, .*exit code 1, ModuleNotFoundError"):
+        list(execute([cell(0)], behave))
+
+
+def test_nothing_to_do_starts_nobody():
+    before = set(psutil.Process().children())
+    assert list(execute([], behave)) == []
+    assert set(psutil.Process().children()) == before
