@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from optid.cli.comparing import ComparingCommand, compare
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.designing import design
 from optid.cli.diagnosing import diagnose
@@ -25,6 +26,7 @@ from optid.cli.options import (
 from optid.cli.ordering import order
 from optid.cli.reformulating import reformulate
 from optid.cli.results import command_line, conclude
+from optid.cli.studies import study
 from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
 
 app = typer.Typer(
@@ -312,9 +314,11 @@ def examples() -> None:
     table()()
 
 
+app.command(cls=ComparingCommand)(compare)
 app.command(cls=Command)(design)
 app.command(cls=Command)(diagnose)
 app.command(cls=Command)(isolability)
 app.command(cls=Command)(monitor)
 app.command(cls=Command)(reformulate)
 app.command(cls=Command)(order)
+app.add_typer(study, name="study")

@@ -20,11 +20,13 @@ _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
 class FittingCommand(Command):
     """A command that takes the arguments of the formulation named by ``--formulation`` as options."""
 
+    spelled_out = DEFAULT
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse, after the options of the formulation have joined those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
         name = chosen(args)
-        if name != DEFAULT:  # whose arguments all have options of their own: nothing need be loaded
+        if name != self.spelled_out:  # whose arguments all have options of their own: nothing need be loaded
             self.params += derived_options(name, {word for p in self.params for word in p.opts})
         try:
             rest = super().parse_args(ctx, args)

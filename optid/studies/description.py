@@ -96,15 +96,15 @@ class Study:
     """
 
     name: str
-    data: tuple[DataEntry, ...]
-    formulations: tuple[FormulationEntry, ...]
-    solvers: tuple[SolverEntry, ...]
-    accuracy: tuple[float, ...] = (1e-8,)
+    data: tuple[DataEntry, ...] | Any
+    formulations: tuple[FormulationEntry, ...] | Any
+    solvers: tuple[SolverEntry, ...] | Any
+    accuracy: tuple[float, ...] | Any = (1e-8,)
     time_limit: float = 60.0
     memory_limit: float = 2000.0
     repetitions: int = 1
     warm: bool = False
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] | Any = (0,)
     holdout: float = 0.3
     folder: Path = field(default_factory=Path, compare=False)
 

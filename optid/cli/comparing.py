@@ -1,0 +1,194 @@
+"""The command that compares solvers on one record: a study of one line."""
+
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from optid.cli.derived import DEFAULT, FittingCommand
+from optid.cli.options import MODEL, RECORD, SOLVER, Example, Files, Report, Seed, reads_a_record
+from optid.cli.studies import Accept, Workers, follow_progress
+from optid.cli.terminal import note, output, say
+from optid.errors import LookupFailed
+from optid.registry import formulation as look_up
+
+STUDY = "The study"
+
+ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
+"""What a formulation is given that needs it, where nobody says: which solver is the question, not which order."""
+
+
+class ComparingCommand(FittingCommand):
+    """Every argument of the formulation is an option derived from it."""
+
+    spelled_out = ""
+
+
+@reads_a_record
+def compare(
+    data: Files = None,
+    example: Example = None,
+    *,
+    how: dict[str, Any],
+    formulation: Annotated[
+        str, typer.Option("--formulation", "-f", metavar="NAME", rich_help_panel=MODEL, help="See optid formulations.")
+    ] = DEFAULT,
+    constraint: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--constraint", "-c", metavar="NAME:VALUE...", rich_help_panel=MODEL, help="See optid constraints."
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE...", rich_help_panel=MODEL, help="Any other argument."),
+    ] = None,
+    solvers: Annotated[
+        list[str] | None,
+        typer.Option("--solvers", "--solver", "-s", metavar="NAME...", rich_help_panel=SOLVER,
+                     help="all, or names: see optid solvers."),
+    ] = None,
+    accuracy: Annotated[
+        float, typer.Option("--accuracy", rich_help_panel=SOLVER, help="Relative, asked of every solver and verified.")
+    ] = 1e-8,
+    time_limit: Annotated[
+        float, typer.Option("--time-limit", metavar="SECONDS", rich_help_panel=SOLVER, help="For each run.")
+    ] = 60.0,
+    memory_limit: Annotated[
+        float, typer.Option("--memory-limit", metavar="MB", rich_help_panel=SOLVER, help="For each run.")
+    ] = 2000.0,
+    repetitions: Annotated[
+        int, typer.Option("--repetitions", rich_help_panel=STUDY, help="Runs of each solver; times are their median.")
+    ] = 3,
+    holdout: Annotated[
+        float, typer.Option("--holdout", metavar="SHARE", rich_help_panel=RECORD, help="Share kept out of the fit.")
+    ] = 0.3,
+    seed: Seed = 0,
+    db: Annotated[
+        Path | None,
+        typer.Option("--db", metavar="FILE", rich_help_panel=STUDY, help="Keep the rows; go on where it stopped."),
+    ] = None,
+    workers: Workers = 1,
+    accept_changed_data: Accept = False,
+    report: Report = None,
+) -> None:
+    """Compare solvers on one record at equal verified accuracy, and say which to use.
+
+    Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2
+    --basis triangular:8 --solvers all
+    """
+    from optid.cli import arguments as words
+    from optid.errors import StudyError
+    from optid.studies import running
+    from optid.studies.comparison import compare as side_by_side
+    from optid.studies.description import Study
+
+    words.check_folders(report, db)
+    entry, suggestion = _entry(data, how, example, seed)
+    arguments = words.suited(suggestion, formulation) if suggestion else {}
+    arguments |= words.pairs(settings, "--set")
+    assumed = _assumed(formulation, arguments)
+    arguments |= assumed
+    constraints = constraint if constraint is not None else arguments.pop("constraints", [])
+    arguments["constraints"] = [] if constraints == ["none"] else constraints
+    chosen = words.listed(solvers) or ["all"]
+    try:
+        study = Study(f"compare {entry['name']}", data=entry, formulations={"formulation": formulation, **arguments},
+                      solvers="all" if chosen == ["all"] else chosen, accuracy=accuracy, time_limit=time_limit,
+                      memory_limit=memory_limit, repetitions=repetitions, warm=True, holdout=holdout)
+        study.check_data()
+    except StudyError as error:
+        raise StudyError(_as_options(str(error))) from None
+    with follow_progress(db) as follow:
+        rows = running.run(study, db, workers=workers, progress=follow, accept_changed_data=accept_changed_data)
+    found = side_by_side(rows)
+    if (reason := found.common_error) is not None:
+        raise StudyError(f"no solver could be tried: {reason}")
+    _show(found, study.formulations[0].name, entry["name"])
+    if assumed:
+        note(f"{', '.join(f'{key} = {value}' for key, value in assumed.items())} assumed; optid order finds orders")
+    if report is not None:
+        from optid.cli.results import command_line
+        from optid.studies.page import write_page
+
+        write_page(rows, report, command=command_line())
+        say(f"report written to {report}")
+
+
+def _assumed(formulation: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Values for what a formulation needs and nobody gave."""
+    try:
+        parameters = inspect.signature(look_up(formulation)[1]).parameters
+    except LookupFailed:  # the study says so
+        return {}
+    needed = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
+    return {key: ASSUMED[key] for key in needed if key not in arguments and key in ASSUMED}
+
+
+def _entry(files: list[Path] | None, how: dict[str, Any], example: str | None, seed: int
+           ) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The data entry of the study, and the arguments that a built-in record suggests."""
+    from optid.cli import arguments as words
+
+    if example is not None or not files:
+        record, suggestion = words.record(files, how, example, seed)
+        return {"name": example, "record": record}, suggestion
+    reading = {"inputs": words.listed(how["inputs"]), "outputs": words.listed(how["outputs"]),
+               "columns": words.listed(how["columns"]), "dt": how["dt"], "experiment": how["experiment"],
+               "time": False if how["time"] == "none" else how["time"],
+               "delimiter": how["delimiter"].replace("\\t", "\t"), "decimal": how["decimal"]}
+    entry = {"name": files[0].stem, "file": [str(path) for path in files]}
+    return entry | {key: value for key, value in reading.items() if value is not None}, {}
+
+
+def _as_options(text: str) -> str:
+    """Say keys of a study as options of the command line."""
+    import re
+
+    lines = [line.strip() for line in text.splitlines()[1:]] or [text]
+    found = []
+    for line in lines:
+        line = re.sub(r"^(\w+)(?:\[\d+\])?: \1 is", lambda m: f"--{m[1].replace('_', '-')} is", line)
+        line = re.sub(r"^(?:data|formulations|solvers)\[\d+\](?:\.\w+)?(?:\[\d+\])?: ", "", line)
+        found.append(line)
+    return "\n".join(found)
+
+
+def _show(found: Any, posed: str, record: str) -> None:
+    from optid.showing.wording import number, seconds
+    from optid.studies.choice import listed
+    from optid.studies.outcomes import SOLVED
+
+    def clock(value: float) -> str:
+        return "-" if value != value else seconds(value)
+
+    def small(value: float) -> str:
+        return "-" if value != value else f"{value:.0e}"
+
+    table = Table(title=f"{posed} on {record}, accuracy {found.accuracy:.0e}", box=box.SIMPLE_HEAD,
+                  title_justify="left", title_style="bold", pad_edge=False)
+    table.add_column("solver", no_wrap=True)
+    table.add_column("verified", overflow="fold")
+    for column in ("excess", "residual", "cold", "warm", "1-step", "simul."):
+        table.add_column(column, justify="right", no_wrap=True)
+    for line in found.lines:
+        good = line.state == SOLVED
+        word = "local" if line.status == "locally optimal" else line.status
+        table.add_row(
+            Text(line.solver, "bold" if good else "dim"),
+            Text(word if good else line.state, "green" if line.proved else "yellow"),
+            "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), clock(line.cold),
+            clock(line.warm), number(line.one_step, 4), number(line.simulation, 4))
+    output().print(table)
+    for reason, solvers in found.reasons.items():
+        say(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
+    if found.refused:
+        say(Text(f"not for {posed}: {', '.join(found.refused)}", "dim"))
+    say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: the largest of "
+             "ours. 1-step, simul.: fit in % on held-out samples.", "dim"))
+    say(Text(found.recommendation, "bold"))

@@ -1,0 +1,234 @@
+"""The commands of studies: run, report, export."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.table import Table
+from rich.text import Text
+from typer.core import TyperGroup
+
+from optid.cli.results import command_line
+from optid.cli.terminal import Command, output, say
+
+study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
+                    help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
+
+STOPPED = 130  # exit code after Ctrl-C, by convention of shells
+
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", "-w", metavar="N", help="Processes that run cells; one per core if not given."),
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:8786.")
+]
+Accept = Annotated[
+    bool,
+    typer.Option("--accept-changed-data", help="Run cells again whose data file is not what it was at the last run."),
+]
+Database = Annotated[Path, typer.Argument(metavar="DATABASE", help="Written by optid study run.", show_default=False)]
+Accuracy = Annotated[
+    float | None, typer.Option("--accuracy", help="Compare at this accuracy; that of most cells if not given.")
+]
+Clock = Annotated[
+    str, typer.Option("--time", metavar="WORD", help="Time to compare: solve (cold), fit (whole) or warm.")
+]
+
+
+@study.command(cls=Command)
+def run(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="STUDY.toml", help="The study file.", show_default=False)
+    ] = None,
+    example: Annotated[bool, typer.Option("--example", help="A built-in study of half a minute instead.")] = False,
+    db: Annotated[
+        Path | None,
+        typer.Option("--db", metavar="FILE", help="Database of the rows; the study file's name with .duckdb."),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    accept_changed_data: Accept = False,
+    export: Annotated[
+        Path | None, typer.Option("--export", metavar="FILE", help="Also write the rows (.parquet, .csv) at the end.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and run nothing.")] = False,
+) -> None:
+    """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
+
+    Example: optid study run study.toml --db study.duckdb
+    """
+    from optid.cli.arguments import check_folders
+    from optid.errors import StudyError
+    from optid.studies import database, running
+    from optid.studies.built_in import example_study
+    from optid.studies.description import Study
+
+    if (file is None) != example:
+        raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
+    described = example_study() if file is None else Study.from_toml(file)
+    db = db or Path(file.stem if file is not None else "example").with_suffix(".duckdb")
+    check_folders(db, export)
+    if export is not None:
+        database.check_target(export)
+    if dry_run:
+        _plan(described, db)
+        return
+    with follow_progress(db) as follow:
+        running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
+                    accept_changed_data=accept_changed_data)
+    _summary(db, described.name)
+    if export is not None:
+        count = database.export(db, export)
+        say(f"{count} rows written to {export}")
+
+
+@study.command(cls=Command)
+def report(
+    db: Database,
+    page: Annotated[
+        Path | None, typer.Option("--report", "-o", metavar="FILE", help="Write a self-contained HTML page.")
+    ] = None,
+    accuracy: Accuracy = None,
+    clock: Clock = "solve",
+) -> None:
+    """Print the verdict of a study, and write its page.
+
+    Example: optid study report study.duckdb -o study.html
+    """
+    from optid.cli.arguments import check_folders
+    from optid.studies.page import write_page
+    from optid.studies.verdict import conclude
+
+    check_folders(page)
+    verdict = conclude(db, accuracy=accuracy, time=clock)
+    say(str(verdict))
+    if page is not None:
+        write_page(verdict, page, command=command_line())
+        say(f"report written to {page}")
+
+
+@study.command(cls=Command)
+def export(
+    db: Database,
+    target: Annotated[Path, typer.Argument(metavar="FILE", help="A .parquet or .csv file.", show_default=False)],
+) -> None:
+    """Write the rows of a database to a Parquet or CSV file.
+
+    Example: optid study export study.duckdb rows.parquet
+    """
+    from optid.cli.arguments import check_folders
+    from optid.studies import database
+
+    check_folders(target)
+    say(f"{database.export(db, target)} rows written to {target}")
+
+
+@study.command(cls=Command)
+def systems() -> None:
+    """List the simulated systems that a study file may name."""
+    from optid.studies.systems import SYSTEMS
+
+    table = Table(title="Simulated systems", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold",
+                  pad_edge=False)
+    table.add_column("system", no_wrap=True)
+    table.add_column("samples", justify="right")
+    table.add_column("noise", justify="right")
+    table.add_column("what it is")
+    for name, system in SYSTEMS.items():
+        table.add_row(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}", system.about)
+    output().print(table)
+    output().print(Text("samples and noise are those used where a study names none; noise is relative to the "
+                        "noise-free output.", "dim"))
+
+
+@contextmanager
+def follow_progress(db: Path | None) -> Iterator[Any]:
+    """A bar on the error stream, and a message where a study goes on; Ctrl-C keeps what is done."""
+    from rich import progress
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    bar = progress.Progress(
+        progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(), progress.TimeRemainingColumn(), console=console, transient=True,
+        disable=not console.is_terminal)
+    task = bar.add_task("cells", total=None)
+    counts = [0, 0]
+
+    def follow(done: int, total: int, row: dict[str, Any] | None) -> None:
+        counts[:] = done, total
+        if row is None and db is not None and done:
+            left = f"{total - done:,} to run" if done < total else "nothing is left to run"
+            say(f"{done:,} of {total:,} cells are in {db} already; {left}")
+        elif row is None and db is not None:
+            say(f"{total:,} cells to run")
+        bar.update(task, completed=done, total=total, description=_now(row))
+
+    try:
+        with bar:
+            yield follow
+    except KeyboardInterrupt:
+        kept = f"{counts[0]:,} of {counts[1]:,} cells are in {db}; the same command goes on from there"
+        say(f"stopped: {kept}" if db is not None else "stopped")
+        raise typer.Exit(STOPPED) from None
+
+
+def _now(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return "cells"
+    word = row["status_verified"] or row["outcome"]
+    return f"[dim]{_short(row['formulation'])} · {_short(row['solver'])}: {word}[/]"
+
+
+def _short(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text if len(text) <= 28 else text[:27] + "…")
+
+
+def _plan(described: Any, db: Path) -> None:
+    """Print the size of a study and what is left of it."""
+    from optid.studies import database, grid
+
+    cells = grid.cells(described)
+    grid_left = grid.left(cells, database.finished(db))
+    refused = sum(1 for cell in cells if cell.refusal)
+    say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
+        f"{len(described.solvers)} solvers; {len(cells):,} cells, {len(grid_left):,} of them to run"
+        + (f", {refused:,} with a solver that is not installed" if refused else ""))
+
+
+def _summary(db: Path, name: str) -> None:
+    """Print how the cells ended, by solver, and the verdict in one line."""
+    from optid.studies.database import read_rows
+    from optid.studies.verdict import conclude
+
+    rows = read_rows(db, study=name)
+    table = Table(title=name, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    table.add_column("solver", no_wrap=True)
+    for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
+        table.add_column(column, justify="right")
+    table.add_column("other outcomes", overflow="fold")
+    for solver in sorted(set(rows["solver"])):
+        mine = {key: values[rows["solver"] == solver] for key, values in rows.items()}
+        table.add_row(Text(solver, "bold"), *(f"{count:,}" if count else "-" for count in (
+            len(mine["key"]), int(mine["reached"].sum()), int(mine["proved"].sum()), int(mine["false_claim"].sum()),
+            int((mine["outcome"] == "refused").sum()))), _others(mine))
+    output().print(table)
+    headline = conclude(rows).headline
+    say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
+    say(Text(f"optid study report {db} -o {db.stem}.html", "dim"))
+
+
+def _others(mine: dict[str, Any]) -> str:
+    """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
+    counts: dict[str, int] = {}
+    for outcome, status, reached in zip(mine["outcome"], mine["status_verified"], mine["reached"]):
+        if not reached and outcome != "refused":
+            word = status if outcome == "done" else outcome
+            counts[word] = counts.get(word, 0) + 1
+    return ", ".join(f"{word} {count:,}" for word, count in sorted(counts.items(), key=lambda item: -item[1])) or "-"

@@ -1,0 +1,150 @@
+"""Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.showing.wording import seconds
+from optid.studies.choice import listed
+from optid.studies.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, columns, tabulate
+from optid.studies.rows import ERROR, REFUSED
+from optid.studies.standings import MINOR
+
+
+@dataclass(frozen=True)
+class Line:
+    """One solver.
+
+    Attributes:
+        solver: its label.
+        state: "solved", or the word for why not.
+        status: status after our own residuals have judged the claim; the outcome where nothing was judged.
+        proved: whether the answer is proved globally optimal.
+        above: objective above the best verified one, relative; NaN without a point.
+        residual: worst verified residual; NaN without a point.
+        cold: seconds of the first solve, compilation included, median over the repetitions.
+        warm: seconds of the second solve, from the first one's solution.
+        one_step: one-step fit in % on the hold-out samples.
+        simulation: simulation fit in % there.
+        reason: one sentence where the state needs one.
+    """
+
+    solver: str
+    state: str
+    status: str
+    proved: bool
+    above: float
+    residual: float
+    cold: float
+    warm: float
+    one_step: float
+    simulation: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All solvers on one record.
+
+    Attributes:
+        lines: those that were run, the recommended order first.
+        refused: {solver: why it was not run}.
+        accuracy: requested relative accuracy.
+    """
+
+    lines: tuple[Line, ...]
+    refused: dict[str, str]
+    accuracy: float
+
+    @property
+    def reasons(self) -> dict[str, list[str]]:
+        """Solvers that did not solve it by the sentence that says why."""
+        found: dict[str, list[str]] = {}
+        for line in self.lines:
+            if line.state != SOLVED and line.reason:
+                found.setdefault(line.reason, []).append(line.solver)
+        return found
+
+    @property
+    def common_error(self) -> str | None:
+        """What kept every solver from being run, such as a record without excitation; None where one was run."""
+        if self.lines and len(self.reasons) == 1 and all(line.state == ERROR for line in self.lines):
+            return next(iter(self.reasons)).partition(": ")[2] or next(iter(self.reasons))
+        return None
+
+    @property
+    def recommendation(self) -> str:
+        """One sentence: which solver, with the evidence."""
+        solved = [line for line in self.lines if line.state == SOLVED]
+        if not solved:
+            if not self.lines:
+                return "No solver takes this formulation: choose others (optid solvers)."
+            return f"No solver reached the verified accuracy of {self.accuracy:.0e}: {self._why_not()}."
+        first, *others = solved
+        proof = ", proved globally optimal" if first.proved else ""
+        close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
+        if close:
+            names = [line.solver for line in (first, *close)]
+            sentence = (f"Use {_either(names)}: they reached the verified accuracy of {self.accuracy:.0e} in "
+                        f"{seconds(first.cold)}, equal within {MINOR:.0%}{proof}")
+        else:
+            sentence = (f"Use {first.solver}: it reached the verified accuracy of {self.accuracy:.0e} in "
+                        f"{seconds(first.cold)}{proof}")
+        rest = [line for line in others if line not in close]
+        if rest:
+            sentence += f"; next is {rest[0].solver} with {seconds(rest[0].cold)}"
+            sentence += " (without a proof)" if first.proved and not rest[0].proved else ""
+        elif not others:
+            failed = [line.solver for line in self.lines if line is not first]
+            sentence += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
+        return sentence + "."
+
+    def _why_not(self) -> str:
+        counts: dict[str, list[str]] = {}
+        for line in self.lines:
+            counts.setdefault(line.state, []).append(line.solver)
+        return "; ".join(f"{state}: {listed(names)}" for state, names in counts.items())
+
+
+def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
+    """Set the rows of one record and one formulation side by side.
+
+    Args:
+        rows: of a study with one record, one formulation and one accuracy.
+    """
+    table = columns(rows)
+    found = tabulate(table)
+    accuracy = float(table["accuracy"][0])
+    best = np.min(found.objective[0][found.solved[0]], initial=np.inf)
+    lines, refused = [], {}
+    for s, solver in enumerate(found.solvers):
+        row = int(found.row[0, s])
+        if found.state[0, s] == REFUSED:
+            refused[solver] = str(table["reason"][row])
+            continue
+        mine = (table["solver"] == solver) & (table["outcome"] == table["outcome"][row])
+        cold = np.nan_to_num(table["compile_s"][mine]) + table["solve_s"][mine]
+        above = (table["objective"][row] - best) / found.size[0] if np.isfinite(best) else np.nan
+        lines.append(Line(
+            solver, str(found.state[0, s]), str(table["status_verified"][row] or table["outcome"][row]),
+            bool(table["proved"][row]), float(above), float(found.residual[0, s]), _median(cold),
+            _median(table["warm_s"][mine]), float(table["one_step_fit"][row]), float(table["simulation_fit"][row]),
+            str(table["reason"][row])))
+    return Comparison(tuple(sorted(lines, key=_order)), refused, accuracy)
+
+
+def _order(line: Line) -> tuple[Any, ...]:
+    states = (SOLVED, WORSE_MINIMUM)
+    rank = states.index(line.state) if line.state in states else len(states) + (line.state == FALSE_CLAIM)
+    return rank, not line.proved, np.nan_to_num(line.cold, nan=np.inf), line.solver
+
+
+def _median(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else float("nan")
+
+
+def _either(names: Sequence[str]) -> str:
+    return " or ".join(names) if len(names) < 4 else f"any of {listed(list(names))}"
