@@ -79,6 +79,8 @@ def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: 
         finally:
             process.kill()
             process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
 
 
 def _line(process: subprocess.Popen, limit: float) -> bytes | None:
