@@ -109,6 +109,15 @@ class WorkerProcess:
         """
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(patience)
+        self.kill()
+        self.connection.close()
+        code = self._process.wait()
+        words = self._last_words()
+        self._words.close()
+        return f"{death(code)}, {words}" if words else death(code)
+
+    def kill(self) -> None:
+        """Kill it with its children; the end of its connection follows."""
         children: Sequence[psutil.Process] = ()
         with suppress(psutil.Error):
             children = psutil.Process(self.pid).children(recursive=True)
@@ -117,11 +126,6 @@ class WorkerProcess:
         for child in children:
             with suppress(psutil.Error):
                 child.kill()
-        self.connection.close()
-        code = self._process.wait()
-        words = self._last_words()
-        self._words.close()
-        return f"{death(code)}, {words}" if words else death(code)
 
     def _begin(self, cell: Cell | None) -> None:
         self.cell, self.peak_mb = cell, 0.0

@@ -8,7 +8,7 @@ import os
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,7 @@ def cores() -> int:
 
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
-            workers: int | None = None) -> Iterator[Row]:
+            workers: int | None = None) -> Generator[Row, None, None]:
     """Run every cell in a worker and yield its row, in the order in which they end.
 
     Closing the generator, or an exception in it such as KeyboardInterrupt, ends all workers at once.
@@ -55,15 +55,19 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
     todo = deque(cells)
     if workers is not None and workers < 1:
         raise StudyError(f"workers = {workers}: at least one process is needed")
-    pool = _Pool(function, min(workers or cores(), max(len(todo), 1)))
+    pool = Pool(function, min(workers or cores(), max(len(todo), 1)))
     try:
         yield from pool.run(todo)
     finally:
         pool.close()
 
 
-class _Pool:
-    """The workers and what they have in hand."""
+class Pool:
+    """The workers and what they have in hand; they are kept over several calls of `run`, one at a time.
+
+    Raises:
+        StudyError: psutil is missing (with the pip line), or a function that has no name to import.
+    """
 
     def __init__(self, function: Callable[..., Any], size: int) -> None:
         try:
@@ -81,15 +85,22 @@ class _Pool:
         self._family_at = time.monotonic()
 
     def run(self, todo: deque[Cell]) -> Iterator[Row]:
+        """Run the cells and yield their rows, as `execute`."""
         rows = self._employ(todo)
         while rows or todo or any(worker.cell is not None for worker in self._workers):
             yield from rows
-            spoke = {worker.connection: worker for worker in self._workers}
-            rows = [row for connection in wait(list(spoke), TICK) for row in self._heard(spoke[connection])]
+            spoke = set(wait([worker.connection for worker in self._workers], TICK))
+            rows = [row for worker in list(self._workers) if worker.connection in spoke for row in self._heard(worker)]
             rows += self._limited()
             rows += self._employ(todo)  # before rows are handed out: no worker waits for what the caller does with them
 
+    def kill(self) -> None:
+        """End all workers from another thread: their cells become rows, and `close` is left to the thread that runs."""
+        for worker in list(self._workers):
+            worker.kill()
+
     def close(self) -> None:
+        """End all workers."""
         while self._workers:
             self._dismiss(self._workers[-1])
 
