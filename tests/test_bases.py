@@ -274,6 +274,7 @@ def test_user_functions_ask_for_themselves():
         ("BSpline:8:degree=2", BSpline(8, 2)),
         ("trigonometric:5:half_range=1.1:outside=extrapolate", Trigonometric(5, 1.1, outside="extrapolate")),
         ("piecewiseconstant:6", PiecewiseConstant(6)),
+        ("triangular:8:interval=-1..2.5", Triangular(8, (-1.0, 2.5))),
         ("linear", Linear()),
     ],
 )
@@ -291,6 +292,8 @@ def test_parse(text, basis):
         ("triangular:4:colour=red", StructureError, "colour"),
         ("triangular:4:outside=mirror", StructureError, "clamp"),
         ("triangular:4:degree=2", StructureError, "degree"),
+        ("triangular:4:interval=1", StructureError, "cannot be read"),
+        ("triangular:4:interval=1..0", StructureError, "interval"),
         ("linear:3", StructureError, "write linear"),
     ],
 )

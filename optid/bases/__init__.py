@@ -38,7 +38,17 @@ _CLASSES: dict[str, Callable[..., Basis]] = {
     "linear": Linear,
 }
 _ALIASES = {"legendre": "polynomial", "hat": "triangular"}
-_OPTIONS: dict[str, Callable[[str], Any]] = {"degree": int, "half_range": float, "outside": str}
+
+
+def _interval(text: str) -> tuple[float, float]:
+    """Read an interval written as low..high."""
+    low, high = map(float, text.split(".."))
+    return low, high
+
+
+_OPTIONS: dict[str, Callable[[str], Any]] = {
+    "degree": int, "half_range": float, "outside": str, "interval": _interval,
+}
 
 
 def parse(text: str) -> Basis:
@@ -46,7 +56,8 @@ def parse(text: str) -> Basis:
 
     Args:
         text: the class name in lower case and its size, then options: "triangular:10", "legendre:4",
-            "bspline:8:degree=2", "trigonometric:5:half_range=1.25:outside=extrapolate", "linear".
+            "bspline:8:degree=2", "trigonometric:5:half_range=1.25:outside=extrapolate", "triangular:8:interval=-1..1",
+            "linear".
 
     Raises:
         LookupFailed: no basis has this name.
