@@ -9,7 +9,7 @@ from optid.studies.quality import Quality
 from optid.studies.standings import Section, Standing
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
-RARE = 0.01  # share of the problems that a solver may refuse and still be called the one to use
+RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
 LONGEST = 90  # characters of a headline
 
 
@@ -94,7 +94,7 @@ def _times(pair: Paired) -> str:
 
 
 def _tone(lead: Standing, n: int) -> str:
-    return GOOD if lead.solved >= 0.95 * n and not lead.false_claims else FAIR if lead.solved >= 0.5 * n else BAD
+    return GOOD if lead.solved >= 0.95 * n and lead.false_claims <= RARE * n else FAIR if lead.solved >= 0.5 * n else BAD
 
 
 def _median(standing: Standing) -> str:

@@ -66,4 +66,5 @@ def paired_ratio(times: np.ndarray, reference: np.ndarray, level: float = 0.95) 
         level: of the interval.
     """
     logs = paired_difference(np.log(times), np.log(reference), level)
-    return Paired(*(float(np.exp(v)) for v in (logs.value, logs.low, logs.high)), logs.n)
+    value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
+    return Paired(value, low, high, logs.n)

@@ -206,6 +206,7 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     false = np.zeros(shape, dtype=bool)
     row, numbers = np.full(shape, -1), {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
     for (p, s), runs in entries.items():
+        runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
         bad = next((i for i in runs if states[i] != SOLVED), None)
         speaks = runs[0] if bad is None else bad
         row[p, s], state[p, s] = speaks, states[speaks]
@@ -243,7 +244,7 @@ def _worst_residual(table: Mapping[str, np.ndarray]) -> np.ndarray:
 def _seconds(table: Mapping[str, np.ndarray], parts: tuple[str, ...]) -> np.ndarray:
     """Sum of the parts; only the last one must be there."""
     total = table[parts[-1]] + sum(np.nan_to_num(table[part]) for part in parts[:-1])
-    return np.where(total >= 0, np.maximum(total, 1e-6), np.nan)  # a clock that stood still says a microsecond
+    return np.where(total > 0, total, np.where(total == 0, 1e-6, np.nan))  # a clock that stood still: a microsecond
 
 
 def _row_states(table: Mapping[str, np.ndarray], residual: np.ndarray, limit: float) -> np.ndarray:
@@ -271,7 +272,7 @@ def _against_the_best(found: Results, limit: float) -> Results:
     size = np.maximum(np.maximum(np.abs(best), 1e-2 * np.nan_to_num(found.size)), np.finfo(float).tiny)
     with np.errstate(invalid="ignore", over="ignore"):
         worse = solved & ((found.objective - best[:, None]) / size[:, None] > max(VALUE, limit))
-    denied = np.isin(found.state, (INFEASIBLE, "unbounded")) & solved.any(axis=1)[:, None]
+    denied = np.isin(found.state, (INFEASIBLE, "unbounded")) & np.any(solved, axis=1, keepdims=True)
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     values |= {"state": state, "false": found.false | denied, "time": np.where(worse, np.nan, found.time), "size": size}

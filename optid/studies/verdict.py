@@ -23,7 +23,7 @@ class FalseClaim:
         solver, formulation: labels.
         count: runs.
         claimed: what the solver said.
-        reason: why it is false, of the first of them.
+        reason: why it is false, of one of them.
     """
 
     solver: str
@@ -136,7 +136,8 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
         said.append(carries_over(overall))
     said += [_never(overall), _refuted(found, table), _no_truth(quality)]
     if overall.infeasible:
-        text = f"{overall.infeasible:,} problems have no solution: solvers say so, none found one. They do not count."
+        noun = "problem has" if overall.infeasible == 1 else "problems have"
+        text = f"{overall.infeasible:,} {noun} no solution: solvers say so, and none found one. That does not count."
         said.append(Statement("fair", "Infeasible problems", text, "solver"))
     return [statement for statement in said if statement is not None]
 
@@ -184,7 +185,7 @@ def _false_claims(table: Mapping[str, np.ndarray], found: Results) -> tuple[Fals
         key = (found.solvers[s], str(found.formulation[p]), str(table["status_claimed"][found.row[p, s]]))
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
         groups.setdefault(key, []).append(f"{winner} has a verified point")
-    claims = [FalseClaim(key[0], key[1], len(reasons), key[2], reasons[0]) for key, reasons in groups.items()]
+    claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
 
 

@@ -1,0 +1,525 @@
+"""The page of a study, in a real browser: quick, quiet, true, and usable by keyboard, on a phone and in the dark."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, NO_BROWSER, Browser
+from study_rows import rows as synthetic
+
+from optid.errors import DataError
+from optid.studies.outcomes import columns, tabulate
+from optid.studies.page import embedded, render, write_page
+from optid.studies.payload import page_payload
+from optid.studies.verdict import conclude
+
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
+HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">"\'&amp;\u2028{{ 7 * 7 }}'
+RUNS = 1500
+
+
+class Page(HTMLParser):
+    """Elements and attributes of a page; refuses tags that are not closed in order."""
+
+    VOID = {"meta", "link", "br", "img", "hr", "input"}
+
+    def __init__(self, source):
+        super().__init__()
+        self.open, self.attributes, self.tags, self.text = [], [], [], ""
+        self.feed(source)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        self.tags.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not {"script", "style"} & set(self.open):
+            self.text += data
+
+    def values(self, name):
+        return [value for _, attribute, value in self.attributes if attribute == name]
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return synthetic(RUNS, 1)
+
+
+@pytest.fixture(scope="module")
+def verdict(rows):
+    return conclude(rows)
+
+
+@pytest.fixture(scope="module")
+def page(rows, tmp_path_factory):
+    return write_page(rows, tmp_path_factory.mktemp("study") / "study.html")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture
+def opened(browser, page):
+    """The page, freshly opened in a wide light window."""
+    browser.window(1280, 900)
+    browser.open(page)
+    yield browser
+    assert browser.complaints() == [] and browser.requests() == []
+
+
+# ---- the file
+
+
+def test_nothing_is_loaded_from_anywhere(page):
+    source = page.read_text(encoding="utf-8")
+    found = Page(source)
+    for attribute in ("src", "href", "xlink:href", "data", "action", "srcset"):
+        assert all(value.startswith("#") or value == "data:," for value in found.values(attribute))
+    policy = next(v for _, name, v in found.attributes if name == "content" and "default-src" in v)
+    assert "default-src 'none'" in policy and "connect-src" not in policy and "'sha256-" in policy
+    for word in ("@import", "fetch(", "XMLHttpRequest", "WebSocket", "import(", "localStorage", "innerHTML", "eval("):
+        assert word not in source
+    assert set(re.findall(r"https?://[^\s\"'<]+", source)) == {"http://www.w3.org/2000/svg"}
+
+
+def test_identifiers_are_unique_and_every_reference_has_its_target(page):
+    found = Page(page.read_text(encoding="utf-8"))
+    ids = found.values("id")
+    assert len(ids) == len(set(ids))
+    assert {value[1:] for value in found.values("href") if value.startswith("#")} <= set(ids)
+    scripts = page.read_text(encoding="utf-8").split("<script>")[1]
+    asked = set(re.findall(r'byId\("([a-z-]+)"\)', scripts))
+    made = set(re.findall(r'id: "([a-z-]+)"', scripts))
+    assert asked <= set(ids) | made | {"filter-text"} and len(asked) > 12
+
+
+def test_the_verdict_stands_without_a_script(page, verdict):
+    text = " ".join(Page(page.read_text(encoding="utf-8")).text.split())
+    assert verdict.headline.word in text and " ".join(verdict.headline.text.split()) in text
+    for statement in verdict.statements:
+        assert statement.word in text and " ".join(statement.text.split()) in text
+    for claim in verdict.false_claims:
+        assert claim.solver in text and claim.reason in text
+    assert "optid study report" in text and "synthetic, 2 cores" in text
+
+
+def test_every_run_is_on_the_page_as_it_is_in_the_database(page, rows, verdict):
+    payload = json.loads(re.search(r'id="payload">(.*?)</script>', page.read_text(encoding="utf-8"), re.S)[1])
+    assert payload["count"] == len(rows)
+    made = {column["name"]: column for column in payload["columns"]}
+    for name in ("objective", "n_samples", "iterations", "one_step_fit"):
+        for row, shown in zip(rows, made[name]["values"]):
+            assert (row[name] is None) == (shown is None)
+            assert row[name] is None or shown == pytest.approx(row[name], rel=1e-4)
+    for name in ("key", "solver", "reason", "poles", "versions"):
+        assert [made[name]["words"][k] for k in made[name]["values"]] == [row[name] or "" for row in rows]
+    states = [made["state"]["words"][k] for k in made["state"]["values"]]
+    found = tabulate(columns(rows))
+    for p in range(0, len(found.data), 7):
+        for s in range(len(found.solvers)):
+            assert found.row[p, s] < 0 or states[found.row[p, s]] == found.state[p, s]
+    for one, two in zip(payload["sections"][0]["standings"], verdict.overall.standings):
+        assert (one["solver"], one["solved"], one["problems"]) == (two.solver, two.solved, two.problems)
+
+
+def test_embedded_values_cannot_end_their_element():
+    text = embedded({"a": HOSTILE, "b": "<!--", "c": 1.5})
+    assert "<" not in text and "\u2028" not in text
+    assert json.loads(text) == {"a": HOSTILE, "b": "<!--", "c": 1.5}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        embedded([float("nan")])
+
+
+def test_huge_texts_are_cut_and_say_so(tmp_path):
+    rows = [{**row, "reason": f"{k} " + "x" * 20_000} for k, row in enumerate(synthetic(400, 1))]
+    path = write_page(rows, tmp_path / "page.html")
+    assert path.stat().st_size < 4e6
+    assert "more characters)" in path.read_text(encoding="utf-8")
+
+
+def test_the_payload_of_long_profiles_keeps_both_ends():
+    rng = np.random.default_rng(0)
+    made = [{"data": "d", "formulation": "f", "solver": s, "seed": p, "outcome": "done", "status_verified": "optimal",
+             "objective": 1.0, "solve_s": float(np.exp(rng.normal())), "scale": 1.0, "violation": 0.0}
+            for p in range(2000) for s in "ab"]  # fmt: skip
+    verdict = conclude(made)
+    xs, ys = page_payload(verdict)["sections"][0]["profiles"]["a"]
+    whole = verdict.overall.profiles["a"]
+    assert len(xs) <= 400 and xs[0] == 1.0 and ys[-1] == 1.0 and xs[-1] == pytest.approx(whole.factors[-1], rel=1e-4)
+
+
+def test_what_is_no_study_is_refused_and_nothing_is_written(tmp_path):
+    path = tmp_path / "page.html"
+    with pytest.raises(DataError):
+        write_page([{"solver": "a"}], path)
+    assert not path.exists()
+    with pytest.raises(OSError):
+        write_page(synthetic(20, 1), tmp_path / "no" / "such" / "page.html")
+
+
+def test_title_and_command_are_texts(verdict):
+    text = Page(render(verdict, title="<b>mine</b>", command="run --it <now>")).text
+    assert "<b>mine</b>" in text and "run --it <now>" in text
+
+
+# ---- in the browser
+
+
+def column(browser, number, table="#runs-table"):
+    """Texts of one column of a table as shown."""
+    script = f"[...document.querySelectorAll('{table} tbody tr')].map(r => r.children[{number}]?.textContent)"
+    return browser.run(script)
+
+
+def shown(browser):
+    return browser.run("document.getElementById('runs-count').textContent")
+
+
+def heading(browser, name, table="#runs-table"):
+    return browser.run(f"[...document.querySelectorAll('{table} thead button')].findIndex(b => b.dataset.column === '{name}')")
+
+
+@in_browser
+def test_the_first_glance_has_the_verdict(opened, verdict):
+    top = opened.where("#verdict .word")
+    opened.run("scrollTo(0, 0)")
+    assert opened.run("document.querySelector('#verdict .word').textContent") == verdict.headline.word
+    assert opened.run("document.querySelector('#verdict .sentence').getBoundingClientRect().bottom") < 500 and top["width"] > 0
+    assert opened.run("document.querySelectorAll('#standings tbody tr').length") == len(verdict.overall.standings)
+
+
+@in_browser
+def test_runs_sort_in_both_directions_with_empty_ones_last(opened, rows):
+    found = tabulate(columns(rows))
+    del found
+    at = heading(opened, "objective")
+    opened.click("#runs-table [data-column=objective]")
+    first = float(column(opened, at)[0])
+    assert first == pytest.approx(min(r["objective"] for r in rows if r["objective"] is not None), rel=1e-5)
+    assert opened.run(f"document.querySelectorAll('#runs-table thead th')[{at}].getAttribute('aria-sort')") == "ascending"
+    opened.click("#runs-table [data-column=objective]")
+    values = [float(v) for v in column(opened, at)]
+    assert values == sorted(values, reverse=True)
+    assert values[0] == pytest.approx(max(r["objective"] for r in rows if r["objective"] is not None), rel=1e-5)
+    opened.click("#runs-table [aria-label='Last page']")
+    assert set(column(opened, at)) == {"-"}
+    opened.click("#runs-table [data-column=solver]")
+    assert column(opened, heading(opened, "solver"))[0] == min(r["solver"] for r in rows)
+    assert opened.run("document.querySelectorAll('#runs-table th[aria-sort]').length") == 1
+
+
+@in_browser
+def test_filters_count_as_the_rows_do(opened, rows):
+    def choose(name, word):
+        opened.run(f"(() => {{ const s = document.getElementById('filter-{name}'); "
+                   f"s.value = [...s.options].find(o => o.text === {json.dumps(word)}).value; "
+                   "s.dispatchEvent(new Event('change')); })()")  # fmt: skip
+
+    choose("solver", "scs")
+    scs = [row for row in rows if row["solver"] == "scs"]
+    assert shown(opened) == f"{len(scs)} of {RUNS:,} runs"
+    choose("formulation", "linear")
+    some = [row for row in scs if row["formulation"] == "linear"]
+    assert shown(opened) == f"{len(some)} of {RUNS:,} runs"
+    assert set(column(opened, heading(opened, "solver"))) == {"scs"}
+    opened.run("document.getElementById('filter-text').focus()")
+    opened.write("tanks objective > 0 n_samples=1500")
+    exact = [r for r in some if r["data"] == "two tanks" and r["objective"] is not None and r["n_samples"] == 1500]
+    opened.wait(f"document.getElementById('runs-count').textContent === '{len(exact)} of {RUNS:,} runs'", 5)
+    assert 0 < len(exact) < len(some)
+    opened.click("#filter-reset")
+    assert shown(opened) == f"{RUNS:,} of {RUNS:,} runs"
+    opened.run("document.getElementById('filter-text').focus()")
+    opened.write("no such words anywhere")
+    opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'", 5)
+
+
+@in_browser
+def test_a_number_in_the_table_of_failures_lists_its_runs(opened, rows, verdict):
+    lying = verdict.overall.standing("scs")
+    count = lying.failures["false claim"]
+    opened.click(f"#failure-matrix [aria-label='{count} false claim, scs: list the runs']")
+    assert shown(opened).startswith(f"{count} of ")
+    assert set(column(opened, heading(opened, "state"))) == {"false claim"}
+
+
+@in_browser
+def test_pages_turn_and_their_length_changes(opened):
+    assert column(opened, 0)[0] == "1" and len(column(opened, 0)) == 50
+    opened.click("#runs-table [aria-label='Next page']")
+    assert column(opened, 0)[0] == "51"
+    assert "Page 2 of 30" in opened.run("document.querySelector('#runs-table .pager').textContent")
+    opened.run("(() => { const s = document.querySelector('#runs-table .pager select'); s.value = 250; "
+               "s.dispatchEvent(new Event('change')); })()")  # fmt: skip
+    assert len(column(opened, 0)) == 250 and column(opened, 0)[0] == "1"
+    assert opened.run("document.querySelector('#runs-table [aria-label=\"First page\"]').disabled")
+
+
+@in_browser
+@pytest.mark.parametrize("figure", ["profile", "accuracy", "ranks", "growth"])
+def test_figures_zoom_by_dragging_buttons_keys_and_wheel(opened, figure):
+    svg = f"#{figure} .plot svg"
+
+    def view():
+        text = opened.run(f"document.querySelector('{svg}').dataset.view || ''")
+        return [float(v) for v in text.split()]
+
+    assert view() == []
+    opened.drag(svg, (0.4, 0.3), (0.7, 0.6))
+    near = view()
+    opened.click(f"#{figure} .zoom button:nth-child(3)")
+    whole = view()
+    assert (near[1] - near[0]) / (whole[1] - whole[0]) == pytest.approx(0.35, abs=0.12)
+    assert whole[0] < near[0] < near[1] < whole[1]
+    opened.click(f"#{figure} .zoom button:nth-child(1)")
+    assert view()[1] - view()[0] == pytest.approx(0.6 * (whole[1] - whole[0]), rel=1e-3)
+    opened.run(f"document.querySelector('{svg}').focus()")
+    opened.press("0")
+    assert view() == pytest.approx(whole, rel=1e-4)
+    opened.press("+", "ArrowRight")
+    moved = view()
+    assert moved[1] - moved[0] == pytest.approx(0.6 * (whole[1] - whole[0]), rel=1e-3)
+    assert moved[0] + moved[1] > whole[0] + whole[1]
+    opened.press("-", "Escape")
+    assert view() == pytest.approx(whole, rel=1e-4)
+    place = opened.where(svg)
+    x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+    before = opened.run("scrollY")
+    opened.mouse("mouseWheel", x, y, deltaX=0, deltaY=-100, modifiers=2)
+    opened.wait(f"document.querySelector('{svg}').dataset.view.split(' ')[1] < {whole[1]} - 1e-6", 5)
+    assert opened.run("scrollY") == before
+
+
+@in_browser
+def test_figures_show_what_the_verdict_holds(opened, verdict):
+    drawn = opened.run("[...document.querySelectorAll('#profile [data-series]')].map(p => p.dataset.series)")
+    assert sorted(drawn) == sorted(s.solver for s in verdict.overall.standings if s.solved)
+    heights = opened.run("Object.fromEntries([...document.querySelectorAll('#profile path[data-series]')].map(p => "
+                         "[p.dataset.series, Number(p.getAttribute('d').match(/V([\\d.]+)H\\d+$/)[1])]))")  # fmt: skip
+    order = sorted(heights, key=heights.get)  # the highest curve has the smallest ordinate
+    solved = {s.solver: s.solved for s in verdict.overall.standings}
+    assert [solved[name] for name in order] == sorted(solved.values(), reverse=True)
+    numbers = opened.run("[...document.querySelectorAll('#profile details tbody tr')].map(r => [...r.children].map(c => c.textContent))")
+    for name, *cells in numbers:
+        for factor, cell in zip((1, 2, 5, 10, 1e99), cells):
+            assert float(cell.split()[0]) == pytest.approx(100 * verdict.overall.profiles[name](factor), rel=6e-3, abs=0.3)
+
+
+@in_browser
+def test_a_solver_is_switched_off_in_every_figure(opened):
+    count = "document.querySelectorAll('#figures .plot [data-series=\"scs\"]').length"
+    assert opened.run(count) >= 4
+    opened.run("[...document.querySelectorAll('#legend button')].find(b => b.title === 'scs').focus()")
+    opened.press("Enter")
+    assert opened.run(count) == 0
+    assert opened.run("document.activeElement.getAttribute('aria-pressed')") == "false"
+    opened.press(" ")
+    assert opened.run(count) >= 4
+
+
+@in_browser
+def test_the_choice_of_a_formulation_changes_tables_and_figures(opened, verdict):
+    section = verdict.sections[0]
+    opened.run("(() => { const s = document.getElementById('section'); s.value = 1; s.dispatchEvent(new Event('change')); })()")
+    assert opened.run("document.querySelectorAll('#standings tbody tr').length") == len(section.standings)
+    assert section.choice.first in opened.run("document.getElementById('said').textContent")
+    legend = opened.run("[...document.querySelectorAll('#legend button')].map(b => b.title)")
+    assert legend == [s.solver for s in section.standings]
+    assert all(name in opened.run("document.getElementById('standings').textContent") for name in section.idle)
+
+
+@in_browser
+def test_a_point_and_a_run_open_their_details_and_escape_closes_them(opened, rows):
+    opened.run("document.querySelector('#runs-table tbody button').focus()")
+    opened.press("Enter")
+    assert opened.run("document.getElementById('detail').open")
+    text = opened.run("document.getElementById('detail').textContent")
+    assert rows[0]["key"] in text and rows[0]["reason"] in text and "SHA-256" in text
+    opened.press("Escape")
+    assert not opened.run("document.getElementById('detail').open")
+    assert opened.run("document.activeElement.textContent") == "1"
+    place = opened.run("(() => { const s = document.querySelector('#accuracy .plot svg'); s.scrollIntoView({block: 'center', behavior: 'instant'});"
+                       "const d = [...s.querySelectorAll('path[data-series]')].map(p => p.getAttribute('d')).sort((a, b) => a.length - b.length)[0];"
+                       "const [x, y] = d.match(/-?[\\d.]+/g).map(Number), r = s.getBoundingClientRect(), k = r.width / s.viewBox.baseVal.width;"
+                       "return [r.x + x * k + 3 * k, r.y + y * k + 3 * k]; })()")  # fmt: skip
+    opened.mouse("mouseMoved", *place)
+    assert "residual" in opened.run("document.querySelector('#accuracy .tip').textContent")
+    opened.mouse("mousePressed", *place, button="left", clickCount=1)
+    opened.mouse("mouseReleased", *place, button="left", clickCount=1)
+    assert opened.run("document.getElementById('detail').open")
+    opened.click("#detail .close")
+    assert not opened.run("document.getElementById('detail').open")
+
+
+@in_browser
+def test_the_whole_page_is_reached_by_tab_and_works_by_keyboard(opened):
+    opened.run("document.querySelectorAll('details').forEach(d => d.open = false)")
+    seen = set()
+    for _ in range(90):
+        opened.press("Tab")
+        seen.add(opened.run("document.activeElement.closest('section, nav, .scope')?.id || document.activeElement.tagName"))
+    assert {"verdict", "solvers", "figures", "failures"} <= seen
+    visible = opened.run("getComputedStyle(document.activeElement).outlineStyle")
+    assert visible != "none"
+    opened.run("document.querySelector('#runs-table [data-column=seed]').focus()")
+    opened.press("Enter")
+    assert opened.run("document.activeElement.closest('th').getAttribute('aria-sort')") == "ascending"
+    assert opened.run("document.activeElement.dataset.column") == "seed"
+
+
+@in_browser
+def test_everything_that_acts_has_an_accessible_name(opened):
+    opened.send("Accessibility.enable")
+    nodes = opened.send("Accessibility.getFullAXTree")["nodes"]
+    acting = [n for n in nodes if not n.get("ignored") and n.get("role", {}).get("value") in
+              ("button", "link", "combobox", "checkbox", "searchbox", "image", "region", "group", "dialog")]  # fmt: skip
+    nameless = [n["role"]["value"] for n in acting if not n.get("name", {}).get("value")]
+    assert len(acting) > 100 and nameless == []
+    pictures = [n["name"]["value"] for n in acting if n["role"]["value"] == "image"]
+    assert any(name.startswith("Performance profile") for name in pictures)
+
+
+@in_browser
+def test_light_dark_and_the_switch(browser, page, tmp_path):
+    import matplotlib.image
+
+    def brightness(name):
+        return float(np.median(matplotlib.image.imread(browser.picture(tmp_path / f"{name}.png"))[..., :3]))
+
+    browser.window(1280, 900)
+    browser.open(page)
+    assert brightness("light") > 0.85
+    browser.click("#theme")
+    assert brightness("switched") < 0.3
+    assert browser.run("document.getElementById('theme').getAttribute('aria-label')") == "Switch to light colours"
+    browser.window(1280, 900, dark=True)
+    browser.open(page)
+    assert brightness("dark") < 0.3
+    browser.click("#theme")
+    assert brightness("back") > 0.85
+    assert browser.complaints() == [] and browser.requests() == []
+
+
+CONTRAST = """(() => {
+  const rgb = (c) => { const k = document.createElement('canvas').getContext('2d', {willReadFrequently: true}); k.fillStyle = c;
+    k.fillRect(0, 0, 1, 1); return [...k.getImageData(0, 0, 1, 1).data]; };
+  const light = (c) => { const [r, g, b] = c.slice(0, 3).map((v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const ground = (e) => { for (; e; e = e.parentElement) { const c = rgb(getComputedStyle(e).backgroundColor); if (c[3] === 255) return c; }
+    return [255, 255, 255, 255]; };
+  return [...document.querySelectorAll('#verdict *, #standings *, #said *, #runs *, #method *')].filter((e) =>
+    [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()) && e.checkVisibility() && !e.disabled)
+    .map((e) => { const a = light(rgb(getComputedStyle(e).color)), b = light(ground(e));
+      return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.className + ': ' + e.textContent.slice(0, 30)]; })
+    .sort((x, y) => x[0] - y[0]).slice(0, 3); })()"""
+
+
+@in_browser
+@pytest.mark.parametrize("dark", [False, True])
+def test_texts_stand_out_from_their_ground(browser, page, dark):
+    browser.window(1280, 900, dark=dark)
+    browser.open(page)
+    worst = browser.run(CONTRAST)
+    assert worst[0][0] >= 3.0, worst  # large and bold texts; running text is above 4.5
+
+
+@in_browser
+@pytest.mark.parametrize("width", [320, 390, 768])
+def test_a_phone_needs_no_sideways_scrolling(browser, page, width):
+    browser.window(width, 800, phone=True)
+    browser.open(page)
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    assert browser.run("document.getElementById('profile').getBoundingClientRect().right") <= width
+    assert browser.run("[...document.querySelectorAll('.picks .why')].every(e => e.getBoundingClientRect().right <= innerWidth)")
+    assert browser.complaints() == [] and browser.requests() == []
+
+
+@in_browser
+def test_the_csv_holds_the_filtered_runs_and_no_formulas(browser, tmp_path):
+    rows = synthetic(60, 1)
+    rows[3] = {**rows[3], "data": "=1+1", "machine": 'a "quoted" machine'}
+    browser.open(write_page(rows, tmp_path / "page.html"))
+    browser.run("(() => { window.saved = null; URL.createObjectURL = (blob) => { window.saved = blob; return '#'; };"
+                "HTMLAnchorElement.prototype.click = function () {}; })()")  # fmt: skip
+    browser.click("#download")
+    text = browser.run("window.saved.text()")
+    import csv
+    import io
+
+    read = list(csv.DictReader(io.StringIO(text)))
+    assert len(read) == 60 and read[3]["data"] == "'=1+1" and read[3]["machine"] == 'a "quoted" machine'
+    assert [r["solver"] for r in read] == [r["solver"] for r in rows]
+
+
+# ---- bad input
+
+
+def bad_inputs():
+    good = synthetic(120, 1)
+    failed = [{**r, "outcome": "error", "status_verified": None, "objective": None, "false_claim": False} for r in good]
+    solved = {"outcome": "done", "status_verified": "optimal", "false_claim": False, "objective": 1.0, "solve_s": 0.1}
+    nan = {"objective": float("nan"), "violation": float("inf"), "solve_s": float("nan"), "gap": -float("inf"), "noise": float("nan")}
+    text = ("study", "data", "formulation", "solver", "reason", "machine", "status_claimed", "options", "poles", "versions")
+    many = [{**good[k % 120], **solved, "solver": f"solver {k % 40}", "seed": k // 40} for k in range(400)]
+    return {
+        "empty": [],
+        "one row": good[3:4],
+        "one solver": [r for r in good if r["solver"] == "ipopt"],
+        "one data set": [r for r in good if r["data"] == "heater"],
+        "all failed": failed,
+        "all refused": [{**r, "outcome": "refused", "status_verified": None, "objective": None} for r in good],
+        "unknown truth": [{**r, "parameter_error": None, "nonlinearity_error": None} for r in good],
+        "not finite": [{**r, **nan} for r in good],
+        "hostile names": [{**r, **{c: HOSTILE + str(r[c]) for c in text}} for r in good],
+        "prototype names": [{**r, "solver": ("__proto__", "constructor", "toString", "")[k % 4]} for k, r in enumerate(good)],
+        "huge texts": [{**r, "data": "d" * 5000, "solver": r["solver"] + "s" * 3000, "reason": "r" * 100_000} for r in good],
+        "surrogates": [{**r, "data": "\ud800 lone", "solver": r["solver"] + " \U0001f600 \u202e"} for r in good],
+        "forty solvers": many,
+        "equal times": [{**r, **solved} for r in good],
+        "zero and negative times": [{**r, **solved, "solve_s": (0.0, -1.0)[k % 2]} for k, r in enumerate(good)],
+        "negative objectives": [{**r, "objective": -1.0 if r["objective"] else None} for r in good],
+        "zero residuals": [{**r, **solved, "violation": 0.0, "stationarity": 0.0} for r in good],
+    }
+
+
+@in_browser
+@pytest.mark.parametrize("name", bad_inputs())
+def test_bad_input_gives_a_true_and_quiet_page(browser, tmp_path, name):
+    rows = bad_inputs()[name]
+    path = write_page(rows, tmp_path / "page.html")
+    browser.window(1000, 800)
+    browser.open(path)
+    assert browser.complaints() == [] and browser.requests() == []
+    assert browser.run("window.hacked === undefined")
+    assert browser.run("document.documentElement.scrollWidth") <= 1000
+    assert browser.run("document.querySelectorAll('section').length") == 8
+    word = browser.run("document.querySelector('#verdict .word').textContent")
+    assert word == conclude(rows).headline.word or name == "surrogates"
+    text = browser.run("document.body.innerText")
+    for wrong in ("NaN", "Infinity", "undefined", "[object"):
+        assert wrong not in text.replace(HOSTILE, ""), wrong
+    if rows:
+        assert f"of {len(rows)} run" in shown(browser)
+    for act in ("#runs-table thead button", "#filter-reset", "#profile .zoom button"):
+        if browser.run(f"!!document.querySelector('{act}')"):
+            browser.click(act)
+    assert browser.complaints() == []
+
+
+def test_bad_input_is_told_in_words():
+    words = {name: conclude(rows).headline.word for name, rows in bad_inputs().items()}
+    assert words["empty"] == words["all refused"] == "Nothing to compare"
+    assert words["all failed"] == words["not finite"] == "No solver can be recommended"
+    assert words["one row"] == words["one solver"] == "Only one solver" or words["one row"] == "Only one solver"
+    assert words["equal times"].startswith("A tie")
