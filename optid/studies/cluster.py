@@ -1,0 +1,190 @@
+"""Run cells on a Dask cluster: the same function in the same kind of worker process, one per thread of a Dask worker.
+
+A cell runs in a local worker process next to the Dask worker, so that its limits hold and its crash is a row, as on one
+machine. When a Dask worker dies, Dask gives its cells to another one; a row is handed out once whatever happens.
+"""
+
+import json
+import pickle
+import uuid
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from time import monotonic
+from typing import Any
+
+from optid.clusters import PACKAGES, connected, difference
+from optid.errors import ClusterError, StudyError
+from optid.studies import cluster_worker
+from optid.studies.cell import lost_row, run_cell
+from optid.studies.grid import Cell, content_hash
+from optid.studies.rows import CRASHED, ERROR
+from optid.studies.versions import determining
+
+TICK = 1.0  # seconds between looks at the cluster while no cell ends
+AHEAD = 2  # cells that are under way per thread of the cluster: one runs, one is there when it ends
+DESERTED = 300.0  # seconds without any worker until that is an error; batch systems replace workers within minutes
+AGAIN = 5.0  # seconds to fetch a row; it is gone when its worker died just after the cell, and then the cell runs again
+SHIPPED = 1 << 30  # bytes of data files that are sent to a worker that does not have them
+
+Row = dict[str, Any]
+
+
+def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
+            scheduler: Any) -> Iterator[Row]:
+    """Run every cell on the cluster and yield its row, in the order in which they end.
+
+    Closing the generator, or an exception in it such as KeyboardInterrupt, ends the cells under way at once.
+
+    Args:
+        cells: what to run; their own limits hold. Data files are read where they are when a worker sees the same
+            content under the same path; else they are sent to it once.
+        function: what makes a row of a cell; workers import it by its name.
+        scheduler: as for `optid.clusters.connected`.
+
+    Raises:
+        ClusterError: no scheduler, no worker, workers with other versions (also those that join later), or a scheduler
+            that goes away.
+        StudyError: a function that has no name to import, or worker processes that do not start on some machine.
+    """
+    todo = deque(cells)
+    try:
+        packed = pickle.dumps(function)
+    except Exception as error:
+        raise StudyError(f"workers cannot import {function!r}: {error}") from None
+    with connected(scheduler, packages(todo)) as client:
+        flight = _Flight(client, packed)
+        try:
+            yield from flight.rows(todo)
+        finally:
+            flight.end()
+
+
+def check(cells: Iterable[Cell], scheduler: Any) -> None:
+    """Refuse a cluster that cannot run the cells.
+
+    Raises:
+        ClusterError: as `execute`.
+    """
+    with connected(scheduler, packages(cells)):
+        pass
+
+
+def packages(cells: Iterable[Cell]) -> list[str]:
+    """Return the distributions that determine the results of the cells."""
+    names = dict.fromkeys(PACKAGES)
+    for cell in cells:
+        names |= dict.fromkeys(name for name in _versions(cell) if not name.startswith("source of "))
+    return list(names)
+
+
+def _versions(cell: Cell) -> dict[str, str]:
+    return determining(cell.formulation_name, cell.solver_name, cell.data_source.system is not None)
+
+
+class _Flight:
+    """The cells that are under way on a cluster."""
+
+    def __init__(self, client: Any, function: bytes) -> None:
+        self._client, self._function = client, function
+        self._name = f"optid-{uuid.uuid4().hex[:12]}"
+        self._landed: SimpleQueue[Any] = SimpleQueue()
+        self._cells: dict[Any, Cell] = {}  # by future
+        self._count = 0
+        self._looked = self._peopled = monotonic()
+        self._threads = sum(client.nthreads().values())
+
+    def rows(self, todo: deque[Cell]) -> Iterator[Row]:
+        while todo or self._cells:
+            while todo and len(self._cells) < AHEAD * max(self._threads, 1):
+                cell = todo.popleft()
+                try:
+                    self._send(cell)
+                except Exception as error:
+                    yield lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}")
+            with suppress(Empty):
+                if row := self._taken(self._landed.get(timeout=TICK)):
+                    yield row
+            self._look()
+
+    def end(self) -> None:
+        """Forget what is under way, and end the worker processes of this study."""
+        with suppress(Exception):  # the cluster may be gone
+            if self._client.status == "running":
+                self._client.cancel(list(self._cells), force=True)
+                self._client.run(cluster_worker.end, self._name, on_error="ignore")
+
+    def _send(self, cell: Cell, contents: Sequence[bytes] | None = None) -> None:
+        packed = pickle.dumps(cell)
+        self._count += 1
+        with warnings.catch_warnings():  # Dask finds data files large
+            warnings.simplefilter("ignore", UserWarning)
+            future = self._client.submit(cluster_worker.run, self._name, self._function, packed, contents,
+                                         key=f"{self._name}-{self._count}", pure=False)
+        self._cells[future] = cell
+        future.add_done_callback(self._landed.put)
+
+    def _taken(self, future: Any) -> Row | None:
+        """The row of a cell that has ended; None where it is sent, or runs, once more."""
+        from distributed import KilledWorker
+
+        cell = self._cells[future]
+        try:
+            answer = future.result(timeout=AGAIN)
+        except TimeoutError:
+            future.add_done_callback(self._landed.put)
+            return None
+        except KilledWorker as error:
+            answer = lost_row(cell, CRASHED, f"{error.allowed_failures + 1} Dask workers died while they had it")
+        except (ClusterError, StudyError):
+            raise
+        except BaseException as error:
+            if future.status in ("cancelled", "lost"):
+                raise ClusterError(f"the scheduler went away or gave the study up ({type(error).__name__}).") from error
+            if not isinstance(error, Exception):
+                raise
+            answer = lost_row(cell, ERROR, f"the Dask worker could not run it: {type(error).__name__}: {error}")
+        del self._cells[future]
+        future.release()
+        if answer is None:
+            return self._sent_with_files(cell)
+        there = json.loads(answer["versions"])
+        if text := difference({name: v for name, v in _versions(cell).items() if name in there}, there):
+            raise ClusterError(f"a worker on {answer['machine']} has other packages: {text}. Install the same versions "
+                               "there, and start again: the rows so far are kept.")
+        return answer
+
+    def _sent_with_files(self, cell: Cell) -> Row | None:
+        entry = cell.data_source
+        names = ", ".join(entry.files)
+        try:
+            size = sum(Path(name).stat().st_size for name in entry.files)
+            if size > SHIPPED:
+                return lost_row(cell, ERROR, f"a worker does not have {names}, which is too large to be sent there "
+                                             f"({size / 1e6:.0f} MB): put it where every worker sees the same path")
+            contents = [Path(name).read_bytes() for name in entry.files]
+            if content_hash(entry, Path()) != cell.data_hash:
+                return lost_row(cell, ERROR, f"{names} changed while the study ran")
+            self._send(cell, contents)
+        except OSError as error:
+            return lost_row(cell, ERROR, f"a worker does not have {names}, and it cannot be sent there: {error}")
+        return None
+
+    def _look(self) -> None:
+        """See how many threads there are now, and whether there is a cluster at all."""
+        now = monotonic()
+        if now - self._looked < TICK:
+            return
+        self._looked = now
+        if self._client.status != "running":
+            raise ClusterError("the scheduler went away. Rows so far are kept; start it and run the study again.")
+        self._threads = sum(self._client.nthreads().values())
+        if self._threads:
+            self._peopled = now
+        elif now - self._peopled > DESERTED:
+            raise ClusterError(f"the cluster has had no worker for {DESERTED:.0f} s. Rows so far are kept; start "
+                               "workers and run the study again.")
+

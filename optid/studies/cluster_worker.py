@@ -1,0 +1,134 @@
+"""What a Dask worker does for a study: keep local worker processes, one per thread, and give them cells and data."""
+
+import pickle
+import threading
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+from optid.studies.grid import Cell, content_hash
+from optid.studies.workers import Pool
+
+
+@dataclass
+class _Hands:
+    """The pools of one study in this process, each of one local worker process."""
+
+    idle: list[Pool] = field(default_factory=list)
+    busy: list[Pool] = field(default_factory=list)
+    ended: bool = False
+
+
+_lock = threading.Lock()
+_studies: dict[str, _Hands] = {}
+
+
+def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | None) -> dict[str, Any] | None:
+    """Run a cell in a local worker process and return its row.
+
+    Args:
+        study: name of the run of a study, for which worker processes are kept.
+        function: what makes a row of a cell, pickled.
+        packed: the cell, pickled.
+        contents: what is in its data files, or None.
+
+    Returns:
+        The row; None when this machine does not have the content of the data files.
+
+    Raises:
+        StudyError: worker processes do not start.
+    """
+    cell: Cell = pickle.loads(packed)
+    here = _with_files(cell, contents)
+    if here is None:
+        return None
+    pool = _taken(study, function)
+    try:
+        (row,) = pool.run(deque([here]))
+    except BaseException:
+        pool.close()
+        raise
+    finally:
+        _put_back(study, pool)
+    return row | {"file": ", ".join(cell.data_source.files) or None}
+
+
+def end(study: str) -> None:
+    """End the worker processes of a run of a study, also in the middle of a cell, and all that other runs left idle."""
+    with _lock:
+        hands = _studies.setdefault(study, _Hands())
+        hands.ended = True
+        for pool in hands.busy:
+            pool.kill()
+        left = [pool for each in _studies.values() for pool in each.idle]
+        for each in _studies.values():
+            each.idle.clear()
+    for pool in left:
+        pool.close()
+
+
+def _taken(study: str, function: bytes) -> Pool:
+    with _lock:
+        hands = _studies.setdefault(study, _Hands())
+        pool = hands.idle.pop() if hands.idle else Pool(pickle.loads(function), 1)
+        hands.busy.append(pool)
+        return pool
+
+
+def _put_back(study: str, pool: Pool) -> None:
+    with _lock:
+        hands = _studies[study]
+        hands.busy.remove(pool)
+        if not hands.ended:
+            hands.idle.append(pool)
+            return
+    pool.close()
+
+
+def _with_files(cell: Cell, contents: Sequence[bytes] | None) -> Cell | None:
+    """The cell with data files that are here and have its content, or None where there are none."""
+    entry = cell.data_source
+    if not entry.files or _content(entry.files) == cell.data_hash:
+        return cell
+    folder = _folder() / cell.data_hash
+    files = tuple(str(folder / str(i) / Path(name).name) for i, name in enumerate(entry.files))
+    if contents is not None and not folder.is_dir():
+        scratch = Path(mkdtemp(dir=_folder()))
+        for i, (name, content) in enumerate(zip(entry.files, contents)):
+            (scratch / str(i)).mkdir()
+            (scratch / str(i) / Path(name).name).write_bytes(content)
+        with suppress(OSError):  # another thread was first
+            scratch.rename(folder)
+    return replace(cell, data_source=replace(entry, files=files)) if folder.is_dir() else None
+
+
+def _folder() -> Path:
+    """Folder for data files that were sent here; it goes with the Dask worker."""
+    from distributed import get_worker
+
+    folder = Path(get_worker().local_directory) / "optid-data"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def _content(files: tuple[str, ...]) -> str:
+    try:
+        stats = [Path(name).stat() for name in files]
+    except OSError:
+        return "not here"
+    return _hash(files, tuple((stat.st_size, stat.st_mtime_ns) for stat in stats))
+
+
+@lru_cache(maxsize=64)
+def _hash(files: tuple[str, ...], _: tuple[tuple[int, int], ...]) -> str:
+    from optid.studies.description import DataEntry
+
+    try:
+        return content_hash(DataEntry(name="files", files=files), Path())
+    except OSError as error:
+        return f"unreadable: {error}"

@@ -1,0 +1,247 @@
+"""Cells on a Dask cluster: the same rows as on one machine, whatever dies."""
+
+import os
+import signal
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import psutil
+import pytest
+from study_trouble import behave, cell
+
+from optid.errors import ClusterError, StudyError
+from optid.studies import Study, cluster, workers
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.grid import cells as cells_of
+from optid.studies.rows import NAMES
+
+distributed = pytest.importorskip("distributed")
+
+TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve_s", "warm_s", "total_s", "peak_mb",
+         "base_mb", "started"}
+
+
+@pytest.fixture(scope="module")
+def local():
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as one:
+        yield one
+
+
+@pytest.fixture
+def client(local):
+    with distributed.Client(local, set_as_default=False) as one:
+        one.wait_for_workers(2, timeout=60)
+        yield one
+
+
+def by_key(found, todo):
+    """Rows by number of the cell; every cell has exactly one."""
+    rows = {int(row["key"], 16): row for row in found}
+    assert len(found) == len(todo) == len(rows)
+    assert all(tuple(row) == NAMES for row in found)
+    return rows
+
+
+def gone(pid):
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def wait_for(condition, seconds=30.0):
+    until = time.monotonic() + seconds
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert condition()
+
+
+def test_rows_are_those_of_one_machine(client, local):
+    """Several formulations, a refused pair, systems of the catalogue: equal in every column but times and memory."""
+    study = Study(name="both", time_limit=60.0, seeds=(1, 2),
+                  data=(DataEntry("rig", system="dead_zone", samples=(200,), noise=(0.1,)),),
+                  formulations=(FormulationEntry("exact", "hammerstein_arx.exact",
+                                                 options={"na": 2, "nb": 2, "basis": "triangular:4"},
+                                                 constraints=("monotone:increasing",)),
+                                FormulationEntry("linear", "arx", options={"na": 2, "nb": 2})),
+                  solvers=(SolverEntry("gn", "gauss_newton"), SolverEntry("clarabel", "clarabel")))
+    todo = cells_of(study)
+    here = {(row["key"], row["repetition"]): row for row in workers.execute(todo, workers=1)}
+    there = {(row["key"], row["repetition"]): row for row in cluster.execute(todo, scheduler=local.scheduler_address)}
+    assert set(here) == set(there) and len(here) == len(todo) == 8
+    assert Counter(row["outcome"] for row in here.values())["done"] >= 4
+    for key, row in here.items():
+        assert {n: row[n] for n in NAMES if n not in TIMES} == {n: there[key][n] for n in NAMES if n not in TIMES}
+
+
+def test_what_cells_do_to_their_process_leaves_the_dask_workers_alone(client):
+    """Crashes, endless loops, hogs and nonsense are the rows that they are on one machine."""
+    before = set(client.nthreads())
+    troubles = [("segfault", {}), ("leave", {}), ("stuck", {"time_limit": 1.0}), ("hog", {"memory_limit": 400.0}),
+                ("raise", {}), ("garbage", {}), ("other", {}), ("nan", {})]
+    todo = [cell(k, do, **limits) for k, (do, limits) in enumerate(troubles)] + [cell(k) for k in range(20, 30)]
+    here = by_key(list(workers.execute(todo, behave, workers=2)), todo)
+    there = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
+    assert set(client.nthreads()) == before
+    assert {k: row["outcome"] for k, row in here.items()} == {k: row["outcome"] for k, row in there.items()}
+    assert there[0]["outcome"] == "crashed" and "SIGSEGV" in there[0]["reason"]
+    assert there[2]["outcome"] == "time limit" and there[3]["outcome"] == "memory limit"
+
+
+def test_worker_processes_are_reused_and_end_with_the_study(client):
+    todo = [cell(k) for k in range(24)]
+    rows = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
+    pids = {row["unknowns"] for row in rows.values()}
+    assert len(pids) <= 2
+    wait_for(lambda: all(map(gone, pids)))
+
+
+def test_a_killed_dask_worker_loses_no_cell(client):
+    """Killed twice in the middle: every cell has one row, and the process of its cell goes with the worker."""
+    todo = [cell(k, seconds=0.1) for k in range(40)]
+    rows, pids = [], client.run(os.getpid)
+    for row in cluster.execute(todo, behave, scheduler=client):
+        rows.append(row)
+        if len(rows) in (5, 15):
+            os.kill(pids.popitem()[1], signal.SIGKILL)
+    found = by_key(rows, todo)
+    assert all(row["outcome"] == "done" for row in found.values())
+    wait_for(lambda: all(gone(row["unknowns"]) for row in rows))
+    client.wait_for_workers(2, timeout=60)
+
+
+def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, local, monkeypatch, tmp_path):
+    """It is not run for ever: Dask gives up a task after some workers."""
+    monkeypatch.setattr(local.scheduler, "allowed_failures", 0)
+    todo = [cell(0, seconds=60.0)]
+    killer = threading.Timer(4.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in client.run(os.getpid).values()])
+    killer.start()
+    rows = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
+    killer.join()
+    assert rows[0]["outcome"] == "crashed" and "1 Dask worker" in rows[0]["reason"]
+    client.wait_for_workers(2, timeout=60)
+
+
+def test_closing_ends_the_cells_under_way(client, tmp_path):
+    log = tmp_path / "log"
+    running = cluster.execute([cell(0), *(cell(k, "stuck", log=str(log)) for k in range(1, 9))], behave,
+                              scheduler=client)
+    row = next(running)
+    assert int(row["key"], 16) == 0
+    wait_for(lambda: log.exists() and len(log.read_text().splitlines()) >= 2)
+    running.close()
+    mine = [p for pid in client.run(os.getpid).values() for p in psutil.Process(pid).children()]
+    wait_for(lambda: not any(p.is_running() and "studies.worker" in " ".join(p.cmdline()) for p in mine))
+    assert len(log.read_text().splitlines()) <= 4  # the others never start
+    todo = [cell(k) for k in range(4)]
+    by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)  # the cluster is as good as before
+
+
+def file_study(path, seeds=()):
+    entry = DataEntry("rig", files=(str(path),), options={"inputs": ["u"], "outputs": ["y"], "dt": 0.1})
+    return Study(name="files", time_limit=60.0, data=(entry,), solvers=(SolverEntry("clarabel", "clarabel"),),
+                 formulations=(FormulationEntry("linear", "arx", options={"na": 1, "nb": 1}),
+                               FormulationEntry("linear 2", "arx", options={"na": 2, "nb": 2})))
+
+
+@pytest.fixture
+def record_file(tmp_path):
+    rng = np.random.default_rng(crc32(tmp_path.name.encode()))  # another content in every test
+    u = rng.standard_normal(400)
+    y = np.convolve(u, [0.0, 1.0, 0.5])[:400] + 0.1 * rng.standard_normal(400)
+    path = tmp_path / "record.csv"
+    np.savetxt(path, np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+    return path
+
+
+def test_data_files_that_a_worker_does_not_have_are_sent(client, record_file, tmp_path, monkeypatch):
+    """What a worker finds under the path has another content than here: pretended by a name that differs there."""
+    todo = cells_of(file_study(record_file))
+    here = {row["key"]: row for row in workers.execute(todo, workers=1)}
+    seen = {row["key"]: row for row in cluster.execute(todo, scheduler=client)}
+    client.run(pretend_no_files, str(tmp_path))
+    sent = {row["key"]: row for row in cluster.execute(todo, scheduler=client)}
+    client.run(pretend_no_files, "")
+    for key, row in here.items():
+        for other in (seen[key], sent[key]):
+            assert row["outcome"] == "done"
+            assert {n: row[n] for n in NAMES if n not in TIMES} == {n: other[n] for n in NAMES if n not in TIMES}
+    copies = client.run(copies_of, record_file.name)
+    assert sum(copies.values()) in (1, 2)  # once per worker that had a cell
+
+
+def copies_of(name, dask_worker):
+    return len(list(Path(dask_worker.local_directory).rglob(name)))
+
+
+def pretend_no_files(folder):
+    """On a Dask worker: files below a folder are not there."""
+    from optid.studies import cluster_worker
+
+    real = getattr(cluster_worker, "_real_content", None) or cluster_worker._content
+    cluster_worker._real_content = real
+    cluster_worker._content = lambda files: (
+        "not here" if folder and files[0].startswith(folder) and "optid-data" not in files[0] else real(files))
+
+
+def test_files_that_cannot_be_sent_are_rows(client, record_file, tmp_path, monkeypatch):
+    todo = cells_of(file_study(record_file))[:1]
+    client.run(pretend_no_files, str(tmp_path))
+    monkeypatch.setattr(cluster, "SHIPPED", 10)
+    (row,) = cluster.execute(todo, scheduler=client)
+    assert row["outcome"] == "error" and "too large to be sent" in row["reason"]
+    monkeypatch.undo()
+    record_file.write_text("u,y\n1,2\n")
+    (row,) = cluster.execute(todo, scheduler=client)
+    assert row["outcome"] == "error" and "changed while the study ran" in row["reason"]
+    record_file.unlink()
+    (row,) = cluster.execute(todo, scheduler=client)
+    client.run(pretend_no_files, "")
+    assert row["outcome"] == "error" and "it cannot be sent there" in row["reason"]
+
+
+def test_clusters_that_cannot_run_the_cells_are_refused(client, monkeypatch):
+    todo = [cell(0)]
+    with pytest.raises(ClusterError, match="no scheduler can be reached"):
+        next(cluster.execute(todo, behave, scheduler="tcp://127.0.0.1:1"))
+    with pytest.raises(ClusterError, match="no scheduler can be reached"):
+        cluster.check(todo, "tcp://127.0.0.1:1")
+    with pytest.raises(StudyError, match="workers cannot import"):
+        next(cluster.execute(todo, lambda c: {}, scheduler=client))
+    assert {"clarabel", "cvxpy", "scipy", "optid"} <= set(cluster.packages(todo))
+    real = cluster._versions
+    monkeypatch.setattr(cluster, "_versions", lambda c: real(c) | {"nix": "1.0"})
+    assert "nix" in cluster.packages(todo)
+
+
+def test_rows_of_a_worker_that_joined_with_other_versions_are_refused(client, monkeypatch):
+    """It came after the cluster was looked at: its first row tells."""
+    real = cluster._versions
+    monkeypatch.setattr(cluster, "_versions", lambda c: real(c) | {"clarabel": "0.1"})
+    monkeypatch.setattr(cluster, "packages", lambda todo: ["numpy"])
+    study = file_study("x")
+    todo = cells_of(replace(study, data=(DataEntry("rig", system="dead_zone", samples=(100,), noise=(0.1,)),)))[:1]
+    with pytest.raises(ClusterError, match=r"other packages: clarabel: 0.1 here, .* there.*rows so far are kept"):
+        list(cluster.execute(todo, scheduler=client))
+
+
+def test_a_cell_that_cannot_be_pickled_is_a_row(client):
+    todo = [replace(cell(0), options={"f": lambda x: x}), cell(1)]
+    rows = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
+    assert rows[0]["outcome"] == "error" and "cannot be sent to a worker" in rows[0]["reason"]
+    assert rows[1]["outcome"] == "done"
+
+
+def test_a_scheduler_that_goes_away_is_an_error_in_words():
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as short:
+        running = cluster.execute([cell(k, seconds=0.2) for k in range(50)], behave,
+                                  scheduler=short.scheduler_address)
+        next(running)
+        short.close()
+        with pytest.raises(ClusterError, match="scheduler went away"):
+            list(running)
