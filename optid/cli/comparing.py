@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
@@ -104,8 +105,9 @@ def compare(
         study.check_data()
     except StudyError as error:
         raise StudyError(_as_options(str(error))) from None
-    with follow_progress(db) as follow:
-        rows = running.run(study, db, workers=workers, progress=follow, accept_changed_data=accept_changed_data)
+    with TemporaryDirectory() as folder, follow_progress(db) as follow:
+        rows = running.run(study, db or Path(folder) / "compare.duckdb", workers=workers, progress=follow,
+                           accept_changed_data=accept_changed_data)
     found = side_by_side(rows)
     if (reason := found.common_error) is not None:
         raise StudyError(f"no solver could be tried: {reason}")
@@ -171,9 +173,9 @@ def _show(found: Any, posed: str, record: str) -> None:
         return "-" if value != value else f"{value:.0e}"
 
     table = Table(title=f"{posed} on {record}, accuracy {found.accuracy:.0e}", box=box.SIMPLE_HEAD,
-                  title_justify="left", title_style="bold", pad_edge=False)
+                  title_justify="left", title_style="bold", pad_edge=False, padding=(0, 0, 0, 1))
     table.add_column("solver", no_wrap=True)
-    table.add_column("verified", overflow="fold")
+    table.add_column("verified", min_width=8, overflow="fold")
     for column in ("excess", "residual", "cold", "warm", "1-step", "simul."):
         table.add_column(column, justify="right", no_wrap=True)
     for line in found.lines:

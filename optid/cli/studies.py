@@ -52,6 +52,10 @@ def run(
     workers: Workers = None,
     scheduler: Scheduler = None,
     accept_changed_data: Accept = False,
+    retry: Annotated[
+        list[str] | None,
+        typer.Option("--retry", metavar="OUTCOME...", help="Run cells of these outcomes again, e.g. 'time limit'."),
+    ] = None,
     export: Annotated[
         Path | None, typer.Option("--export", metavar="FILE", help="Also write the rows (.parquet, .csv) at the end.")
     ] = None,
@@ -79,7 +83,7 @@ def run(
         return
     with follow_progress(db) as follow:
         running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
-                    accept_changed_data=accept_changed_data)
+                    accept_changed_data=accept_changed_data, retry=retry or ())
     _summary(db, described.name)
     if export is not None:
         count = database.export(db, export)
