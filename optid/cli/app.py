@@ -68,6 +68,15 @@ def fit(
         bool,
         typer.Option("--stream", rich_help_panel=RECORD, help="Read chunk by chunk: for a file larger than memory."),
     ] = False,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            rich_help_panel=RECORD,
+            help="Let a Dask cluster (tcp://host:8786) read the row groups of Parquet files or folders.",
+        ),
+    ] = None,
     split: Annotated[
         float | None,
         typer.Option(
@@ -184,7 +193,7 @@ def fit(
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
         record: Any
-        record, suggestion = words.record(data, how, example, seed, stream=stream)
+        record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
         arguments = words.suited(suggestion, formulation) if suggestion else {}
         given = {
             "na": na,

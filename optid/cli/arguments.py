@@ -11,13 +11,16 @@ from optid.errors import DataError, StructureError
 from optid.streams import Stream
 
 
-def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False) -> Data | Stream:
+def read_record(
+    files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False, scheduler: str | None = None
+) -> Data | Stream:
     """Read the files of a record, one experiment each.
 
     Args:
-        files: paths.
+        files: paths; for a stream also of folders of Parquet files.
         how: options: inputs, outputs and columns (words), dt, time, experiment, delimiter, decimal.
         stream: read chunk by chunk.
+        scheduler: address of a Dask scheduler whose workers read them, chunk by chunk.
 
     Raises:
         DataError: what `optid.read` refuses.
@@ -33,16 +36,17 @@ def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: 
         "time": False if time == "none" else time,
         "delimiter": how["delimiter"].replace("\\t", "\t"),
     }
-    if not stream:
+    if not stream and scheduler is None:
         return read([Path(name) for name in files], **options)
-    if len(files) > 1 or options.pop("experiment") is not None:
-        raise DataError("--stream reads one file with one experiment; leave --stream out for several")
-    return open_stream(Path(files[0]), **options)
+    if options.pop("experiment") is not None:
+        raise DataError("--stream and --scheduler read a file or folder as one experiment; leave --experiment out")
+    paths = [Path(name) for name in files]
+    return open_stream(paths if len(paths) > 1 else paths[0], scheduler=scheduler, **options)
 
 
 def record(
     files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int,
-    *, asked: str = "a data file", stream: bool = False,
+    *, asked: str = "a data file", stream: bool = False, scheduler: str | None = None,
 ) -> tuple[Data | Stream, dict[str, Any]]:
     """Return the record of files, or a built-in one with the arguments of a fit that it suggests.
 
@@ -53,6 +57,7 @@ def record(
         seed: of the noise of the example.
         asked: what the command takes in the way of files, for the messages.
         stream: read chunk by chunk.
+        scheduler: as in `read_record`.
 
     Raises:
         DataError: neither is given, or both are, or what `optid.read` refuses.
@@ -61,7 +66,7 @@ def record(
     if example is None:
         if not files:
             raise DataError(f"give {asked}, or --example NAME (optid examples lists them)")
-        return read_record(files, how, stream=stream), {}
+        return read_record(files, how, stream=stream, scheduler=scheduler), {}
     if files:
         raise DataError(f"give {asked} or --example, not both")
     from optid.examples import example as built_in
@@ -138,7 +143,7 @@ def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
         DataError: an impossible share, or a stream.
     """
     if isinstance(record, Stream):
-        raise DataError("--split needs the record in memory; leave --stream out, or give --test another file")
+        raise DataError("--split needs the record in memory; leave --stream and --scheduler out, or give --test another file")
     return record.split(share)
 
 
