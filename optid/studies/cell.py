@@ -10,16 +10,17 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from optid.errors import SolverMissing, SolverRefused
+from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.fitting import Fit, fit
 from optid.solution import Solution, Times
 from optid.solving import NOT_FINITE, solve
 from optid.studies.environment import machine
-from optid.studies.grid import Cell
+from optid.studies.grid import Cell, content_hash
 from optid.studies.memory import Peak
 from optid.studies.records import Record, load
 from optid.studies.rows import (
@@ -147,6 +148,9 @@ def _loaded(cell: Cell) -> Record:
     entry = cell.data_source
     identity = (cell.data_hash, entry.system, cell.samples, cell.noise, cell.seed, cell.holdout, as_json(entry.options))
     if identity not in _records:
+        if entry.files and content_hash(entry, Path()) != cell.data_hash:
+            raise DataError(f"{', '.join(entry.files)}: not the content that the study started with; it changed since, "
+                            "or this machine has another file of that name")
         _records[identity] = load(cell)
         while len(_records) > KEPT:
             _records.popitem(last=False)

@@ -209,6 +209,67 @@ def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]
     return {(key, int(repetition)) for key, repetition in found}
 
 
+def identities(path: str | Path) -> dict[tuple[str, str, int], str]:
+    """Return {(study, key, repetition): place} of every row; empty where there is no database yet.
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    if not Path(path).exists():
+        return {}
+    with opened(path) as connection:
+        found = connection.execute("SELECT study, key, repetition, place FROM rows").fetchall()
+    return {(study, key, int(repetition)): place for study, key, repetition, place in found}
+
+
+def rows_of(path: str | Path, study: str | None, identified: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
+    """Return rows as they were written, as dictionaries, in the order asked for; those that are not there are left out.
+
+    Args:
+        path: the database.
+        study: only rows of this study; None for any, one of each.
+        identified: (key, repetition) of the rows.
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    if not identified:
+        return []
+    names = ", ".join("strftime(started, '%Y-%m-%dT%H:%M:%S.%f') || '+00:00' AS started" if c.kind == "time"
+                      else f'"{c.name}"' for c in COLUMNS)
+    condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
+    with opened(path) as connection:
+        found = connection.execute(f"SELECT {names} FROM rows {condition}", values).fetchall()
+    rows = [dict(zip(NAMES, values)) for values in found]
+    by_identity = {(row["key"], row["repetition"]): row for row in rows}
+    return [by_identity[identity] for identity in identified if identity in by_identity]
+
+
+def set_aside(path: str | Path, study: str, outcomes: Sequence[str]) -> None:
+    """Move the rows of a study with these outcomes to the table ``superseded``, so that their cells are run again.
+
+    Raises:
+        DatabaseError: as in `writing`.
+    """
+    if not outcomes or not Path(path).exists():
+        return
+    names = ", ".join(f'"{name}"' for name in NAMES)
+    chosen = f"study = ? AND outcome IN ({', '.join('?' * len(outcomes))})"
+    with writing(path) as connection:
+        connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {chosen}", [study, *outcomes])
+        connection.execute(f"DELETE FROM rows WHERE {chosen}", [study, *outcomes])
+
+
+def describe(path: str | Path, study: str, description: str) -> None:
+    """Keep the text of a study file with its rows; the newest replaces the one before.
+
+    Raises:
+        DatabaseError: as in `writing`.
+    """
+    with writing(path) as connection:
+        connection.execute("INSERT OR REPLACE INTO studies VALUES (?, ?)", [study, description])
+
+
 def data_hashes(path: str | Path) -> dict[tuple[str, str], set[str]]:
     """Return {(study, data label): hashes of the data files that the rows were made from}; simulated data have none.
 

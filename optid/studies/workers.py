@@ -8,7 +8,7 @@ import os
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,7 @@ def cores() -> int:
 
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
-            workers: int | None = None) -> Generator[Row, None, None]:
+            workers: int | None = None) -> Iterator[Row]:
     """Run every cell in a worker and yield its row, in the order in which they end.
 
     Closing the generator, or an exception in it such as KeyboardInterrupt, ends all workers at once.

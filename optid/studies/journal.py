@@ -1,0 +1,112 @@
+"""One writer at a time, and rows that outlive it: the lock and the journal beside a database.
+
+A row is in the journal from the moment it is there, so that a run that is killed loses only what it had not finished;
+the database gets rows in batches. Whoever runs next finds the rest in the journal.
+"""
+
+import errno
+import fcntl
+import json
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from optid.errors import DatabaseError
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a database; the system releases it when the process ends, however it ends.
+
+    Args:
+        path: the database, which need not be there yet.
+
+    Raises:
+        DatabaseError: another run holds it (says which), or its folder cannot be written.
+    """
+    path = path.resolve()
+    name = path.with_name(path.name + ".lock")
+    handle = _acquired(path, name)
+    try:
+        os.ftruncate(handle, 0)
+        os.write(handle, f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"
+                 .encode())
+        yield
+    finally:
+        name.unlink(missing_ok=True)  # before the lock goes: nobody locks a name that is about to vanish
+        os.close(handle)
+
+
+def _acquired(path: Path, name: Path) -> int:
+    while True:
+        try:
+            handle = os.open(name, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise DatabaseError(f"{path} cannot be written: {error.strerror}: {name}") from None
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            holder = os.pread(handle, 200, 0).decode(errors="replace") or "a process that has only just started"
+            os.close(handle)
+            raise DatabaseError(f"another run is writing to {path}: {holder}. Wait until it ends, stop it, or give "
+                                "another database") from None
+        try:
+            if os.stat(name).st_ino == os.fstat(handle).st_ino:
+                return handle
+        except FileNotFoundError:
+            pass
+        os.close(handle)  # its former holder removed it between our two steps
+
+
+class Journal:
+    """Rows that are not in the database yet, one line of JSON each."""
+
+    def __init__(self, database: Path) -> None:
+        """Open the journal of a database.
+
+        Args:
+            database: its path.
+
+        Raises:
+            DatabaseError: it cannot be written.
+        """
+        self.path = database.with_name(database.name + ".journal")
+        try:
+            self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+        except OSError as error:
+            raise DatabaseError(f"{self.path} cannot be written: {error.strerror}") from None
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Write a row down.
+
+        Raises:
+            DatabaseError: it cannot be written, such as on a full disk.
+        """
+        line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        size = os.fstat(self._handle).st_size
+        try:
+            written = os.write(self._handle, line)
+            if written < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            os.ftruncate(self._handle, size)  # half a row is none
+            raise DatabaseError(f"{self.path} cannot be written: {error.strerror}") from error
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return what is in it; a last line that a killed process left unfinished is none."""
+        content = os.pread(self._handle, os.fstat(self._handle).st_size, 0)
+        return [json.loads(line) for line in content.split(b"\n")[:-1]]
+
+    def clear(self) -> None:
+        """Forget everything: it is in the database."""
+        os.ftruncate(self._handle, 0)
+
+    def close(self) -> None:
+        """Close it, and remove it when nothing is in it."""
+        if os.fstat(self._handle).st_size == 0:
+            self.path.unlink(missing_ok=True)
+        os.close(self._handle)

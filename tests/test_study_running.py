@@ -1,0 +1,345 @@
+"""Running a study: nothing twice, nothing lost, one writer, and a clear word where it cannot go on."""
+
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import study_trouble
+from study_trouble import behave, cell, row
+
+from optid.errors import DatabaseError, StudyError
+from optid.studies import running, workers
+from optid.studies.database import finished, opened, read_rows
+from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.journal import Journal, locked
+from optid.studies.rows import NAMES
+from optid.studies.running import run, run_to_frame
+
+STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
+              (FormulationEntry("f", "arx", (), {"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "study.duckdb"
+
+
+class Hands:
+    """An executor in this process that counts, and stops where it is told."""
+
+    def __init__(self, stop_after=None, error=KeyboardInterrupt):
+        self.ran, self.stop_after, self.error, self.closed = [], stop_after, error, False
+
+    def __call__(self, todo):
+        try:
+            for one in todo:
+                if self.stop_after is not None and len(self.ran) >= self.stop_after:
+                    raise self.error("stopped")
+                self.ran.append(int(one.key, 16))
+                yield row(one)
+        finally:
+            self.closed = True
+
+
+@pytest.fixture
+def grid(monkeypatch):
+    """Let the study consist of these cells."""
+
+    def set_to(found):
+        monkeypatch.setattr(running, "cells", lambda study: list(found))
+        return list(found)
+
+    return set_to
+
+
+def test_a_second_run_recomputes_nothing(path, grid):
+    grid([cell(k) for k in range(10)])
+    seen = []
+    hands = Hands()
+    rows = run(STUDY, path, execute=hands, progress=lambda *found: seen.append(found))
+    assert hands.ran == list(range(10)) and [int(r["key"], 16) for r in rows] == hands.ran
+    assert seen[0] == (0, 10, None) and seen[-1][:2] == (10, 10) and seen[-1][2]["key"] == f"{9:064x}"
+    grid([cell(k) for k in range(12)])
+    again = Hands()
+    rows = run(STUDY, path, execute=again)
+    assert again.ran == [10, 11] and len(rows) == 12 and tuple(rows[0]) == NAMES
+    assert sorted(p.name for p in path.parent.iterdir()) == ["study.duckdb"]
+
+
+def test_rows_are_given_back_as_they_were_made(path, grid):
+    grid([cell(0)])
+    made = []
+    rows = run(STUDY, path, execute=Hands(), progress=lambda done, total, found: made.append(found))
+    assert rows == [made[-1]]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_what_is_finished_is_kept_when_something_stops_the_run(path, grid, error):
+    grid([cell(k) for k in range(10)])
+    hands = Hands(4, error)
+    with pytest.raises(error):
+        run(STUDY, path, execute=hands)
+    assert hands.closed and len(finished(path)) == 4
+    rest = Hands()
+    run(STUDY, path, execute=rest)
+    assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished(path)) == 10
+
+
+def test_an_error_of_the_caller_s_progress_keeps_what_is_finished(path, grid):
+    grid([cell(k) for k in range(5)])
+
+    def progress(done, total, found):
+        if done == 3:
+            raise OSError("the terminal is gone")
+
+    hands = Hands()
+    with pytest.raises(OSError):
+        run(STUDY, path, execute=hands, progress=progress)
+    assert hands.closed and len(finished(path)) == 3
+
+
+def test_rows_in_the_journal_of_a_killed_run_are_taken_over_once(path, grid):
+    cells = grid([cell(k) for k in range(6)])
+    run(STUDY, path, execute=lambda todo: iter([row(c) for c in cells]))
+    grid([cell(k) for k in range(9)])
+    journal = Journal(path)
+    for k in (5, 6, 7):  # 5 is in the database already: the run was killed before it cleared the journal
+        journal.add(row(cell(k)))
+    with open(journal.path, "a") as file:
+        file.write('{"key": "half a ro')
+    rest = Hands()
+    assert len(run(STUDY, path, execute=rest)) == 9
+    assert rest.ran == [8] and not journal.path.exists()
+
+
+def test_batches_are_readable_while_the_study_runs(path, grid, monkeypatch):
+    monkeypatch.setattr(running, "BATCH", 3)
+    grid([cell(k) for k in range(8)])
+    seen = []
+    run(STUDY, path, execute=Hands(), progress=lambda done, total, found: seen.append(len(finished(path))))
+    assert seen == [0, 0, 0, 3, 3, 3, 6, 6, 6]
+
+
+def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
+    grid([cell(k) for k in range(3)])
+    rows = run(STUDY, path, execute=lambda todo: iter([row(c) for c in [*todo, cell(7), *todo]]))
+    assert len(rows) == 3 == len(finished(path))
+
+
+def test_cells_that_come_back_without_a_row_are_told(path, grid):
+    grid([cell(k) for k in range(3)])
+    with pytest.raises(StudyError, match="2 cells of 3 came back without a row"):
+        run(STUDY, path, execute=lambda todo: iter([row(todo[0])]))
+    assert len(finished(path)) == 1
+
+
+def test_refused_cells_need_no_worker(path, grid):
+    from dataclasses import replace
+
+    grid([replace(cell(0), refusal="not installed: pip install x"), cell(1)])
+    hands = Hands()
+    rows = run(STUDY, path, execute=hands)
+    assert hands.ran == [1] and [r["outcome"] for r in rows] == ["refused", "done"]
+
+
+def test_outcomes_are_retried_on_request(path, grid):
+    grid([cell(k) for k in range(4)])
+    run(STUDY, path, execute=lambda todo: iter([row(c, outcome="done" if k else "crashed")
+                                                for k, c in enumerate(todo)]))
+    hands = Hands()
+    assert [r["outcome"] for r in run(STUDY, path, execute=hands, retry=["crashed"])] == ["done"] * 4
+    assert hands.ran == [0]
+    with opened(path) as connection:
+        assert connection.execute("SELECT outcome FROM superseded").fetchall() == [("crashed",)]
+    with pytest.raises(StudyError, match="Did you mean 'crashed'"):
+        run(STUDY, path, execute=hands, retry=["crash"])
+
+
+def test_other_labels_and_other_studies_take_over_what_is_there(path, grid):
+    from dataclasses import replace
+
+    cells = grid([cell(k) for k in range(4)])
+    run(STUDY, path, execute=Hands())
+    grid([replace(c, solver="renamed") for c in cells])
+    hands = Hands()
+    rows = run(STUDY, path, execute=hands)
+    assert hands.ran == [] and {r["solver"] for r in rows} == {"renamed"} and len(finished(path)) == 4
+    grid([replace(c, study="another") for c in cells])
+    rows = run(replace(STUDY, name="another"), path, execute=hands)
+    assert hands.ran == [] and {r["study"] for r in rows} == {"another"}
+    assert [len(finished(path, name)) for name in ("trouble", "another")] == [4, 4]
+    before = read_rows(path)["started"].size
+    run(replace(STUDY, name="another"), path, execute=hands)
+    assert read_rows(path)["started"].size == before == 8
+
+
+def test_changed_data_are_refused_unless_told(path, grid):
+    from dataclasses import replace
+
+    entry = DataEntry("mine", files=("/somewhere/x.csv",))
+    old = [replace(cell(k), data="mine", data_source=entry, data_hash="a" * 64) for k in range(3)]
+    new = [replace(c, key=f"{100 + k:064x}", data_hash="b" * 64) for k, c in enumerate(old)]
+    made = lambda todo: iter([row(c, data_hash=c.data_hash) for c in todo])  # noqa: E731
+    grid(old)
+    run(STUDY, path, execute=made)
+    grid(new)
+    with pytest.raises(StudyError, match="data changed since the last run.*\n.*mine: /somewhere/x.csv"):
+        run(STUDY, path, execute=made)
+    rows = run(STUDY, path, execute=made, accept_changed_data=True)
+    assert {r["data_hash"] for r in rows} == {"b" * 64} and len(finished(path)) == 3
+    run(STUDY, path, execute=made)
+
+
+def test_two_runs_at_once_are_refused(path, grid):
+    import os
+
+    grid([cell(0)])
+    with locked(path):
+        with pytest.raises(DatabaseError, match=f"another run is writing to .*: process {os.getpid()} on .* since"):
+            run(STUDY, path, execute=Hands())
+    assert not path.exists()
+    assert len(run(STUDY, path, execute=Hands())) == 1
+
+
+def test_the_lock_of_a_killed_run_is_free(path):
+    program = f"""
+from pathlib import Path
+from optid.studies.journal import locked
+with locked(Path({str(path)!r})):
+    print("held", flush=True)
+    input()
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
+        with pytest.raises(DatabaseError, match=f"process {holder.pid} on"), locked(path):
+            pass
+        holder.kill()
+        holder.wait()
+    with locked(path):
+        pass
+    assert list(path.parent.iterdir()) == []
+
+
+def test_a_link_to_the_database_is_the_same_database(path, tmp_path, grid):
+    grid([cell(0)])
+    run(STUDY, path, execute=Hands())
+    link = tmp_path / "link.duckdb"
+    link.symlink_to(path)
+    with locked(link), pytest.raises(DatabaseError, match="another run"):
+        run(STUDY, path, execute=Hands())
+
+
+def test_another_version_is_refused_before_anything_is_run(path, grid):
+    grid([cell(0)])
+    run(STUDY, path, execute=Hands())
+    import duckdb
+
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
+    grid([cell(1)])
+    hands = Hands()
+    with pytest.raises(DatabaseError, match="schema version 99"):
+        run(STUDY, path, execute=hands)
+    assert hands.ran == [] and sorted(p.name for p in path.parent.iterdir()) == ["study.duckdb"]
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path, grid):
+    grid([cell(0)])
+    with pytest.raises(DatabaseError, match="cannot be written: No such file or directory"):
+        run(STUDY, tmp_path / "nowhere" / "x.duckdb", execute=Hands())
+
+
+def test_frames(path, grid):
+    pd = pytest.importorskip("pandas")
+    grid([cell(k) for k in range(3)])
+    for db in (path, None):
+        frame = run_to_frame(STUDY, db, execute=Hands())
+        assert tuple(frame.columns) == NAMES and len(frame) == 3
+        assert frame["objective"].isna().all() and frame["objective"].dtype == float
+        assert frame["reached"].dtype == bool and frame["unknowns"].dtype == "Int64"
+        assert isinstance(frame["started"].iloc[0], pd.Timestamp)
+
+
+def test_every_trouble_in_one_study(path, grid):
+    ways = ["fine", "segfault", "fine", "loop", "hog", "leave", "raise", "fine", "partial", "fine"]
+    limits = {"loop": {"time_limit": 0.5}, "hog": {"memory_limit": 500.0}}
+    grid([cell(k, do, **limits.get(do, {})) for k, do in enumerate(ways)])
+    rows = run(STUDY, path, execute=partial(workers.execute, function=behave, workers=2))
+    assert [r["outcome"] for r in rows] == ["done", "crashed", "done", "time limit", "memory limit", "crashed", "error",
+                                            "done", "error", "done"]
+    assert all(r["reason"] for r in rows if r["outcome"] != "done")
+    assert len(finished(path)) == 10
+
+
+DRIVER = """
+import sys
+sys.path.insert(0, {tests!r})
+from functools import partial
+from study_trouble import behave, cell
+from optid.studies import running, workers
+from test_study_running import STUDY
+running.cells = lambda study: [cell(k, seconds=0.02, log={log!r}) for k in range({count})]
+running.run(STUDY, {path!r}, execute=partial(workers.execute, function=behave, workers=2))
+"""
+
+
+def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_path, grid):
+    count, log = 60, tmp_path / "log"
+    log.touch()
+    program = DRIVER.format(tests=str(Path(study_trouble.__file__).parent), log=str(log), count=count, path=str(path))
+
+    def begun():
+        return len(log.read_text().splitlines())
+
+    for aim in (1, 15, 40):
+        driver = subprocess.Popen([sys.executable, "-c", program])
+        until = time.monotonic() + 120.0
+        while begun() < aim and time.monotonic() < until:
+            time.sleep(0.005)
+        driver.kill()
+        driver.wait()
+        if path.exists():
+            assert len(finished(path)) <= begun()  # it opens
+    cells = grid([cell(k, seconds=0.0, log=str(log)) for k in range(count)])
+    rows = run(STUDY, path, execute=partial(workers.execute, function=behave, workers=2))
+    assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished(path)) == count
+    assert begun() <= count + 3 * 4  # run twice: at most what three kills found in flight, with one waiting each
+
+
+
+@pytest.mark.parametrize("full", ["journal", "database"])
+def test_a_full_disk_stops_cleanly_and_the_next_run_goes_on(path, grid, full):
+    """Files may grow to a size only: first the journal has no room, then the database."""
+    program = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+from study_trouble import cell
+from optid.errors import DatabaseError
+from optid.studies import running
+from test_study_running import STUDY, Hands
+grid = [cell(k) for k in range(3000)]
+running.cells = lambda study: grid[:10]
+running.run(STUDY, {str(path)!r}, execute=Hands())
+running.cells = lambda study: grid
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+room = {8_000 if full == "journal" else 1_000_000}
+resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+hands = Hands()
+try:
+    running.run(STUDY, {str(path)!r}, execute=hands)
+except DatabaseError as error:
+    print(hands.closed, len(hands.ran), error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    closed, ran, words = done.stdout.split(" ", 2)
+    assert closed == "True" and int(ran) > 5
+    assert ("study.duckdb.journal" if full == "journal" else "study.duckdb") + " cannot be written: " in words
+    assert len(finished(path)) >= 10
+    grid([cell(k) for k in range(3000)])
+    rest = Hands()
+    assert len(run(STUDY, path, execute=rest)) == 3000
+    assert len(rest.ran) + int(ran) + 10 in (3000, 3001)  # the row for which there was no room is made again
