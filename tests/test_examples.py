@@ -10,7 +10,8 @@ import pytest
 
 FOLDER = Path(__file__).parent.parent / "examples"
 SCRIPTS = {
-    str(path.relative_to(FOLDER).with_suffix("")): path for path in FOLDER.rglob("*.py") if path.stem != "common"
+    str(path.relative_to(FOLDER).with_suffix("")): path for path in FOLDER.rglob("*.py")
+    if path.stem != "common" and path.parent.name != "studies"  # those are run by test_study_examples.py
 }
 
 Range = tuple[float, float]
