@@ -137,9 +137,10 @@ class Browser:
         self.send("Input.insertText", text=text)
 
     def where(self, selector: str) -> dict[str, float]:
-        """Scroll an element into view and return its place in the window."""
-        return self.run(f"(() => {{ const e = document.querySelector({json.dumps(selector)}); "
-                        "e.scrollIntoView({block: 'center', behavior: 'instant'}); const r = e.getBoundingClientRect();"
+        """Scroll an element into view, let the page come to rest, and return its place in the window."""
+        return self.run(f"(async () => {{ const e = document.querySelector({json.dumps(selector)}); "
+                        "e.scrollIntoView({block: 'center', behavior: 'instant'}); for (let k = 0; k < 2; k++) "
+                        "await new Promise((done) => requestAnimationFrame(done)); const r = e.getBoundingClientRect();"
                         "return {x: r.x, y: r.y, width: r.width, height: r.height}; })()")
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
@@ -150,6 +151,7 @@ class Browser:
         """Click into the middle of an element."""
         place = self.where(selector)
         x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+        self.mouse("mouseMoved", x, y)
         self.mouse("mousePressed", x, y, button="left", clickCount=1)
         self.mouse("mouseReleased", x, y, button="left", clickCount=1)
 

@@ -10,7 +10,7 @@ from browser import CHROMIUM, NO_BROWSER, Browser
 from study_rows import rows as synthetic
 
 from optid.errors import DataError
-from optid.studies.outcomes import columns, tabulate
+from optid.studies.outcomes import columns, states_of_rows, tabulate
 from optid.studies.page import embedded, render, write_page
 from optid.studies.payload import page_payload
 from optid.studies.verdict import conclude
@@ -187,7 +187,8 @@ def shown(browser):
 
 
 def heading(browser, name, table="#runs-table"):
-    return browser.run(f"[...document.querySelectorAll('{table} thead button')].findIndex(b => b.dataset.column === '{name}')")
+    buttons = f"[...document.querySelectorAll('{table} thead button')]"
+    return browser.run(f"{buttons}.findIndex(b => b.dataset.column === '{name}')")
 
 
 @in_browser
@@ -195,19 +196,19 @@ def test_the_first_glance_has_the_verdict(opened, verdict):
     top = opened.where("#verdict .word")
     opened.run("scrollTo(0, 0)")
     assert opened.run("document.querySelector('#verdict .word').textContent") == verdict.headline.word
-    assert opened.run("document.querySelector('#verdict .sentence').getBoundingClientRect().bottom") < 500 and top["width"] > 0
+    bottom = opened.run("document.querySelector('#verdict .sentence').getBoundingClientRect().bottom")
+    assert bottom < 500 and top["width"] > 0
     assert opened.run("document.querySelectorAll('#standings tbody tr').length") == len(verdict.overall.standings)
 
 
 @in_browser
 def test_runs_sort_in_both_directions_with_empty_ones_last(opened, rows):
-    found = tabulate(columns(rows))
-    del found
     at = heading(opened, "objective")
     opened.click("#runs-table [data-column=objective]")
     first = float(column(opened, at)[0])
     assert first == pytest.approx(min(r["objective"] for r in rows if r["objective"] is not None), rel=1e-5)
-    assert opened.run(f"document.querySelectorAll('#runs-table thead th')[{at}].getAttribute('aria-sort')") == "ascending"
+    head = f"document.querySelectorAll('#runs-table thead th')[{at}]"
+    assert opened.run(f"{head}.getAttribute('aria-sort')") == "ascending"
     opened.click("#runs-table [data-column=objective]")
     values = [float(v) for v in column(opened, at)]
     assert values == sorted(values, reverse=True)
@@ -247,9 +248,10 @@ def test_filters_count_as_the_rows_do(opened, rows):
 
 @in_browser
 def test_a_number_in_the_table_of_failures_lists_its_runs(opened, rows, verdict):
-    lying = verdict.overall.standing("scs")
-    count = lying.failures["false claim"]
-    opened.click(f"#failure-matrix [aria-label='{count} false claim, scs: list the runs']")
+    problems = verdict.overall.standing("scs").failures["false claim"]
+    states = states_of_rows(columns(rows), verdict.found)
+    count = sum(r["solver"] == "scs" and s == "false claim" for r, s in zip(rows, states))  # repetitions one by one
+    opened.click(f"#failure-matrix [aria-label='{problems} false claim, scs: list the runs']")
     assert shown(opened).startswith(f"{count} of ")
     assert set(column(opened, heading(opened, "state"))) == {"false claim"}
 
@@ -310,10 +312,12 @@ def test_figures_show_what_the_verdict_holds(opened, verdict):
     order = sorted(heights, key=heights.get)  # the highest curve has the smallest ordinate
     solved = {s.solver: s.solved for s in verdict.overall.standings}
     assert [solved[name] for name in order] == sorted(solved.values(), reverse=True)
-    numbers = opened.run("[...document.querySelectorAll('#profile details tbody tr')].map(r => [...r.children].map(c => c.textContent))")
+    lines = "[...document.querySelectorAll('#profile details tbody tr')]"
+    numbers = opened.run(f"{lines}.map(r => [...r.children].map(c => c.textContent))")
     for name, *cells in numbers:
         for factor, cell in zip((1, 2, 5, 10, 1e99), cells):
-            assert float(cell.split()[0]) == pytest.approx(100 * verdict.overall.profiles[name](factor), rel=6e-3, abs=0.3)
+            share = 100 * verdict.overall.profiles[name](factor)
+            assert float(cell.split()[0]) == pytest.approx(share, rel=6e-3, abs=0.3)
 
 
 @in_browser
@@ -331,12 +335,23 @@ def test_a_solver_is_switched_off_in_every_figure(opened):
 @in_browser
 def test_the_choice_of_a_formulation_changes_tables_and_figures(opened, verdict):
     section = verdict.sections[0]
-    opened.run("(() => { const s = document.getElementById('section'); s.value = 1; s.dispatchEvent(new Event('change')); })()")
+    opened.run("(() => { const s = document.getElementById('section'); s.value = 1; "
+               "s.dispatchEvent(new Event('change')); })()")  # fmt: skip
     assert opened.run("document.querySelectorAll('#standings tbody tr').length") == len(section.standings)
     assert section.choice.first in opened.run("document.getElementById('said').textContent")
     legend = opened.run("[...document.querySelectorAll('#legend button')].map(b => b.title)")
     assert legend == [s.solver for s in section.standings]
     assert all(name in opened.run("document.getElementById('standings').textContent") for name in section.idle)
+
+
+# The middle of a cross among the points.
+CROSS = """(() => {
+  const s = document.querySelector('#accuracy .plot svg'), r = s.getBoundingClientRect();
+  const paths = [...s.querySelectorAll('path[data-series]')].map((p) => p.getAttribute('d'));
+  const d = paths.sort((a, b) => a.length - b.length)[0], k = r.width / s.viewBox.baseVal.width;
+  const [x, y] = d.match(/-?[\\d.]+/g).map(Number);
+  return [r.x + (x + 3) * k, r.y + (y + 3) * k];
+})()"""
 
 
 @in_browser
@@ -349,10 +364,8 @@ def test_a_point_and_a_run_open_their_details_and_escape_closes_them(opened, row
     opened.press("Escape")
     assert not opened.run("document.getElementById('detail').open")
     assert opened.run("document.activeElement.textContent") == "1"
-    place = opened.run("(() => { const s = document.querySelector('#accuracy .plot svg'); s.scrollIntoView({block: 'center', behavior: 'instant'});"
-                       "const d = [...s.querySelectorAll('path[data-series]')].map(p => p.getAttribute('d')).sort((a, b) => a.length - b.length)[0];"
-                       "const [x, y] = d.match(/-?[\\d.]+/g).map(Number), r = s.getBoundingClientRect(), k = r.width / s.viewBox.baseVal.width;"
-                       "return [r.x + x * k + 3 * k, r.y + y * k + 3 * k]; })()")  # fmt: skip
+    opened.where("#accuracy .plot svg")
+    place = opened.run(CROSS)
     opened.mouse("mouseMoved", *place)
     assert "residual" in opened.run("document.querySelector('#accuracy .tip').textContent")
     opened.mouse("mousePressed", *place, button="left", clickCount=1)
@@ -368,7 +381,7 @@ def test_the_whole_page_is_reached_by_tab_and_works_by_keyboard(opened):
     seen = set()
     for _ in range(90):
         opened.press("Tab")
-        seen.add(opened.run("document.activeElement.closest('section, nav, .scope')?.id || document.activeElement.tagName"))
+        seen.add(opened.run("document.activeElement.closest('section, nav, .scope')?.id || 'body'"))
     assert {"verdict", "solvers", "figures", "failures"} <= seen
     visible = opened.run("getComputedStyle(document.activeElement).outlineStyle")
     assert visible != "none"
@@ -383,9 +396,10 @@ def test_everything_that_acts_has_an_accessible_name(opened):
     opened.send("Accessibility.enable")
     nodes = opened.send("Accessibility.getFullAXTree")["nodes"]
     acting = [n for n in nodes if not n.get("ignored") and n.get("role", {}).get("value") in
-              ("button", "link", "combobox", "checkbox", "searchbox", "image", "region", "group", "dialog")]  # fmt: skip
+              ("button", "link", "combobox", "checkbox", "searchbox", "image", "region", "dialog")]  # fmt: skip
     nameless = [n["role"]["value"] for n in acting if not n.get("name", {}).get("value")]
     assert len(acting) > 100 and nameless == []
+    assert opened.run("[...document.querySelectorAll('[role=group]')].every(e => e.getAttribute('aria-label'))")
     pictures = [n["name"]["value"] for n in acting if n["role"]["value"] == "image"]
     assert any(name.startswith("Performance profile") for name in pictures)
 
@@ -412,12 +426,13 @@ def test_light_dark_and_the_switch(browser, page, tmp_path):
 
 
 CONTRAST = """(() => {
-  const rgb = (c) => { const k = document.createElement('canvas').getContext('2d', {willReadFrequently: true}); k.fillStyle = c;
-    k.fillRect(0, 0, 1, 1); return [...k.getImageData(0, 0, 1, 1).data]; };
-  const light = (c) => { const [r, g, b] = c.slice(0, 3).map((v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
-    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
-  const ground = (e) => { for (; e; e = e.parentElement) { const c = rgb(getComputedStyle(e).backgroundColor); if (c[3] === 255) return c; }
-    return [255, 255, 255, 255]; };
+  const k = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  const rgb = (c) => { k.clearRect(0, 0, 1, 1); k.fillStyle = c; k.fillRect(0, 0, 1, 1);
+    return [...k.getImageData(0, 0, 1, 1).data]; };
+  const linear = (v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
+  const light = (c) => { const [r, g, b] = c.map(linear); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const ground = (e) => { for (; e; e = e.parentElement) { const c = rgb(getComputedStyle(e).backgroundColor);
+    if (c[3] === 255) return c; } return [255, 255, 255, 255]; };
   return [...document.querySelectorAll('#verdict *, #standings *, #said *, #runs *, #method *')].filter((e) =>
     [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim()) && e.checkVisibility() && !e.disabled)
     .map((e) => { const a = light(rgb(getComputedStyle(e).color)), b = light(ground(e));
@@ -441,7 +456,8 @@ def test_a_phone_needs_no_sideways_scrolling(browser, page, width):
     browser.open(page)
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run("document.getElementById('profile').getBoundingClientRect().right") <= width
-    assert browser.run("[...document.querySelectorAll('.picks .why')].every(e => e.getBoundingClientRect().right <= innerWidth)")
+    inside = "e => e.getBoundingClientRect().right <= innerWidth"
+    assert browser.run(f"[...document.querySelectorAll('.picks .why')].every({inside})")
     assert browser.complaints() == [] and browser.requests() == []
 
 
@@ -469,21 +485,25 @@ def bad_inputs():
     good = synthetic(120, 1)
     failed = [{**r, "outcome": "error", "status_verified": None, "objective": None, "false_claim": False} for r in good]
     solved = {"outcome": "done", "status_verified": "optimal", "false_claim": False, "objective": 1.0, "solve_s": 0.1}
-    nan = {"objective": float("nan"), "violation": float("inf"), "solve_s": float("nan"), "gap": -float("inf"), "noise": float("nan")}
-    text = ("study", "data", "formulation", "solver", "reason", "machine", "status_claimed", "options", "poles", "versions")
+    nan = dict.fromkeys(("objective", "solve_s", "noise"), float("nan"))
+    nan |= {"violation": float("inf"), "gap": -float("inf")}
+    text = ("study", "data", "formulation", "solver", "reason", "machine", "status_claimed", "options", "poles",
+            "versions")  # fmt: skip
+    odd = ("__proto__", "constructor", "toString", "")
+    huge = {"data": "d" * 5000, "reason": "r" * 100_000}
     many = [{**good[k % 120], **solved, "solver": f"solver {k % 40}", "seed": k // 40} for k in range(400)]
     return {
         "empty": [],
         "one row": good[3:4],
         "one solver": [r for r in good if r["solver"] == "ipopt"],
-        "one data set": [r for r in good if r["data"] == "heater"],
+        "one data set": [r for r in synthetic(300, 1) if r["data"] == "heater"],
         "all failed": failed,
         "all refused": [{**r, "outcome": "refused", "status_verified": None, "objective": None} for r in good],
         "unknown truth": [{**r, "parameter_error": None, "nonlinearity_error": None} for r in good],
         "not finite": [{**r, **nan} for r in good],
         "hostile names": [{**r, **{c: HOSTILE + str(r[c]) for c in text}} for r in good],
-        "prototype names": [{**r, "solver": ("__proto__", "constructor", "toString", "")[k % 4]} for k, r in enumerate(good)],
-        "huge texts": [{**r, "data": "d" * 5000, "solver": r["solver"] + "s" * 3000, "reason": "r" * 100_000} for r in good],
+        "prototype names": [{**r, "solver": odd[k % 4]} for k, r in enumerate(good)],
+        "huge texts": [{**r, **huge, "solver": r["solver"] + "s" * 3000} for r in good],
         "surrogates": [{**r, "data": "\ud800 lone", "solver": r["solver"] + " \U0001f600 \u202e"} for r in good],
         "forty solvers": many,
         "equal times": [{**r, **solved} for r in good],
@@ -518,8 +538,14 @@ def test_bad_input_gives_a_true_and_quiet_page(browser, tmp_path, name):
 
 
 def test_bad_input_is_told_in_words():
-    words = {name: conclude(rows).headline.word for name, rows in bad_inputs().items()}
-    assert words["empty"] == words["all refused"] == "Nothing to compare"
+    verdicts = {name: conclude(rows) for name, rows in bad_inputs().items()}
+    words = {name: verdict.headline.word for name, verdict in verdicts.items()}
+    assert words["empty"] == "Nothing to compare" and words["all refused"] == "Nothing was run"
     assert words["all failed"] == words["not finite"] == "No solver can be recommended"
-    assert words["one row"] == words["one solver"] == "Only one solver" or words["one row"] == "Only one solver"
+    assert words["one row"] == words["one solver"] == "Only one solver"
+    assert "at least 6 data sets; there is 1" in str(verdicts["one data set"])
+    assert "Truth unknown" in str(verdicts["unknown truth"])
+    for name in ("empty", "all failed", "all refused", "not finite", "one solver", "one row"):
+        assert verdicts[name].recommended == ()
+    assert max(len(s.text) for s in (verdicts["huge texts"].headline, *verdicts["huge texts"].statements)) < 1500
     assert words["equal times"].startswith("A tie")

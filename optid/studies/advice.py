@@ -44,6 +44,9 @@ def choice_of_solver(section: Section) -> Statement:
     if not n:
         agreed = " Every problem is infeasible, and the solvers agree." if section.infeasible else ""
         return Statement(FAIR, "Nothing to compare", f"There is no run of a solver.{agreed}", "solver")
+    if not section.standings:
+        text = f"Every solver ({listed(section.idle)}) refuses every problem, or was not run."
+        return Statement(FAIR, "Nothing was run", text, "solver")
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
         text = f"No solver reached the accuracy on any of {n:,} problems ({common})."
@@ -94,7 +97,9 @@ def _times(pair: Paired) -> str:
 
 
 def _tone(lead: Standing, n: int) -> str:
-    return GOOD if lead.solved >= 0.95 * n and lead.false_claims <= RARE * n else FAIR if lead.solved >= 0.5 * n else BAD
+    if lead.solved >= 0.95 * n and lead.false_claims <= RARE * n:
+        return GOOD
+    return FAIR if lead.solved >= 0.5 * n else BAD
 
 
 def _median(standing: Standing) -> str:
@@ -156,7 +161,7 @@ def _claims(section: Section, names: tuple[str, ...]) -> str:
 
 
 def carries_over(section: Section) -> Statement:
-    """Say whether the order of the solvers carries over to other data sets."""
+    """Say whether the order of the solvers carries over to other data sets; needs a problem that some solver solved."""
     ranking = section.ranking
     if not ranking.told:
         text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
@@ -179,7 +184,7 @@ def carries_over(section: Section) -> Statement:
 def choice_of_formulation(quality: Quality) -> Statement | None:
     """Say which formulation gives the best models, or why that cannot be told; None for a single formulation."""
     choice, n = quality.choice, quality.records
-    if len(quality.formulations) < 2 or not n:
+    if len(quality.formulations) < 2 or not any(quality.solved.values()):
         return None
     if choice.kind == NOBODY:
         text = "No model has a simulation fit on samples it has not seen: keep a hold-out share."
@@ -204,15 +209,16 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
         text = (f"{lead}; the next, {name}, stays {pair.value:.2g} points behind on {pair.n:,} records "
                 f"(95 %: {pair.low:.2g} to {pair.high:.2g}).")  # fmt: skip
     else:
-        text = f"{lead}; no other was solved on as many."
+        text = f"{lead}; no other was solved on half as many records."
+        return Statement(FAIR, "Models: cannot tell", text, "formulation")
     return Statement(GOOD, f"Best models: {choice.first}", text, "formulation")
 
 
 def headline(overall: Section, sections: list[Section]) -> Statement:
     """Say the verdict in one line: one solver for everything, or that it depends on the formulation."""
-    if len(sections) < 2:
-        return choice_of_solver(overall)
     choice, n = overall.choice, len(overall.found.data)
+    if len(sections) < 2 or len(overall.standings) < 2:
+        return choice_of_solver(overall)
     if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n:
         return choice_of_solver(overall)
     picks = [(section, section.choice) for section in sections]

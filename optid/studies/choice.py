@@ -20,7 +20,7 @@ class Choice:
             says which), "only one" (nothing to compare with), "nobody" (not one problem solved).
         first: who is ahead, of a tie the one with the best mean; "" where there is nobody.
         tied: the others that cannot be told apart from it.
-        candidates: who solved as many problems as the most reliable, up to `RELIABLE`.
+        candidates: who solved as many problems as the most reliable, up to the slack.
         against: {name: it against the first, on the problems that both solved}.
         solved: {name: problems solved}.
         problems: their number.
@@ -38,7 +38,7 @@ class Choice:
 
 
 def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
-           compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0) -> Choice:
+           compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0, slack: float = RELIABLE) -> Choice:
     """Choose the least costly of the most reliable.
 
     Args:
@@ -47,6 +47,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         minor: a mean comparison closer to ``none`` than this is of no practical meaning.
         compare: one column of costs against another, such as `paired_ratio`.
         none: the comparison of equals (1 for ratios, 0 for differences).
+        slack: share of the problems by which the number solved may stay behind the most reliable.
 
     Returns:
         The choice. Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of
@@ -56,7 +57,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     solved, problems = {name: int(c) for name, c in zip(names, counts)}, len(costs)
     if not counts.any():
         return Choice(NOBODY, solved=solved, problems=problems, missing="needs a solver that reaches the accuracy")
-    reliable = np.flatnonzero(counts >= counts.max() - int(RELIABLE * problems))
+    reliable = np.flatnonzero((counts > 0) & (counts >= counts.max() - int(slack * problems)))
     candidates = tuple(names[s] for s in reliable)
     common = np.isfinite(costs[:, reliable]).all(axis=1)
     if not common.any():

@@ -1,5 +1,6 @@
 """Which runs count: a table of problems and solvers, every entry with a time or with the reason why it has none."""
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,6 +14,7 @@ SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", "infeasible"
 LESS_ACCURATE, WORSE_MINIMUM = "less accurate", "worse minimum"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
+LABELS, LONGEST_LABEL = ("data", "formulation", "solver"), 80
 REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}
 """Measures of time and the columns they are the sum of."""
@@ -40,7 +42,8 @@ def columns(rows: Any) -> dict[str, np.ndarray]:
         rows: a mapping of columns, a frame (pandas, polars), or dict rows.
 
     Returns:
-        {column: array}: numbers as floats (``nan`` where empty), flags as bools, texts as str ("" where empty).
+        {column: array}: numbers as floats (``nan`` where empty), flags as bools, texts as str ("" where empty); labels
+        longer than `LONGEST_LABEL` shortened.
 
     Raises:
         DataError: a column that a verdict needs is missing, columns of unequal length, or a text in place of a number.
@@ -54,7 +57,17 @@ def columns(rows: Any) -> dict[str, np.ndarray]:
     missing = [name for name in REQUIRED if name not in given] if n else []
     if missing:
         raise DataError(f"the rows have no column {', '.join(missing)}: this is not a table of study rows")
-    return {name: _filled(name, column.kind, given.get(name), n) for name, column in BY_NAME.items()}
+    table = {name: _filled(name, column.kind, given.get(name), n) for name, column in BY_NAME.items()}
+    for name in LABELS:
+        table[name] = np.array([_label(text) for text in table[name]], dtype=object)
+    return table
+
+
+def _label(text: str) -> str:
+    """Shorten a label that no sentence could hold, so that it stays different from others."""
+    if len(text) <= LONGEST_LABEL:
+        return text or "(no name)"
+    return f"{text[: LONGEST_LABEL - 8]}…{hashlib.sha256(text.encode(errors='replace')).hexdigest()[:6]}"
 
 
 def _by_column(rows: Any) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from optid.studies.outcomes import Results
 from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
 MINOR = 0.1  # points of simulation fit that nobody would see in a plot
+SLACK = 0.5  # share of the records by which a formulation may stay behind: fits compare on common records anyway
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
     ranking = rank_over_data_sets(scores_by_data_set(ranks_of_problems(losses), data), names)
     return Quality(
         names, records, {name: int((row[:, f] >= 0).sum()) for f, name in enumerate(names)}, figures,
-        choose(losses, names, MINOR, _points), ranking, bool(np.isfinite(values["parameter_error"]).any()),
+        choose(losses, names, MINOR, _points, slack=SLACK), ranking, bool(np.isfinite(values["parameter_error"]).any()),
     )  # fmt: skip
 
 

@@ -132,7 +132,7 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
     if not len(found.data):
         return []
     said = [choice_of_formulation(quality)]
-    if len(sections) == 1 or head == choice_of_solver(overall):
+    if found.solved.any() and (len(sections) == 1 or head == choice_of_solver(overall)):
         said.append(carries_over(overall))
     said += [_never(overall), _refuted(found, table), _no_truth(quality)]
     if overall.infeasible:
@@ -146,7 +146,8 @@ def _never(overall: Section) -> Statement | None:
     never = [s.solver for s in overall.standings if not s.solved]
     if not never or len(never) == len(overall.standings):
         return None
-    tried = "; ".join(f"{s.solver}: {s.problems:,} problems, {', '.join(f'{w} {c:,}' for w, c in s.failures.items())}"
+    tried = "; ".join(f"{s.solver}: {s.problems:,} problem{'' if s.problems == 1 else 's'}, "
+                      + ", ".join(f"{word} {count:,}" for word, count in s.failures.items())
                       for s in overall.standings if not s.solved)  # fmt: skip
     return Statement("bad", "Never reached the accuracy", f"{tried}.", "solver")
 
