@@ -98,6 +98,11 @@ class StateError:
         values, vectors = np.linalg.svd(np.array(rows), full_matrices=False)[1:]
         return vectors[values > 1e-12 * values[0]]
 
+    def value(self, x: Array) -> float:
+        """Return the weighted sum of squared errors, what is missing counting as zero."""
+        errors = np.nan_to_num(np.vstack(self.residuals(x)))
+        return float(np.sum((errors @ self.weight) * errors))
+
     def residuals(self, x: Array) -> list[Array]:
         """Return the errors (N, l) of every experiment."""
         return residuals(self.data, self.unknowns, x, self.at)
@@ -117,11 +122,13 @@ class StateError:
             covariance = complete.T @ complete / len(complete) + np.diag(floor**2)
         return replace(self, weight=np.linalg.inv(covariance))
 
-    def level(self, x: Array) -> float:
-        """Return the sum of log variances of the errors, by which points of different weights are compared."""
-        errors = np.vstack(self.residuals(x))
-        floor = FLOOR * np.nanstd(np.vstack([e.y for e in self.data.experiments]), axis=0)
-        return float(np.sum(np.log(np.maximum(np.nanmean(errors**2, axis=0), floor**2))))
+    def level(self, x: Array, full: bool = False) -> float:
+        """Return the logarithm of the size of the errors, by which points of different weights are compared.
+
+        It is that of the product of the variances, or, ``full``, of the determinant of the covariance, which
+        `reweighted` lowers.
+        """
+        return -float(np.linalg.slogdet(self.reweighted(x, full).weight)[1])
 
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""

@@ -251,37 +251,48 @@ def _block_rows(plan: Plan) -> list[int | None]:
 
 def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, weighting: str, iterations: int
               ) -> tuple[StateError, Descent, dict[str, Any]]:
-    """Descend from every start, then weight the errors anew until the weights stay; the best end wins."""
+    """Descend from every start, then weight the errors anew until the weights stay; the best end wins.
+
+    With the determinant every start is weighted by its own errors from the first step on: weights from the outputs
+    lead a third of short records to a zero of the noise on the unit circle, from where no step leads back.
+    """
     if error.unknowns.l == 1:
         weighting = "scale"  # one output has nothing to be weighed against
     elif weighting == "auto":
         weighting = "determinant" if criterion == "prediction" else "variance"
-    found = best_of(error, starts.items(), iterations)
-    levels = [error.level(one.x) if weighting != "scale" else one.value for one in found]
-    order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
-    ends = []
-    for i in order[:FINALISTS]:
-        end = _weighted(error, found[i], weighting, iterations)
-        ends.append((end[0].level(end[1].x) if weighting != "scale" else end[1].value, *end))
+    if weighting == "determinant":
+        weighted = [_weighted(error, name, x, weighting, iterations) for name, x in starts.items()]
+        found = [one for _, one in weighted]
+        values = np.array([error.value(one.x) for one in found])
+    else:
+        found = best_of(error, starts.items(), iterations)
+        values = np.array([one.value for one in found])
+        levels = [error.level(one.x) if weighting != "scale" else one.value for one in found]
+        order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
+        weighted = [_weighted(error, found[i].start, found[i].x, weighting, iterations, found[i].steps)
+                    for i in order[:FINALISTS]]
+    full = weighting == "determinant"
+    ends = [(own.level(one.x, full) if weighting != "scale" else one.value, own, one) for own, one in weighted]
     _, final, best = min(ends, key=lambda end: (end[2].border, end[0]))
-    values = np.array([one.value for one in found])
     reach = (1 + AGREE) * values.min() + 1e-14 * error.energy
-    agreed = [one.start for one in found if one.value <= reach]
+    agreed = [one.start for one, value in zip(found, values) if value <= reach]
     figures = {"starts": f"{len(agreed)} of {len(found)} starts arrive at the smallest error ({', '.join(agreed)})",
                "starts that agree": len(agreed), "errors of the starts": np.sort(values)[::-1]}
     return final, best, figures
 
 
-def _weighted(error: StateError, one: Descent, weighting: str, iterations: int) -> tuple[StateError, Descent]:
-    steps = one.steps
+def _weighted(error: StateError, start: str, x: Array, weighting: str, iterations: int, steps: int = 0
+              ) -> tuple[StateError, Descent]:
+    """Descend, the errors weighted by their own (co)variance until it stays; steps taken before are counted."""
     if weighting == "scale":
-        return error, descend(error, one.x, iterations=iterations, start=one.start)
+        one = descend(error, x, iterations=iterations, start=start)
+        return error, one
     for _ in range(ROUNDS):
-        new = error.reweighted(one.x, full=weighting == "determinant")
+        new = error.reweighted(x, full=weighting == "determinant")
         change = np.linalg.norm(new.weight - error.weight) / np.linalg.norm(new.weight)
-        error, start = new, one.start
-        one = descend(error, one.x, iterations=iterations, start=start)
-        steps += one.steps
+        error = new
+        one = descend(error, x, iterations=iterations, start=start)
+        x, steps = one.x, steps + one.steps
         if change < SAME_WEIGHT:
             break
     return error, replace(one, steps=steps)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.optimize
+from state_systems import by_hand
 from state_systems import linear as linear_system
 
 import optid
@@ -18,6 +19,7 @@ from optid.bases import Linear, Polynomial, Triangular, UserFunctions
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.models import HammersteinSS, Nonlinearity
+from optid.models.kalman import kalman_gain
 from optid.regressors.state_sensitivities import StateUnknowns, linearise_states
 from optid.subspace.expansion import expand
 
@@ -306,6 +308,24 @@ def test_a_start_of_the_user_is_taken():
     model, data = system(noise=0.05)
     fit = optid.fit(data, linear, nx=2, initial=model, block_rows=5)
     assert "start 1" in fit.figures["starts"]
+
+
+@pytest.mark.parametrize("seed", [3, 6, 11])
+def test_outputs_of_different_noise_do_not_lead_to_the_border(seed):
+    """Weights from the outputs instead of the errors ended at a zero of the noise on the unit circle, far off."""
+    A, B = np.array([[0.88, 0.22, 0.0], [-0.22, 0.88, 0.0], [0.0, 0.0, 0.6]]), [[0.6, 0.2], [-0.3, 0.5], [0.4, 0.3]]
+    C, R = np.array([[-1.2, 1.2, 0.3], [0.05, -0.1, 0.4]]), np.diag([0.05, 0.06]) ** 2
+    steady = kalman_gain(A, C, 0.03**2 * np.eye(3), R)
+    plant = HammersteinSS(A, B, C, D=0.1 * np.eye(2), K=steady.K)
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1, 1, (40, 2)), 5, axis=0)
+    e = rng.normal(size=(200, 2)) @ np.linalg.cholesky(steady.innovation).T
+    data = Data(u, by_hand(plant, u, np.zeros(3), noise=e))
+    fit = optid.fit(data, "ss.exact", nx=3, criterion="prediction", block_rows=8)
+    assert fit.solution.status.value == "locally optimal"
+    # the model is at least as likely as the plant
+    errors = data.y - plant.predict(data, x0="fit")
+    assert np.linalg.det(fit.model.noise.innovation) < np.linalg.det(errors.T @ errors / 200)
 
 
 def test_order_is_found_from_the_gap():
