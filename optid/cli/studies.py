@@ -21,7 +21,7 @@ STOPPED = 130  # exit code after Ctrl-C, by convention of shells
 
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", "-w", metavar="N", help="Processes that run cells; one per core if not given."),
+    typer.Option("--workers", "-w", metavar="N", min=1, help="Processes that run cells; one per core if not given."),
 ]
 Scheduler = Annotated[
     str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:8786.")

@@ -1,0 +1,256 @@
+"""optid study and optid compare, as a user runs them."""
+
+import csv as comma
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from optid.cli.app import app
+from optid.errors import StudyError
+from optid.examples import example
+from optid.studies.comparison import compare
+from optid.studies.database import read_rows
+from optid.studies.rows import complete
+
+SOLVERS = '["clarabel", "gauss_newton", "auto"]'
+STUDY = """
+name = "rigs"
+solvers = {solvers}
+seeds = 2
+time_limit = 30.0
+
+[[data]]
+system = "thruster"
+samples = 120
+
+[[data]]
+file = "rig.csv"
+inputs = "current"
+outputs = "thrust"
+dt = 0.1
+
+[[formulation]]
+name = "exact"
+formulation = "hammerstein_arx.exact"
+na = 2
+nb = 1
+basis = "triangular:5"
+
+[[formulation]]
+formulation = "arx"
+na = 2
+nb = 1
+"""
+
+
+def run(*words: object):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def write_rig(path: Path, seed: int = 0) -> Path:
+    data = example("thruster", seed=seed, n=200).data
+    rows = "\n".join(f"{u!r},{y!r}" for u, y in zip(data.u[:, 0].tolist(), data.y[:, 0].tolist()))
+    path.write_text("current,thrust\n" + rows + "\n")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with a study and its data."""
+    write_rig(tmp_path / "rig.csv")
+    (tmp_path / "rigs.toml").write_text(STUDY.format(solvers=SOLVERS))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# -- run, resume, report, export ---------------------------------------------------------------------------------------
+
+
+def test_a_study_from_run_to_page(folder):
+    plan = run("study", "run", "rigs.toml", "--dry-run")
+    assert plan.exit_code == 0 and "18 cells, 18 of them to run" in plan.stdout and not Path("rigs.duckdb").exists()
+
+    first = run("study", "run", "rigs.toml", "-w", 1, "--export", "rows.csv")
+    assert first.exit_code == 0, first.stderr
+    assert first.stdout.startswith("18 cells to run\n") and "18 rows written to rows.csv" in first.stdout
+    assert "optid study report rigs.duckdb -o rigs.html" in first.stdout
+    rows = read_rows("rigs.duckdb")
+    pairs = set(zip(rows["formulation"], rows["solver"], rows["outcome"], rows["status_verified"]))
+    assert pairs == {("exact", "gauss_newton", "done", "optimal"), ("exact", "auto", "done", "optimal"),
+                     ("arx", "clarabel", "done", "optimal"), ("arx", "auto", "done", "optimal"),
+                     ("exact", "clarabel", "refused", ""), ("arx", "gauss_newton", "refused", "")}
+    table = {words[0]: words[1:] for words in map(str.split, first.stdout.splitlines()) if len(words) == 7}
+    assert table["auto"][:3] == ["6", "6", "6"] and table["clarabel"] == ["6", "3", "3", "-", "3", "-"]
+    with open("rows.csv", newline="") as file:
+        assert len(list(comma.DictReader(file))) == 18
+
+    started = sorted(rows["started"])
+    again = run("study", "run", "rigs.toml")
+    assert again.stdout.startswith("18 of 18 cells are in rigs.duckdb already; nothing is left to run")
+    assert sorted(read_rows("rigs.duckdb")["started"]) == started  # nothing was computed again
+
+    Path("rigs.toml").write_text(STUDY.format(solvers='["clarabel", "gauss_newton", "auto", "osqp"]'))
+    more = run("study", "run", "rigs.toml", "-w", 1)
+    assert more.stdout.startswith("18 of 24 cells are in rigs.duckdb already; 6 to run")
+
+    told = run("study", "report", "rigs.duckdb", "-o", "page.html")
+    assert told.exit_code == 0 and "report written to page.html" in told.stdout
+    assert "auto" in told.stdout and Path("page.html").stat().st_size > 20_000
+    assert run("study", "export", "rigs.duckdb", "rows.parquet").stdout == "24 rows written to rows.parquet\n"
+
+
+def test_data_that_changed_are_refused_until_accepted(folder):
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
+    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
+    before = read_rows("rigs.duckdb")
+    write_rig(folder / "rig.csv", seed=1)
+    refused = run("study", "run", "rigs.toml", "-w", 1)
+    assert refused.exit_code == 2 and "rig.csv" in refused.stderr and "--accept-changed-data" in refused.stderr
+    assert len(read_rows("rigs.duckdb")["key"]) == len(before["key"]) == 6
+    accepted = run("study", "run", "rigs.toml", "-w", 1, "--accept-changed-data")
+    assert accepted.exit_code == 0 and "4 of 6 cells are in rigs.duckdb already; 2 to run" in accepted.stdout
+    after = read_rows("rigs.duckdb")
+    assert len(after["key"]) == 6 and len(set(after["key"]) & set(before["key"])) == 4
+    assert run("study", "run", "rigs.toml").exit_code == 0  # and is now what the database knows
+
+
+def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
+    from optid.studies import running
+
+    def interrupted(study, db, *, progress, **settings):
+        progress(0, 18, None)
+        progress(1, 18, {"formulation": "exact", "solver": "auto", "status_verified": None, "outcome": "crashed"})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(running, "run", interrupted)
+    found = run("study", "run", "rigs.toml")
+    assert found.exit_code == 130
+    assert "stopped: 1 of 18 cells are in rigs.duckdb; the same command goes on from there" in found.stdout
+
+
+def test_the_built_in_study_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = run("study", "run", "--example", "--dry-run")
+    assert found.exit_code == 0 and "80 cells, 80 of them to run" in found.stdout
+
+
+def test_systems_are_listed():
+    from optid.studies.systems import SYSTEMS
+
+    found = run("study", "systems")
+    assert found.exit_code == 0 and all(name in found.stdout for name in SYSTEMS)
+
+
+# -- compare -----------------------------------------------------------------------------------------------------------
+
+
+def test_compare_says_which_solver_to_use(folder):
+    words = ("compare", "rig.csv", "--inputs", "current", "--outputs", "thrust", "--na", 2, "--nb", 1, "--basis",
+             "triangular:5", "--solvers", "gauss_newton", "ipopt", "clarabel", "--repetitions", 2)
+    found = run(*words, "-o", "page.html", "--db", "kept.duckdb")
+    assert found.exit_code == 0, found.stderr
+    lines = found.stdout.splitlines()
+    assert lines[0].startswith("6 cells to run") and Path("page.html").stat().st_size > 20_000
+    sentence = next(line for line in lines if line.startswith("Use "))
+    assert "it reached the verified accuracy of 1e-08 in" in sentence or "they reached" in sentence
+    assert "proved globally optimal" in sentence and "not for hammerstein_arx.exact: clarabel" in found.stdout
+    assert read_rows("kept.duckdb")["warm_s"].size == 6
+    again = run(*words, "--db", "kept.duckdb")
+    assert again.stdout.startswith("6 of 6 cells are in kept.duckdb already; nothing is left to run")
+
+
+def test_compare_assumes_orders_that_nobody_gives_and_says_so(folder):
+    found = run("compare", "rig.csv", "--inputs", "current", "--outputs", "thrust", "--formulation",
+                "hammerstein_arx.exact", "--solvers", "uno", "--repetitions", 1)
+    assert found.exit_code == 0 and "na = 2, nb = 2, basis = triangular:8 assumed" in found.stderr
+    assert "Use uno" in found.stdout and "no other to compare it with" in found.stdout
+    assert sorted(path.name for path in folder.iterdir()) == ["rig.csv", "rigs.toml"]  # nothing is left behind
+
+
+def test_compare_tells_an_error_of_the_record_once(folder):
+    Path("binary.csv").write_text("u,y\n" + "\n".join(f"{k // 3 % 2},{k % 7}" for k in range(60)))
+    found = run("compare", "binary.csv", "--solvers", "gauss_newton", "uno", "--repetitions", 1)
+    assert found.exit_code == 2 and found.stderr.count("is binary") == 1 and "no solver could be tried" in found.stderr
+
+
+def row(solver, **values):
+    given = {"key": solver, "repetition": 0, "place": solver, "study": "s", "data": "d", "formulation": "f",
+             "solver": solver, "formulation_name": "f", "options": "{}", "constraints": "[]", "solver_name": solver,
+             "solver_options": "{}", "accuracy": 1e-8, "holdout": 0.3, "time_limit": 60.0, "memory_limit": 2e3,
+             "outcome": "done", "status_verified": "optimal", "proved": True, "reached": True, "objective": 1.0,
+             "scale": 10.0, "violation": 1e-12, "stationarity": 1e-12, "solve_s": 0.01,
+             "started": "2026-01-01T00:00:00",
+             "machine": "m", "versions": "{}", "warm": True, "warm_s": 0.005}
+    return complete({**given, **values})
+
+
+LOCAL = {"status_verified": "locally optimal", "proved": False}
+FAILED = {"status_verified": "failed", "reached": False, "proved": False, "objective": None, "reason": "it broke"}
+
+
+@pytest.mark.parametrize("rows, words", [
+    ([row("a"), row("b", solve_s=0.03), row("c", solve_s=0.05)],
+     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; next is b with 30 ms."),
+    ([row("a"), row("b", solve_s=0.0105)], "Use a or b: they reached the verified accuracy of 1e-08 in 10 ms, equal "
+     "within 10%, proved globally optimal."),
+    ([row("a", **LOCAL), row("b", solve_s=0.03)],
+     "Use b: it reached the verified accuracy of 1e-08 in 30 ms, proved globally optimal; next is a with 10 ms "
+     "(without a proof)."),
+    ([row("a", objective=1.01, **LOCAL), row("b", solve_s=3.0)],
+     "Use b: it reached the verified accuracy of 1e-08 in 3 s, proved globally optimal; a did not."),
+    ([row("a", **FAILED), row("b", **FAILED)], "No solver reached the verified accuracy of 1e-08: failed: a and b."),
+    ([row("a")], "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; there is no "
+     "other to compare it with."),
+    ([row("a", outcome="refused", status_verified=None, reached=False, proved=False, reason="not its class")],
+     "No solver takes this formulation: choose others (optid solvers)."),
+    ([row("a", false_claim=True), row("b", solve_s=9.0)],
+     "Use b: it reached the verified accuracy of 1e-08 in 9 s, proved globally optimal; a did not."),
+])
+def test_recommendations(rows, words):
+    assert compare(rows).recommendation == words
+
+
+def test_lines_have_the_numbers_of_the_rows():
+    rows = [row("a", compile_s=0.02, repetition=k, solve_s=s, place=f"a{k}") for k, s in enumerate((0.01, 0.03, 0.02))]
+    found = compare([*rows, row("b", objective=1.5, one_step_fit=90.0), row("c", **FAILED), row("d", **FAILED)])
+    a, b = (next(line for line in found.lines if line.solver == name) for name in "ab")
+    assert a.cold == pytest.approx(0.04) and a.above == 0 and a.warm == 0.005
+    assert b.above == pytest.approx(0.5) and b.state == "worse minimum" and b.one_step == 90.0
+    assert found.reasons == {"it broke": ["c", "d"]}
+
+
+# -- what a new user gets wrong ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words, told", [
+    (("study", "run"), "give a study file, or --example"),
+    (("study", "run", "rigs.toml", "--example"), "not both"),
+    (("study", "run", "rags.toml"), "study file rags.toml cannot be read: No such file"),
+    (("study", "run", "rig.csv"), "line 1, column"),
+    (("study", "run", "rigs.toml", "--db", "no/rows.duckdb"), "there is no folder"),
+    (("study", "run", "rigs.toml", "--db", "rig.csv"), "rig.csv"),
+    (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),
+    (("study", "run", "rigs.toml", "--retry", "crshed"), "Did you mean 'crashed'"),
+    (("study", "run", "rigs.toml", "-w", 0), "0 is not in the range x>=1"),
+    (("study", "report", "none.duckdb"), "no such database"),
+    (("study", "report", "rigs.toml"), "rigs.toml"),
+    (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
+    (("compare",), "give a data file, or --example"),
+    (("compare", "none.csv"), "no file 'none.csv'"),
+    (("compare", "rig.csv"), "no column 'u'"),
+    (("compare", "rig.csv", "-u", "curent", "-y", "thrust"), "Did you mean 'current'"),
+    (("compare", "--example", "thrster"), "Did you mean 'thruster'"),
+    (("compare", "--example", "thruster", "--solvers", "clarabell"), "Did you mean 'clarabel'"),
+    (("compare", "--example", "thruster", "--accuracy", 3), "--accuracy is a number between 0 and 1"),
+    (("compare", "--example", "thruster", "--repetitions", 0), "--repetitions is a whole number from 1"),
+    (("compare", "--example", "thruster", "-f", "hammerstein_arx.exat"), "Did you mean 'hammerstein_arx.exact'"),
+    (("compare", "--example", "thruster", "--basis", "triangel:8"), "Did you mean 'triangular'"),
+    (("compare", "--example", "thruster", "-c", "monoton"), "Did you mean 'monotone'"),
+    (("compare", "--example", "thruster", "--bassis", "triangular:8"), "takes no --bassis"),
+])
+def test_what_a_new_user_gets_wrong(folder, words, told):
+    found = run(*words)
+    assert found.exit_code == 2 and not isinstance(found.exception, StudyError)
+    assert told in " ".join(found.stderr.replace("│", " ").split()), found.stderr
+    assert "Traceback" not in found.stderr and not list(folder.glob("rigs.duckdb"))
