@@ -180,8 +180,13 @@ class Data:
     @cached_property
     def missing(self) -> dict[str, float]:
         """Share of missing samples of each channel, 0 to 1."""
-        lost = sum(np.isnan(np.hstack([e.u, e.y])).sum(axis=0) for e in self.experiments)
-        return dict(zip(self.inputs + self.outputs, (np.asarray(lost) / self.n_samples).tolist()))
+        lost = np.zeros(self.m + self.l)
+        for e in self.experiments:
+            for samples, columns in ((e.u, slice(0, self.m)), (e.y, slice(self.m, None))):
+                nan = np.isnan(samples)
+                if nan.any():  # a long record without gaps is told at once
+                    lost[columns] += nan.sum(axis=0)
+        return dict(zip(self.inputs + self.outputs, (lost / self.n_samples).tolist()))
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:

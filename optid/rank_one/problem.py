@@ -70,6 +70,11 @@ class RankOne:
         """Objective at z = 0."""
         return float(self.target @ self.target) + self.remainder
 
+    @cached_property
+    def core(self) -> "Core":
+        """The reduction that keeps nothing in the core (`reduce`): start, solver and proof share it."""
+        return _reduced(self, (), False)
+
     def value(self, z: Array) -> float:
         """Objective at the lifted vector z (n,)."""
         residual = self.root @ z - self.target
@@ -215,6 +220,10 @@ def reduce(problem: RankOne, keep: tuple[int, ...] = (), keep_linear: bool = Fal
         keep: blocks that stay in the core although they have one row or one column.
         keep_linear: keep w, because constraints act on it.
     """
+    return _reduced(problem, keep, keep_linear) if keep or keep_linear else problem.core
+
+
+def _reduced(problem: RankOne, keep: tuple[int, ...], keep_linear: bool) -> Core:
     slices = block_slices(problem)
     kept = tuple(i for i, shape in enumerate(problem.blocks) if min(shape) > 1 or i in keep)
     chunks = [slices[i] for i in range(len(slices)) if i not in kept]

@@ -61,7 +61,7 @@ class Signals:
     def total(self) -> Array:
         """Return the sum over time, (size,)."""
         if not self.local:
-            return self.weights.sum(axis=0)
+            return np.ones(len(self.weights)) @ self.weights
         from optid.regressors import kernels
 
         sums = np.zeros(self.size)
