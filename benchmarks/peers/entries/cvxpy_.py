@@ -80,19 +80,19 @@ def constrained(r):
 
 
 def state_space(r, lags=10):
-    """Not convex in the states: a long vector ARX model, its Markov parameters realised by the SVD of their Hankel."""
+    """Not convex in the states: a long vector ARX model, states from the SVD of what it predicts, then regressions."""
     u, y, n = r["u"], r["y"], r["nx"]
     w, p = np.hstack([u, y]), y.shape[1]
-    rows = np.column_stack([w[lags - j : len(w) - j] for j in range(1, lags + 1)])
-    R = np.linalg.qr(np.hstack([rows, y[lags:]]), mode="r")
-    theta = cp.Variable((rows.shape[1], p))
-    size = rows.shape[1]
+    past = np.column_stack([w[lags - j : len(w) - j] for j in range(1, lags + 1)])
+    size = past.shape[1]
+    R = np.linalg.qr(np.hstack([past, y[lags:]]), mode="r")
+    theta = cp.Variable((size, p))
     cp.Problem(cp.Minimize(cp.sum_squares(R[:size, :size] @ theta - R[:size, size:]))).solve(solver=cp.CLARABEL)
-    H = theta.value.T.reshape(p, lags, w.shape[1]).transpose(1, 0, 2)
-    half = lags // 2
-    hankel = np.block([[H[i + j] for j in range(lags - half)] for i in range(half)])
-    left, values, right = np.linalg.svd(hankel)
-    obs, Q = left[:, :n] * np.sqrt(values[:n]), np.sqrt(values[:n])[:, None] * right[:n]
-    C, B, K = obs[:p], Q[:, : u.shape[1]], Q[:, u.shape[1] : w.shape[1]]
-    predictor = np.linalg.lstsq(obs[:-p], obs[p:], rcond=None)[0]
-    return {"A": predictor + K @ C, "B": B, "C": C, "D": np.zeros((p, u.shape[1])), "K": K}
+    shifts = [np.vstack([theta.value[i * w.shape[1] :], np.zeros((i * w.shape[1], p))]) for i in range(lags // 2)]
+    left, values, _ = np.linalg.svd(past @ np.hstack(shifts), full_matrices=False)
+    x, u, y = left[:, :n] * values[:n], u[lags:], y[lags:]
+    C = np.linalg.lstsq(x, y, rcond=None)[0].T
+    e = y - x @ C.T
+    ABK = np.linalg.lstsq(np.hstack([x, u, e])[:-1], x[1:], rcond=None)[0].T
+    A, B, K = np.split(ABK, [n, n + u.shape[1]], axis=1)
+    return {"A": A, "B": B, "C": C, "D": np.zeros((p, u.shape[1])), "K": K}

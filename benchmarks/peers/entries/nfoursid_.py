@@ -35,7 +35,7 @@ def powers(u, degree):
 def hammerstein(r):
     u, mean = powers(r["u"], r["degree"]), r["y"].mean(axis=0)
     centre = u.mean(axis=0)
-    model = with_gain(u - centre, r["y"] - mean, r["na"], 10)
+    model = with_gain(u - centre, r["y"] - mean, r["na"], 3)
     return model | {"offset": mean, "features": lambda v: powers(v, r["degree"]) - centre}
 
 
