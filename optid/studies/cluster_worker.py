@@ -1,6 +1,7 @@
 """What a Dask worker does for a study: keep local worker processes, one per thread, and give them cells and data."""
 
 import pickle
+import platform
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from optid.errors import ClusterError, StudyError
 from optid.studies.grid import Cell, content_hash
 from optid.studies.workers import Pool
 
@@ -49,13 +51,14 @@ def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | 
         return None
     pool = _taken(study, function)
     try:
-        (row,) = pool.run(deque([here]))
-    except BaseException:
-        pool.close()
-        raise
+        rows = list(pool.run(deque([here])))
+    except StudyError as error:
+        raise StudyError(f"on machine {platform.node()!r}: {error}") from None
     finally:
         _put_back(study, pool)
-    return row | {"file": ", ".join(cell.data_source.files) or None}
+    if not rows:
+        raise ClusterError("the study ended while this cell ran")
+    return rows[0] | {"file": ", ".join(cell.data_source.files) or None}
 
 
 def end(study: str) -> None:
@@ -75,6 +78,8 @@ def end(study: str) -> None:
 def _taken(study: str, function: bytes) -> Pool:
     with _lock:
         hands = _studies.setdefault(study, _Hands())
+        if hands.ended:
+            raise ClusterError("the study has ended")
         pool = hands.idle.pop() if hands.idle else Pool(pickle.loads(function), 1)
         hands.busy.append(pool)
         return pool

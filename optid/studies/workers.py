@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from optid.errors import StudyError
 from optid.isolated import GRACE
-from optid.studies.cell import lost_row, run_cell
+from optid.studies.cell import lost_row, prepare, run_cell
 from optid.studies.grid import Cell
 from optid.studies.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 from optid.studies.worker import RAISED, READY
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 TICK = 0.1  # seconds between looks at time and memory of the workers
 FAMILY = 1.0  # seconds between looks at the children of workers, which take a scan of all processes
 START = 300.0  # seconds a worker may take to import what it needs
-STILLBORN = 3  # workers that end before they are ready, one after another, until that is an error
+STILLBORN = 5  # workers that end before they are ready, one after another, until that is an error
 DYING = 2.0  # seconds to wait for the exit code of a worker whose connection has ended
 KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells until it is replaced
 
@@ -75,19 +75,20 @@ class Pool:
         except ImportError:
             raise StudyError("workers are watched with psutil: pip install 'optid[study]'") from None
         try:
-            self._function = pickle.dumps(function)
+            self._function = pickle.dumps((function, prepare if function is run_cell else None))
         except Exception as error:
             raise StudyError(f"workers cannot import {function!r}: {error}") from None
         self._hire = WorkerProcess
         self._size = size
         self._workers: list[WorkerProcess] = []
         self._stillborn = 0
+        self._killed = False
         self._family_at = time.monotonic()
 
     def run(self, todo: deque[Cell]) -> Iterator[Row]:
         """Run the cells and yield their rows, as `execute`."""
         rows = self._employ(todo)
-        while rows or todo or any(worker.cell is not None for worker in self._workers):
+        while not self._killed and (rows or todo or any(worker.cell is not None for worker in self._workers)):
             yield from rows
             spoke = set(wait([worker.connection for worker in self._workers], TICK))
             rows = [row for worker in list(self._workers) if worker.connection in spoke for row in self._heard(worker)]
@@ -95,7 +96,8 @@ class Pool:
             rows += self._employ(todo)  # before rows are handed out: no worker waits for what the caller does with them
 
     def kill(self) -> None:
-        """End all workers from another thread: their cells become rows, and `close` is left to the thread that runs."""
+        """End all workers from another thread; `run` ends with the rows there are, and `close` is still to come."""
+        self._killed = True
         for worker in list(self._workers):
             worker.kill()
 
