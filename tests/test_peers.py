@@ -183,17 +183,21 @@ def dies(r):
     os.abort()
 def sleeps(r):
     time.sleep(60)
+def turns(r):
+    while True:
+        pass
 '''
 
 
 @pytest.mark.parametrize("kind, key, word", [
     ("answers", "one_step", None), ("raises", "error", "KeyError"), ("leaves", "error", "SystemExit"),
-    ("dies", "stopped", "the process ended: signal 6"), ("sleeps", "stopped", "no answer in 2 s")])
+    ("dies", "stopped", "the process ended: signal 6"), ("sleeps", "stopped", "no answer in 2 s"),
+    ("turns", "stopped", "no answer in 2 CPU seconds")])
 def test_the_runner_survives_what_a_peer_does_and_does_not_repeat_it(kind, key, word, tmp_path):
     entry, kept = tmp_path / "entry.py", tmp_path / "kept.json"
     entry.write_text(TROUBLE)
     paths = [records.write(tmp_path, records.ROWS[0], seed) for seed in range(2)]
-    limit = 2.0 if kind == "sleeps" else 60.0
+    limit = {"sleeps": 2.0 / running.WALL, "turns": 2.0}.get(kind, 60.0)
     found = running.run(sys.executable, entry, kind, paths, kept, limit, 1e9)
     assert word is None or found[paths[0].stem][key] == word
     assert len(found) == (1 if key == "stopped" else 2)

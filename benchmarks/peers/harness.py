@@ -1,10 +1,11 @@
 """Run one entry in the interpreter of its environment: fit, time, predict. Needs numpy alone.
 
-    python harness.py ENTRY.py KIND OUT RECORD.npz [RECORD.npz ...]
+    python harness.py LIMIT ENTRY.py KIND RECORD.npz [RECORD.npz ...]
 
 One line of JSON on the standard output before each record (``{"record": ...}``) and after it; whatever the package
 prints goes to the standard error. The time is CPU time of this process and its children in the entry's function alone;
 the first fit of a process is done twice and the second counts, unless it takes more than `WARM` seconds.
+A fit that takes more than LIMIT CPU seconds ends the process (SIGXCPU).
 """
 
 import importlib.util
@@ -28,6 +29,13 @@ def cpu_seconds() -> float:
     """CPU seconds of this process and of children that have ended."""
     return sum(use.ru_utime + use.ru_stime
                for use in (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)))
+
+
+def patience(limit: float) -> None:
+    """End the process when it has taken so many CPU seconds from now on; what runs in children is not counted."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime + limit) + 1, hard))
 
 
 def load(path: str):
@@ -73,14 +81,16 @@ def _said(caught: list, printed: io.StringIO) -> str:
 
 
 def main() -> None:
-    entry, kind, *paths = sys.argv[1:]
+    limit, entry, kind, *paths = sys.argv[1:]
     channel = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     fitter = getattr(load(entry), kind)
     for i, path in enumerate(paths):
         channel.write(json.dumps({"record": Path(path).stem}) + "\n")
         started = cpu_seconds()
+        patience(float(limit))
         found = measured(fitter, path)
+        patience(float(limit))
         if i == 0 and cpu_seconds() - started < WARM:
             found = measured(fitter, path)
         channel.write(json.dumps(found) + "\n")

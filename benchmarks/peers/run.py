@@ -5,7 +5,7 @@
 Every peer has a file in ``entries`` with the code that a competent user of the package would write, and an environment
 of its own (``python -m venv`` and pip, kept in ``--environments``). The records are simulated once and are the same for
 all; every peer is told the same orders, delay and basis, and uses the settings that did best. Fits are scored by
-`judging` on samples that none has seen. A fit that takes more than ``--limit`` wall seconds is stopped; a peer that has
+`judging` on samples that none has seen. A fit that takes more than ``--limit`` CPU seconds is stopped; a peer that has
 used up ``--budget`` wall seconds in a row does no further seeds, and the table says how many it did. What is done
 is kept in ``--results`` and not done again, unless the entry, the records, the judging or optid changed.
 
@@ -147,7 +147,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--rows", nargs="*", choices=[row.name for row in ROWS], default=[row.name for row in ROWS])
     parser.add_argument("--environments", type=Path, default=CACHE / "environments")
     parser.add_argument("--results", type=Path, default=CACHE / "results")
-    parser.add_argument("--limit", type=float, default=300.0, help="wall seconds for a fit")
+    parser.add_argument("--limit", type=float, default=120.0, help="CPU seconds for a fit")
     parser.add_argument("--budget", type=float, default=120.0, help="wall seconds for a peer in a row")
     parser.add_argument("--no-bad", action="store_true", help="leave out the bad records")
     parser.add_argument("--write", action="store_true", help="write README.md beside this file")

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import selectors
+import signal
 import subprocess
 import time
 from collections.abc import Sequence
@@ -12,6 +13,9 @@ from pathlib import Path
 HERE = Path(__file__).parent
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1",
                "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1", "MPLBACKEND": "Agg"}
+
+WALL = 10.0
+"""Wall seconds per CPU second of the limit: a backstop, for machines that are busy and for fits that wait."""
 
 
 def digest(entry: Path, also: Sequence[Path] = ()) -> str:
@@ -30,7 +34,8 @@ def run(python: str, entry: Path, kind: str, paths: Sequence[Path], kept: Path, 
         kind: the function in it.
         paths: the records.
         kept: JSON file of results so far; written after every record.
-        limit: wall seconds after which a fit is stopped; records after it are not tried.
+        limit: CPU seconds after which a fit is stopped, or `WALL` times as many wall seconds; records after it are not
+            tried.
         budget: wall seconds after which no further record is begun.
     """
     found: dict[str, dict] = json.loads(kept.read_text()) if kept.exists() else {}
@@ -52,11 +57,11 @@ def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: 
     noise = kept.with_suffix(".stderr.txt")
     with noise.open("wb") as stderr:
         process = subprocess.Popen(
-            [python, str(HERE / "harness.py"), str(entry), kind, *map(str, paths)], stdout=subprocess.PIPE,
+            [python, str(HERE / "harness.py"), str(limit), str(entry), kind, *map(str, paths)], stdout=subprocess.PIPE,
             stderr=stderr, bufsize=0, env=os.environ | ENVIRONMENT)
         name, began = "", time.monotonic()
         try:
-            while (line := _line(process, limit)) is not None:
+            while (line := _line(process, WALL * limit)) is not None:
                 if not line:
                     break
                 told = json.loads(line)
@@ -69,11 +74,13 @@ def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: 
                 if time.monotonic() > until:
                     return
             if line is None:
-                found[name or paths[0].stem] = {"stopped": f"no answer in {limit:.0f} s", "wall": limit}
+                found[name or paths[0].stem] = {"stopped": f"no answer in {WALL * limit:.0f} s", "wall": WALL * limit}
             elif name or process.wait() != 0:
                 code = process.wait()
-                ended = f"signal {-code}" if code < 0 else f"exit code {code}"
-                found[name or paths[0].stem] = {"stopped": f"the process ended: {ended}", "wall": 0.0,
+                ended = f"the process ended: signal {-code}" if code < 0 else f"the process ended: exit code {code}"
+                if code == -signal.SIGXCPU:
+                    ended = f"no answer in {limit:.0f} CPU seconds"
+                found[name or paths[0].stem] = {"stopped": ended, "wall": time.monotonic() - began,
                                                 "message": noise.read_text(errors="replace")[-400:]}
             kept.write_text(json.dumps(found, indent=1))
         finally:
