@@ -232,7 +232,7 @@ def test_lines_have_the_numbers_of_the_rows():
     (("study", "run", "rigs.toml", "--db", "rig.csv"), "rig.csv"),
     (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),
     (("study", "run", "rigs.toml", "--retry", "crshed"), "Did you mean 'crashed'"),
-    (("study", "run", "rigs.toml", "-w", 0), "0 is not in the range x>=1"),
+    (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
     (("study", "report", "none.duckdb"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),
     (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
