@@ -177,7 +177,7 @@ def test_a_function_without_a_name_is_refused():
 
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
     monkeypatch.setattr("optid.studies.worker_process.PROGRAM", "import no_such_module_{parent}  # {path} {descriptor}")
-    with pytest.raises(StudyError, match="3 workers, one after another, .*exit code 1, ModuleNotFoundError"):
+    with pytest.raises(StudyError, match="5 workers, one after another, .*exit code 1, ModuleNotFoundError"):
         list(execute([cell(0)], behave))
 
 

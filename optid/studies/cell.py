@@ -88,6 +88,18 @@ def _run(cell: Cell) -> dict[str, Any]:
                      "base_mb": peak.start, "total_s": time.perf_counter() - clock})
 
 
+def prepare() -> None:
+    """Import what every fit needs and load compiled kernels, so that no cell of this process pays for it."""
+    from optid.examples import dead_zone
+    from optid.validation.predictions import one_step, simulated
+
+    data = dead_zone(n=100).data
+    for formulation, options in (("hammerstein_arx.exact", {"basis": "triangular:4"}), ("arx", {})):
+        model = fit(data, formulation, na=1, nb=1, prove=False, **options).model
+        one_step(model, data)
+        simulated(model, data)
+
+
 def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None,
              peak_mb: float | None = None) -> dict[str, Any]:
     """Return the row of a cell that made none itself.

@@ -21,13 +21,16 @@ def main(descriptor: int, parent: int) -> None:
     """Work until the parent closes the connection.
 
     Args:
-        descriptor: of one end of a pair of sockets, inherited; the function comes first, then the cells.
+        descriptor: of one end of a pair of sockets, inherited. First comes a function with what prepares for it (or
+            None), then cells.
         parent: its process id.
     """
     faulthandler.enable()  # a segmentation fault then says where
     _die_with(parent)
     connection = Connection(descriptor)
-    function = pickle.loads(connection.recv_bytes())
+    function, prepare = pickle.loads(connection.recv_bytes())
+    if prepare is not None:
+        prepare()
     connection.send((READY, os.getpid()))
     while True:
         try:

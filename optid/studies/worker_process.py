@@ -23,7 +23,8 @@ from optid.studies.memory import MB
 
 PROGRAM = "import sys; sys.path[:] = {path!r}; from optid.studies.worker import main; main({descriptor}, {parent})"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-TOLD = 4000  # bytes of a dead worker's last words that are looked at
+TOLD = 100_000  # bytes of a dead worker's last words that are looked at
+LONGEST = 300  # characters of them in a reason
 TALK = 10_000_000  # bytes of them that are kept on the disk
 
 
@@ -140,7 +141,8 @@ class WorkerProcess:
         """What it wrote last to its standard error: where Python says it crashed, or the last line."""
         self._words.seek(max(0, self._words.seek(0, os.SEEK_END) - TOLD))
         lines = [line.strip() for line in self._words.read().decode(errors="replace").splitlines() if line.strip()]
-        if any(line.startswith("Fatal Python error") for line in lines):
-            places = [line for line in lines if line.startswith("File ")]
+        fatal = [k for k, line in enumerate(lines) if line.startswith("Fatal Python error")]
+        if fatal:
+            places = [line for line in lines[fatal[-1]:] if line.startswith("File ")]
             return f"at {places[0]}" if places else ""
-        return lines[-1] if lines else ""
+        return lines[-1][-LONGEST:] if lines else ""
