@@ -41,6 +41,7 @@ def cluster():
 @pytest.fixture
 def client(cluster):
     with distributed.Client(cluster, set_as_default=False) as one:
+        one.wait_for_workers(2, timeout=180)  # the nanny replaces those that the test before killed
         yield one
 
 
@@ -117,7 +118,6 @@ def test_a_worker_killed_in_the_middle_changes_no_digit(record, cluster, client,
     there = optid.fit(stream, **STRUCTURE)
     assert flag.exists()
     np.testing.assert_array_equal(digits(there), digits(here))
-    client.wait_for_workers(2, timeout=30)  # the nanny starts another
 
 
 def test_a_partition_that_kills_every_worker_is_an_error_in_words(cluster, client, monkeypatch):
@@ -132,7 +132,6 @@ def test_a_partition_that_kills_every_worker_is_an_error_in_words(cluster, clien
     array = da.zeros((100, 2), chunks=(50, 2)).map_blocks(deadly, meta=np.zeros((1, 2)))
     with pytest.raises(ClusterError, match="1 worker died over the same task.*memory"):
         optid.open_stream(array, columns=["u", "y"], scheduler=client).ranges()
-    client.wait_for_workers(2, timeout=30)
 
 
 def test_errors_of_the_record_come_back_as_they_are(record, folders, client):

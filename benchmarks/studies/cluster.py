@@ -5,11 +5,12 @@ workers and once on a LocalCluster whose Dask workers are killed (SIGKILL) at ra
 their own. Printed: cells, rows in each database, kills, and the columns that differ in any row, times, memory and start
 aside. Goal: every cell exactly once, no difference.
 
-Statistics: a record of two experiments with missing samples is written as folders of Parquet files. The same fit is made
-from the arrays in memory, from the folders read here, and from the folders read by the workers of the cluster, of which
-one is killed while they read. Printed: the largest difference of a Gram matrix from the one in memory, relative to the
-norms of its two columns, that of the coefficients, and whether cluster and this machine agree to the last digit on the
-same parts; wall times. Goal: 1e-12. Workers share this machine: the wall time is no figure of a cluster.
+Statistics: a record of two experiments with missing samples is written as folders of Parquet files. The same fit is
+made from the arrays in memory, from the folders read here, and from the folders read by the workers of the cluster,
+of which one is killed while they read. Printed: the largest difference of a Gram matrix from the one in memory,
+relative to the norms of its two columns, that of the coefficients, and whether cluster and this machine agree to the
+last digit on the same parts; wall times. Goal: 1e-12. Workers share this machine: the wall time is no figure of a
+cluster.
 """
 
 import argparse
@@ -100,8 +101,8 @@ def compare_rows(client: Any, seeds: int, folder: Path) -> None:
     outcomes = {word: sum(row["outcome"] == word for row in here.values())
                 for word in sorted({str(row["outcome"]) for row in here.values()})}
     print(f"study       {len(here)} cells: {outcomes}")
-    print(f"rows        here {len(here)} in {between - clock:.0f} s, cluster {len(there)} in {end - between:.0f} s with "
-          f"{killer.kills} Dask workers killed; same cells: {set(here) == set(there)}")
+    print(f"rows        here {len(here)} in {between - clock:.0f} s, cluster {len(there)} in {end - between:.0f} s "
+          f"with {killer.kills} Dask workers killed; same cells: {set(here) == set(there)}")
     columns: dict[str, int] = {}
     for key in here:
         for name in different(here[key], there[key]):
