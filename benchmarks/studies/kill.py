@@ -9,6 +9,7 @@ of before a kill must still be the same one (nothing is computed again), and no 
 """
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
@@ -51,18 +52,20 @@ def moments(db: Path) -> dict[tuple[str, int], np.datetime64]:
     return found
 
 
-def waiting(db: Path) -> int:
-    """Rows in the journal."""
+def waiting(db: Path) -> dict[tuple[str, int], np.datetime64]:
+    """When each row of the journal was started; half a line at its end is no row."""
     journal = db.with_name(db.name + ".journal")
-    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+    lines = journal.read_bytes().split(b"\n")[:-1] if journal.exists() else []
+    rows = [json.loads(line) for line in lines]
+    return {(row["key"], row["repetition"]): np.datetime64(row["started"].partition("+")[0], "us") for row in rows}
 
 
 def until_new_rows(process: subprocess.Popen, db: Path, number: int, limit: float = 300.0) -> None:
     """Wait until the process has written so many rows more."""
-    before = len(finished(db))
+    before = len(finished(db) | set(waiting(db)))
     until = time.monotonic() + limit
     while process.poll() is None and time.monotonic() < until:
-        if len(finished(db)) + waiting(db) - before >= number:
+        if len(finished(db) | set(waiting(db))) - before >= number:
             return
         time.sleep(0.02)
 
@@ -103,10 +106,11 @@ def main() -> None:
             process.wait()
             killed += alive
             now = moments(db)  # raises where the database cannot be read
-            same = all(now.get(identity) == moment for identity, moment in seen.items())
-            print(f"  {number:>4}  {len(now):>4}  {waiting(db):>3}  yes{'' if same else '  ROWS CHANGED'}"
+            kept = waiting(db) | now
+            same = all(kept.get(identity) == moment for identity, moment in seen.items())
+            print(f"  {number:>4}  {len(now):>4}  {len(waiting(db)):>3}  yes{'' if same else '  ROWS CHANGED'}"
                   f"{'' if alive else '  (it had ended)'}")
-            seen |= now
+            seen |= now | waiting(db)
             _, living = psutil.wait_procs(children, timeout=10.0)
             if living or not same:
                 raise SystemExit(f"workers that live on: {living}" if living else "rows changed")
@@ -115,7 +119,7 @@ def main() -> None:
         rest = moments(db)
         same = all(rest.get(identity) == moment for identity, moment in seen.items())
         wanted = {(cell.key, cell.repetition) for cell in cells(Study.from_toml(file))}
-        print(f"resumed to the end in {time.monotonic() - clock:.1f} s; journal left: {waiting(db)} rows")
+        print(f"resumed to the end in {time.monotonic() - clock:.1f} s; journal left: {len(waiting(db))} rows")
         print(f"{killed} kills; cells {len(wanted)}, rows {len(rest)}, every cell exactly once: {set(rest) == wanted}, "
               f"no row computed again: {same} (goal: both)")
         if set(rest) != wanted or not same:
