@@ -196,11 +196,11 @@ def turns(r):
 def test_the_runner_survives_what_a_peer_does_and_does_not_repeat_it(kind, key, word, tmp_path):
     entry, kept = tmp_path / "entry.py", tmp_path / "kept.json"
     entry.write_text(TROUBLE)
-    paths = [records.write(tmp_path, records.ROWS[0], seed) for seed in range(2)]
+    paths = [records.write(tmp_path, records.ROWS[0], seed) for seed in range(4)]
     limit = {"sleeps": 2.0 / running.WALL, "turns": 2.0}.get(kind, 60.0)
     found = running.run(sys.executable, entry, kind, paths, kept, limit, 1e9)
     assert word is None or found[paths[0].stem][key] == word
-    assert len(found) == (1 if key == "stopped" else 2)
+    assert len(found) == {"stopped": 1, "error": 3}.get(key, 4)
     assert json.loads(kept.read_text()).keys() == found.keys()
     again = running.run("no such interpreter", entry, kind, paths, kept, limit, 1e9)
     assert again == found

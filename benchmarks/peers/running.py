@@ -42,13 +42,19 @@ def run(python: str, entry: Path, kind: str, paths: Sequence[Path], kept: Path, 
     kept.parent.mkdir(parents=True, exist_ok=True)
     started = time.monotonic() - sum(one.get("wall", 0.0) for one in found.values())
     while left := [path for path in paths if path.stem not in found]:
-        if time.monotonic() - started > budget or any("stopped" in one for one in found.values()):
+        if time.monotonic() - started > budget or _hopeless(found):
             break
         before = len(found)
         _session(python, entry, kind, left, found, kept, limit, started + budget)
         if len(found) == before:
             break
     return {path.stem: found[path.stem] for path in paths if path.stem in found}
+
+
+def _hopeless(found: dict[str, dict]) -> bool:
+    """Whether a fit was stopped, or the first three all raised: then no further record is tried."""
+    return any("stopped" in one for one in found.values()) or (
+        len(found) >= 3 and all("error" in one for one in found.values()))
 
 
 def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: dict[str, dict], kept: Path,
@@ -71,7 +77,7 @@ def _session(python: str, entry: Path, kind: str, paths: Sequence[Path], found: 
                 found[name] = told | {"wall": time.monotonic() - began}
                 kept.write_text(json.dumps(found, indent=1))
                 name = ""
-                if time.monotonic() > until:
+                if time.monotonic() > until or _hopeless(found):
                     return
             if line is None:
                 found[name or paths[0].stem] = {"stopped": f"no answer in {WALL * limit:.0f} s", "wall": WALL * limit}

@@ -4,7 +4,7 @@ import numpy as np
 from fastcan.narx import NARX
 
 PACKAGES = ["fastcan==0.6.0"]
-CANNOT = {"constrained": "no constraints"}
+CANNOT = {"constrained": "bounds on coefficients alone, no gain"}
 
 
 def shifted(x, k):

@@ -12,7 +12,8 @@ def train(state, output, nx, guess, U, Y, **bounds):
     model = Model(nx, Y.shape[1], U.shape[1], state_fcn=state, output_fcn=output)
     model.init(params=guess, x0=np.zeros(nx))
     model.loss(rho_x0=0.0, rho_th=0.0)
-    model.optimization(adam_epochs=500, adam_eta=0.01, lbfgs_epochs=1000, iprint=-1, **bounds)
+    adam = 500 if len(Y) < 10_000 else 0  # as many would take minutes on a long record, and L-BFGS-B needs none there
+    model.optimization(adam_epochs=adam, adam_eta=0.01, lbfgs_epochs=1000, iprint=-1, **bounds)
     model.fit(Y, U)
     return [np.asarray(p) for p in model.params]
 

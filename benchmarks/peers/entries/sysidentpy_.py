@@ -6,7 +6,8 @@ from sysidentpy.model_structure_selection import FROLS
 from sysidentpy.parameter_estimation import LeastSquares
 
 PACKAGES = ["sysidentpy==0.9.0"]
-CANNOT = {"missing": "refuses NaN", "constrained": "no constraints", "state_space": "one output"}
+CANNOT = {"missing": "refuses NaN", "state_space": "one output",
+          "constrained": "a gain as a second objective (AILS), no monotone curve"}
 
 
 def powers(u, degree):
