@@ -39,6 +39,9 @@ EXPECTED: dict[str, dict[str, Range]] = {
     "larger_than_memory": {
         "a1": about(-1.5, 1e-3), "a2": about(0.7, 1e-3), "b1 / b0": about(0.75, 2e-3), "rows": (1_999_998, 1_999_998),
     },
+    "parts_on_a_cluster": {
+        "a1": about(-1.5, 5e-3), "a2": about(0.7, 5e-3), "rows": (380_000, 390_000), "difference": (0, 0),
+    },
     "faults_end_to_end": {
         "delay": (0, 5), "unique": (1, 1), "share lost": about(0.6, 0.05), "fit before": (60, 80),
         "fit after": (97, 100), "control gains": (2, 100),
