@@ -406,7 +406,10 @@ def test_reliability_goes_before_speed_and_the_quick_one_is_named():
     times[:4, 1] = NAN
     verdict = conclude(table_of(times))
     assert verdict.recommended == ("a",)
-    assert "b is" in verdict.headline.text and "solved only 16 of 20 problems" in verdict.headline.text
+    value = verdict.overall.choice.against["b"].value
+    assert f"The next, b, solved only 16, in {value:.3g} × the time" in verdict.headline.text
+    third = np.column_stack([times, 9 * times[:, 0]])
+    assert "b is" in (text := conclude(table_of(third)).headline.text) and "solved only 16 of 20 problems" in text
 
 
 def test_ties_are_called_ties():
@@ -523,9 +526,11 @@ def test_formulations_are_compared_by_simulation_fit_record_by_record():
     choice = verdict.quality.choice
     assert choice.kind == FIRST and choice.first == "exact"
     assert choice.against["relaxed"].value == pytest.approx(1.5, abs=0.1)
-    assert any(s.word == "Best models: exact" and "1.5 points behind" in s.text for s in verdict.statements)
+    assert verdict.headline.word == "Best models: exact"  # a single solver: the formulations are what is compared
+    assert f"the next, relaxed, stays {choice.against['relaxed'].value:.2f} points behind" in verdict.headline.text
+    assert any(s.word == "Only one solver" for s in verdict.statements)
     tie = conclude(models({"exact": 0.0, "relaxed": -0.02}))
-    assert tie.quality.choice.kind == TIE and any(s.word.startswith("Equal models") for s in tie.statements)
+    assert tie.quality.choice.kind == TIE and tie.headline.word.startswith("Equal models")
     few = conclude(models({"exact": 0.0, "relaxed": -5.0}, problems=3))
     assert few.quality.choice.kind == CANNOT_TELL
 
@@ -536,6 +541,36 @@ def test_the_model_of_the_best_verified_objective_speaks_for_a_formulation():
         rows += [run("a", p, simulation_fit=80.0), run("b", p, simulation_fit=70.0, objective=1.5),
                  run("lie", p, simulation_fit=99.0, objective=0.1, false_claim=True)]  # fmt: skip
     assert conclude(rows).quality.figures["simulation_fit"]["exact"].mean == 80.0
+
+
+def test_a_formulation_that_is_solved_less_often_is_compared_where_it_is_solved():
+    rows = models({"exact": 0.0, "linear": -9.0})
+    for row in rows:
+        if row["formulation"] == "exact" and row["seed"] < 3:
+            row |= {"status_verified": "limit"}
+    choice = conclude(rows).quality.choice
+    assert choice.kind == FIRST and choice.first == "exact" and choice.against["linear"].n == 9
+    for row in rows:
+        if row["formulation"] == "exact" and row["seed"] < 11:
+            row |= {"status_verified": "limit"}
+    assert conclude(rows).quality.choice.candidates == ("linear",)
+    assert "no other was solved on half as many" in conclude(rows).headline.text
+
+
+def test_formulations_rank_over_the_data_sets_they_were_all_tried_on():
+    rows = [run("a", seed, data=f"set {d}", formulation=f, simulation_fit=80.0 - loss + 0.01 * seed)
+            for d in range(8) for seed in range(2) for f, loss in (("x", 0), ("y", 3), ("z", 9))
+            if f != "z" or d == 0]  # fmt: skip
+    ranking = conclude(rows).quality.ranking
+    assert ranking.names == ("x", "y") and ranking.left_out == ("z",) and ranking.differ("x", "y")
+    assert any(s.word == "Other data: x leads" for s in conclude(rows).statements)
+
+
+def test_one_simulation_that_runs_away_does_not_decide():
+    rows = models({"exact": 0.0, "relaxed": -1.5})
+    next(r for r in rows if r["formulation"] == "exact")["simulation_fit"] = -1e9
+    figures = conclude(rows).quality.figures["simulation_fit"]
+    assert figures["exact"].mean == pytest.approx((11 * 80 - 100) / 12, abs=5)
 
 
 def test_an_unknown_truth_is_said():
@@ -626,6 +661,13 @@ def test_rows_come_as_dicts_columns_or_frames():
     assert str(conclude(polars.DataFrame(rows, infer_schema_length=None))) == expected
 
 
+def test_studies_of_one_database_are_kept_apart():
+    rows = table_of(times_of(1.0, 3.0, problems=4)) + [
+        {**row, "study": "other", "objective": 2.0} for row in table_of(times_of(1.0, 3.0, problems=4, seed=1))]
+    verdict = conclude(rows)
+    assert len(verdict.found.data) == 8 and verdict.found.solved.all() and verdict.overall.ranking.n == 2
+
+
 def test_a_database_is_read(tmp_path):
     pytest.importorskip("duckdb")
     from optid.studies import database
@@ -667,6 +709,7 @@ def test_a_verdict_is_frozen_and_prints():
 def test_names_are_listed_as_in_a_sentence():
     texts = [listed(list("abcdef"[:k])) for k in (0, 1, 2, 4, 6)]
     assert texts == ["", "a", "a and b", "a, b, c and d", "a, b, c and 3 more"]
+    assert listed(["free", "monotone, odd"]) == "\u201cfree\u201d and \u201cmonotone, odd\u201d"
 
 
 def test_choose_alone_has_nothing_to_choose_from_nothing():

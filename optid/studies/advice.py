@@ -6,6 +6,7 @@ from optid.showing.wording import seconds
 from optid.studies.averages import Paired
 from optid.studies.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
 from optid.studies.quality import Quality
+from optid.studies.ranks import Ranking
 from optid.studies.standings import Section, Standing
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
@@ -92,6 +93,26 @@ def evidence(section: Section) -> str:
     return f"next: {most.solver} solved {most.solved:,}{speed}" if most.solved else "nobody else solved any"
 
 
+def model_evidence(quality: Quality, name: str) -> str:
+    """Say in a few words how far the models of a formulation stay behind the best."""
+    choice = quality.choice
+    if name == choice.first:
+        return {FIRST: "best", TIE: "tied for the best"}.get(choice.kind, "best so far")
+    pair = choice.against.get(name)
+    if pair is None or not pair.n:
+        return "no record in common with the best" if choice.first else choice.missing
+    tied = "tied: " if name in choice.tied and pair.enough else ""
+    ahead = pair.value <= -0.005
+    value, low, high = (-pair.value, -pair.high, -pair.low) if ahead else (pair.value, pair.low, pair.high)
+    interval = f" ({_points(low)} to {_points(high)})" if pair.n > 1 else ""
+    return f"{tied}{_points(value)} points{interval} {'ahead where both were solved' if ahead else 'behind'}"
+
+
+def _points(value: float) -> str:
+    """Write points of fit with two decimals, zero without a sign."""
+    return f"{round(value, 2) + 0.0:.2f}"
+
+
 def _times(pair: Paired) -> str:
     return f"{pair.value:.3g} × the time ({pair.low:.3g} to {pair.high:.3g})"
 
@@ -137,7 +158,9 @@ def _runner_up(section: Section) -> str:
     if not any(s.solved for s in others):
         return f"Nobody else solved any: {listed([s.solver for s in others])}."
     most = max(others, key=lambda s: s.solved)
-    return f"The next, {most.solver}, solved only {most.solved:,}."
+    pair = choice.against.get(most.solver)
+    speed = f", in {_times(pair)} where both work" if pair is not None and pair.enough else ""
+    return f"The next, {most.solver}, solved only {most.solved:,}{speed}."
 
 
 def _quicker(section: Section) -> str:
@@ -151,6 +174,9 @@ def _quicker(section: Section) -> str:
     if not fast:
         return ""
     value, name = min(fast)
+    others = [solved for solver, solved in choice.solved.items() if solver != choice.first]
+    if len(choice.candidates) == 1 and choice.solved[name] == max(others):
+        return ""  # named already
     return f" {name} is {1 / value:.3g} times faster where both work, but solved only {of(choice.solved[name], n)}."
 
 
@@ -160,25 +186,30 @@ def _claims(section: Section, names: tuple[str, ...]) -> str:
                    for name, k in false)  # fmt: skip
 
 
-def carries_over(section: Section) -> Statement:
-    """Say whether the order of the solvers carries over to other data sets; needs a problem that some solver solved."""
-    ranking = section.ranking
+def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
+    """Say whether an order carries over to other data sets.
+
+    Args:
+        ranking: of solvers by time, or of formulations by simulation fit.
+        noun: what is ranked.
+    """
     if not ranking.told:
         text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
         return Statement(FAIR, "Other data: cannot tell", text, "data sets")
     p = "below 0.001" if ranking.probability < 0.001 else f"{ranking.probability:.2g}"
     evidence = f"{ranking.test}, {ranking.n} data sets, probability {p}"
     if ranking.probability >= ranking.level:
-        text = f"Over the data sets no solver ranks differently from another ({evidence})."
+        text = f"Over the data sets no {noun} ranks differently from another ({evidence})."
         return Statement(FAIR, "Other data: no difference", text, "data sets")
     best = ranking.names[0]
     same = [name for name in ranking.names[1:] if not ranking.differ(best, name)]
     text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} ({evidence})"
     if len(same) == len(ranking.names) - 1:
-        text += "; the ranks differ as a whole, but no other solver is behind it for certain."
+        text += f"; the ranks differ as a whole, but no other {noun} is behind it for certain."
         return Statement(FAIR, "Other data: a tie", text, "data sets")
     text += f"; {listed(same)} cannot be told apart from it." if same else "; every other ranks behind it for certain."
-    return Statement(GOOD, "Other data: the order holds", text, "data sets")
+    word = f"Other data: {listed([best, *same])} {'lead' if same else 'leads'}"
+    return Statement(GOOD, word, text, "data sets")
 
 
 def choice_of_formulation(quality: Quality) -> Statement | None:
@@ -197,27 +228,35 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
         text = f"The comparison {choice.missing}. So far {lead}."
         return Statement(FAIR, "Models: cannot tell yet", text, "formulation")
     if choice.kind == TIE:
-        each = "; ".join(f"{name} differs by {-choice.against[name].value:+.2g} points "
-                         f"(95 %: {-choice.against[name].high:+.2g} to {-choice.against[name].low:+.2g})"
-                         for name in choice.tied[:3])  # fmt: skip
+        pairs = [(name, choice.against[name]) for name in choice.tied[:3]]
+        each = "; ".join(f"{name} stays {_points(pair.value)} points behind (95 %: {_points(pair.low)} to "
+                         f"{_points(pair.high)}, {pair.n:,} records)" for name, pair in pairs)  # fmt: skip
         text = f"{lead}. No difference beyond chance or 0.1 points: {each}."
         return Statement(GOOD, f"Equal models: {listed((choice.first, *choice.tied))}", text, "formulation")
     rivals = [name for name in choice.candidates if name != choice.first]
     if rivals:
         name = min(rivals, key=lambda rival: choice.against[rival].value)
         pair = choice.against[name]
-        text = (f"{lead}; the next, {name}, stays {pair.value:.2g} points behind on {pair.n:,} records "
-                f"(95 %: {pair.low:.2g} to {pair.high:.2g}).")  # fmt: skip
+        text = (f"{lead}; the next, {name}, stays {_points(pair.value)} points behind on {pair.n:,} records "
+                f"(95 %: {_points(pair.low)} to {_points(pair.high)}).")  # fmt: skip
     else:
         text = f"{lead}; no other was solved on half as many records."
         return Statement(FAIR, "Models: cannot tell", text, "formulation")
     return Statement(GOOD, f"Best models: {choice.first}", text, "formulation")
 
 
-def headline(overall: Section, sections: list[Section]) -> Statement:
-    """Say the verdict in one line: one solver for everything, or that it depends on the formulation."""
+def headline(overall: Section, sections: list[Section], quality: Quality) -> Statement:
+    """Say the verdict in one line: one solver for everything, or that it depends on the formulation.
+
+    Args:
+        overall: all problems.
+        sections: those of every formulation.
+        quality: the formulations by their models, which is what a study of a single solver is about.
+    """
     choice, n = overall.choice, len(overall.found.data)
-    if len(sections) < 2 or len(overall.standings) < 2:
+    if len(overall.standings) == 1:
+        return choice_of_formulation(quality) or choice_of_solver(overall)
+    if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)
     if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n:
         return choice_of_solver(overall)

@@ -38,7 +38,8 @@ class Choice:
 
 
 def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
-           compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0, slack: float = RELIABLE) -> Choice:
+           compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0, slack: float = RELIABLE,
+           noun: str = "problem") -> Choice:
     """Choose the least costly of the most reliable.
 
     Args:
@@ -47,6 +48,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         minor: a mean comparison closer to ``none`` than this is of no practical meaning.
         compare: one column of costs against another, such as `paired_ratio`.
         none: the comparison of equals (1 for ratios, 0 for differences).
+        noun: what a row of the costs is called.
         slack: share of the problems by which the number solved may stay behind the most reliable.
 
     Returns:
@@ -61,7 +63,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     candidates = tuple(names[s] for s in reliable)
     common = np.isfinite(costs[:, reliable]).all(axis=1)
     if not common.any():
-        missing = f"needs a problem that {listed(candidates)} all solve"
+        missing = f"needs a {noun} that {listed(candidates)} all solve"
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
     means = [_mean(costs[common, s], compare) for s in reliable]
     lead = int(reliable[int(np.argmin(means))])
@@ -72,11 +74,11 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         kind = ONLY_ONE
     elif problems < MINIMUM_PAIRS:
         kind = CANNOT_TELL
-        missing = f"needs at least {MINIMUM_PAIRS} problems; there {'is' if problems == 1 else 'are'} {problems}"
+        missing = f"needs at least {MINIMUM_PAIRS} {noun}s; there {'is' if problems == 1 else 'are'} {problems}"
     elif any(not against[name].enough for name in tied):
         kind = CANNOT_TELL
         few = next(name for name in tied if not against[name].enough)
-        missing = (f"needs at least {MINIMUM_PAIRS} problems that both {names[lead]} and {few} solve; "
+        missing = (f"needs at least {MINIMUM_PAIRS} {noun}s that both {names[lead]} and {few} solve; "
                    f"there {'is' if against[few].n == 1 else 'are'} {against[few].n}")  # fmt: skip
     return Choice(kind, names[lead], tied, candidates, against, solved, problems, missing)
 
@@ -93,7 +95,9 @@ def _apart(pair: Paired, minor: float, none: float) -> bool:
 
 
 def listed(names: tuple[str, ...] | list[str], most: int = 4) -> str:
-    """Write names as "a, b and c"; of many the first ones and how many more."""
+    """Write names as "a, b and c", in quotes where a name has a comma; of many the first ones and how many more."""
+    if any("," in name or " and " in name for name in names):
+        names = [f"\u201c{name}\u201d" for name in names]
     if len(names) > most:
         return ", ".join(names[: most - 1]) + f" and {len(names) - most + 1} more"
     return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))

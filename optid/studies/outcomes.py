@@ -24,7 +24,8 @@ MEANINGS = {
     FALSE_CLAIM: "success or infeasibility was claimed, and our residuals took it back",
     CONTRADICTED: "infeasible or unbounded, it said; another solver has a verified point",
     LESS_ACCURATE: "verified to a looser accuracy of its own, not to the one compared at",
-    WORSE_MINIMUM: "a verified local minimum, above the best one that another solver verified",
+    WORSE_MINIMUM: "a verified minimum above the best one that another solver verified; of a procedure the minimum of "
+                   "its last programme, which depends on the steps before it",
     NOT_RUN: "no run in the database",
 }
 """What the words of the failure table mean beyond the outcomes and statuses of a row."""

@@ -13,7 +13,8 @@ from markupsafe import Markup
 from optid import __version__
 from optid.showing.page import template, versions
 from optid.showing.wording import Table, number, seconds
-from optid.studies.advice import Statement, choice_of_solver, evidence, of
+from optid.studies.advice import Statement, choice_of_solver, evidence, model_evidence
+from optid.studies.choice import CANNOT_TELL
 from optid.studies.outcomes import MEANINGS, TIMES
 from optid.studies.payload import page_payload
 from optid.studies.quality import FIGURES, Quality
@@ -22,6 +23,7 @@ from optid.studies.verdict import Verdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
+FOLDED = 8  # formulations above which their list is folded away
 LISTED = 40  # false claims on the page; the database has them all
 WIDEST = 120  # characters of a text in a table
 
@@ -73,6 +75,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "sentence": head.text,
         "cards": _cards(verdict),
         "picks": _picks(verdict) if several else None,
+        "folded": len(verdict.sections) > FOLDED,
         "statements": verdict.statements,
         "claims": _claims(verdict),
         "quality": _quality_table(verdict.quality) if verdict.quality.records else None,
@@ -88,7 +91,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "script": Markup(script),
         "digest": digest,
         "payload": embedded(page_payload(verdict)),
-        "several": several,
+        "single": len(verdict.overall.standings) < 2,
         "sections": [("verdict", "Verdict"), ("solvers", "Solvers"), ("figures", "Figures"), ("failures", "Failures"),
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
     }  # fmt: skip
@@ -130,16 +133,25 @@ def _cards(verdict: Verdict) -> list[dict[str, str]]:
 
 
 def _picks(verdict: Verdict) -> list[dict[str, Any]]:
-    """One line per formulation: who to use there, and why."""
-    lines = []
+    """One line per formulation: who to use there, and why; of a single solver how good the models are, and why."""
+    lines, single = [], len(verdict.overall.standings) < 2
     for section in verdict.sections:
         said: Statement = choice_of_solver(section)
         first = section.choice.first
         lead = section.standing(first) if first else None
+        if single:
+            mean = verdict.quality.figures["simulation_fit"][section.name].mean
+            word = f"{mean:.2f} %" if np.isfinite(mean) else "no fit"
+            best = section.name in (verdict.quality.choice.first, *verdict.quality.choice.tied)
+            tone, why = "good" if best else "fair", model_evidence(verdict.quality, section.name)
+        else:
+            so_far = first and section.choice.kind == CANNOT_TELL
+            word, tone, why = f"{first}, so far" if so_far else said.word, said.tone, evidence(section)
         lines.append({
-            "name": section.name, "tone": said.tone, "word": said.word, "text": said.text,
-            "solved": of(lead.solved, len(section.found.data)) if lead else "-",
-            "time": seconds(lead.time) if lead and np.isfinite(lead.time) else "-", "evidence": evidence(section),
+            "name": section.name, "tone": tone, "word": word,
+            "solved": f"{lead.solved:,} of {len(section.found.data):,}" if lead else "-",
+            "time": seconds(lead.time) if lead and np.isfinite(lead.time) else "-",
+            "evidence": why,
         })  # fmt: skip
     return lines
 
@@ -148,8 +160,10 @@ def _claims(verdict: Verdict) -> Table | None:
     claims = verdict.false_claims
     if not claims:
         return None
-    rows = [(_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", _short(c.reason) or "-")
-            for c in claims[:LISTED]]  # fmt: skip
+    rows = []
+    for c in claims[:LISTED]:
+        why = _short(c.reason) or "verified otherwise"
+        rows.append((_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", why))
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
     return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)
 

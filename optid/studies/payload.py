@@ -49,7 +49,9 @@ def number(value: float, digits: int = 5) -> float | None:
 
 def section_payload(section: Section) -> dict[str, Any]:
     """Return one section: standings, profiles, ranking."""
-    ranking, said = section.ranking, [choice_of_solver(section), carries_over(section)]
+    ranking, said = section.ranking, [choice_of_solver(section)]
+    if len(section.standings) > 1:
+        said.append(carries_over(ranking))
     return {
         "name": section.name,
         "said": [[s.tone, s.word, s.text] for s in said],

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.studies.averages import Paired, paired_difference
+from optid.studies.averages import paired_difference
 from optid.studies.choice import Choice, choose
-from optid.studies.outcomes import Results
+from optid.studies.outcomes import NOT_RUN, Results
 from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
 MINOR = 0.1  # points of simulation fit that nobody would see in a plot
+WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
 SLACK = 0.5  # share of the records by which a formulation may stay behind: fits compare on common records anyway
 
 
@@ -35,7 +36,7 @@ class Quality:
         formulations: labels.
         records: their number.
         solved: {formulation: records on which some solver reached the accuracy}.
-        figures: {column: {formulation: figure}}.
+        figures: {column: {formulation: figure}}; fits below `WORST` count as that.
         choice: by simulation fit on the hold-out samples.
         ranking: by the same over data sets.
         truth: whether the truth is known for some model.
@@ -50,11 +51,8 @@ class Quality:
     truth: bool
 
 
+FITS = ("simulation_fit", "one_step_fit")
 FIGURES = ("simulation_fit", "one_step_fit", "parameter_error", "nonlinearity_error")
-
-
-def _points(values: np.ndarray, reference: np.ndarray) -> Paired:
-    return paired_difference(values, reference)
 
 
 def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Quality:
@@ -73,6 +71,7 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
             best = int(np.nanargmin(np.where(found.solved[p], found.objective[p], np.nan)))
             row[case[p], names.index(found.formulation[p])] = found.row[p, best]
     values = {c: np.where(row >= 0, table[c][row] if len(table[c]) else np.nan, np.nan) for c in FIGURES}
+    values |= {c: np.maximum(values[c], WORST) for c in FITS}
     figures = {
         c: {name: Figure(_mean(v[:, f]), int(np.isfinite(v[:, f]).sum())) for f, name in enumerate(names)}
         for c, v in values.items()
@@ -80,11 +79,23 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
     data = np.array([""] * records, dtype=object)
     data[case] = [f"{s}\0{d}" for s, d in zip(found.study, found.data)]
     losses = 100.0 - values["simulation_fit"]
-    ranking = rank_over_data_sets(scores_by_data_set(ranks_of_problems(losses), data), names)
-    return Quality(
-        names, records, {name: int((row[:, f] >= 0).sum()) for f, name in enumerate(names)}, figures,
-        choose(losses, names, MINOR, _points, slack=SLACK), ranking, bool(np.isfinite(values["parameter_error"]).any()),
-    )  # fmt: skip
+    choice = choose(losses, names, MINOR, paired_difference, slack=SLACK, noun="record")
+    solved = {name: int((row[:, f] >= 0).sum()) for f, name in enumerate(names)}
+    truth = bool(np.isfinite(values["parameter_error"]).any())
+    return Quality(names, records, solved, figures, choice, _ranking(found, losses, data, names), truth)
+
+
+def _ranking(found: Results, losses: np.ndarray, data: np.ndarray, names: tuple[str, ...]) -> Ranking:
+    """Rank the formulations that were tried on every data set; where one was not solved it is last."""
+    tried = np.zeros(losses.shape, dtype=bool)
+    case = found.case
+    for p, formulation in enumerate(found.formulation):
+        tried[case[p], names.index(formulation)] |= bool(np.any(found.state[p] != NOT_RUN))
+    labels = list(dict.fromkeys(data))
+    everywhere = np.array([all(tried[data == d, f].any() for d in labels) for f in range(len(names))], dtype=bool)
+    kept = tuple(name for name, there in zip(names, everywhere) if there)
+    out = tuple(name for name, there in zip(names, everywhere) if not there)
+    return rank_over_data_sets(scores_by_data_set(ranks_of_problems(losses[:, everywhere]), data), kept, out)
 
 
 def _mean(values: np.ndarray) -> float:

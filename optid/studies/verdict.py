@@ -120,7 +120,7 @@ def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", l
     formulations = sorted(set(found.formulation))
     sections = tuple(compare_solvers(found.where(found.formulation == f), f, level) for f in formulations)
     quality = compare_formulations(found, table)
-    head = headline(overall, list(sections))
+    head = headline(overall, list(sections), quality)
     return Verdict(
         table, found, at, time, overall, sections, quality, agreement_matrix(found, table), _false_claims(table, found),
         _failures(found), head, tuple(_statements(overall, sections, quality, found, table, head)),
@@ -131,9 +131,13 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
                 table: Mapping[str, np.ndarray], head: Statement) -> list[Statement]:  # fmt: skip
     if not len(found.data):
         return []
-    said = [choice_of_formulation(quality)]
-    if found.solved.any() and (len(sections) == 1 or head == choice_of_solver(overall)):
-        said.append(carries_over(overall))
+    models, solvers = choice_of_formulation(quality), choice_of_solver(overall)
+    if head == models:
+        said = [solvers, carries_over(quality.ranking, "formulation")]
+    else:
+        said = [models]
+        if found.solved.any() and len(overall.standings) > 1 and (len(sections) == 1 or head == solvers):
+            said.append(carries_over(overall.ranking))
     said += [_never(overall), _refuted(found, table), _no_truth(quality)]
     if overall.infeasible:
         noun = "problem has" if overall.infeasible == 1 else "problems have"

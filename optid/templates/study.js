@@ -43,7 +43,7 @@ function drawStandings() {
       section.first === s.solver && section.kind === "first" ? element("span", { class: "mark", title: "first choice" }, " ★") : section.kind === "tie" && (section.first === s.solver || section.tied.includes(s.solver)) ? element("span", { class: "faint", title: "tied for the first place" }, " tied") : null) },
     { name: "solved", title: "accuracy reached on", hint: "problems it was run on, and where it reached the verified accuracy", number: true, descending: true, value: (s) => s.share, node: shareBar },
     { name: "time", title: "time", hint: "shifted geometric mean on what it solved: compares only where others solved the same", number: true, value: (s) => s.time, text: (s) => duration(s.time) },
-    { name: "against", title: section.first ? `against ${section.first}` : "against", hint: "ratio of times on the problems both solved, with its 95 % interval", number: true, value: (s) => (s.against ? s.against[0] : section.first === s.solver ? 1 : null),
+    { name: "against", title: section.first ? `against ${section.first.length > 24 ? section.first.slice(0, 23) + "…" : section.first}` : "against", hint: "ratio of times on the problems both solved, with its 95 % interval", number: true, value: (s) => (s.against ? s.against[0] : section.first === s.solver ? 1 : null),
       node: (s) => !s.against ? (section.first === s.solver ? "1" : "-") : element("span", {}, times(s.against), element("span", { class: "faint" }, s.against[3] > 1 && s.against[0] !== null ? ` (${significant(s.against[1])} to ${significant(s.against[2])})` : "")) },
     { name: "fastest", title: "fastest on", hint: "problems on which nobody was faster", number: true, descending: true, value: (s) => s.fastest, text: (s) => s.fastest.toLocaleString("en") },
     { name: "penalised", title: "failures at limit", hint: "shifted geometric mean with every failure counted as the time limit", number: true, value: (s) => s.penalised, text: (s) => duration(s.penalised) },
@@ -55,7 +55,7 @@ function drawStandings() {
   const idle = section.idle.length ? `Not run on any of these problems: ${section.idle.join(", ")}.` : null;
   standings = makeGrid(byId("standings"), { label: "Standings of the solvers", columns, rows: section.standings, caption: idle });
   const word = (name) => element("b", {}, name + ". ");
-  byId("said").replaceChildren(...(DATA.sections.length > 1 || section !== DATA.sections[0] ? section.said.map(([mood, title, text]) => element("p", { class: `chosen ${mood}` }, word(title), text)) : []));
+  byId("said").replaceChildren(...(DATA.sections.length > 2 ? section.said.map(([mood, title, text]) => element("p", { class: `chosen ${mood}` }, word(title), text)) : []));
 }
 
 // ---- figures
@@ -83,7 +83,7 @@ function profileFigure() {
   });
   const far = Math.max(2, ...series.flatMap((one) => one.xs));
   const at = (one, factor) => { const k = one.xs.findLastIndex((x) => x <= factor * (1 + 1e-9)); return k < 0 ? "0 %" : `${significant(one.ys[k])} %`; };
-  figure("profile", "Performance profile", "Share of the problems solved within a factor of the fastest solver: higher and further left is better. It compares each with the fastest, not two others with each other.", series.length ? {
+  figure("profile", "Performance profile", "Share of the problems solved within a factor of the fastest solver: higher and further left is better. It compares each with the fastest, not two others with each other." + (section.standings.some((s) => s.refused) ? " A refusal counts as not solved." : ""), series.length ? {
     x: { title: "times the fastest", log: true, low: 1, high: far * 1.05 }, y: { title: "problems solved (%)", low: 0, high: 102 }, series,
     tip: (one, i) => `${one.name}\n${significant(one.ys[i])} % within ${significant(one.xs[i])} × the fastest`,
   } : null, series.length ? numbersBelow(["solver", "1 ×", "2 ×", "5 ×", "10 ×", "any"], series.map((one) => [one.name, ...[1, 2, 5, 10, Infinity].map((f) => at(one, f))])) : null);
@@ -118,7 +118,7 @@ function ranksFigure() {
   const series = drawnHere ? r.names.map((name, k) => ({ ...styled(name), kind: "interval", xs: [r.ranks[k]], ys: [names.indexOf(name)], halves: [half] })) : [];
   const caption = r.missing ? `Whether a difference carries over to other data sets cannot be told: the test ${r.missing}.`
     : `${r.test} over ${plural(r.n, "data set")}, probability ${significant(r.p, 2)}. ` + (!r.apart ? "The ranks do not differ beyond chance." : half ? `Solvers whose bars overlap cannot be told apart (critical difference ${significant(r.difference)}).` : "The two differ.");
-  figure("ranks", "Mean rank over the data sets", caption + (r.left_out.length ? ` Left out, because they did not run or solve everywhere: ${r.left_out.join(", ")}.` : ""), drawnHere ? {
+  figure("ranks", "Mean rank over the data sets", caption + (r.left_out.length ? ` Left out, because they did not run or solve everywhere: ${r.left_out.slice(0, 4).join(", ")}${r.left_out.length > 4 ? ` and ${r.left_out.length - 4} more` : ""}.` : ""), drawnHere ? {
     x: { title: "mean rank (1 is best)", low: 0.85, high: names.length + 0.15 }, y: { categories: names }, series,
     tip: (one) => `${one.name}: mean rank ${significant(one.xs[0])}`,
   } : null, drawnHere ? numbersBelow(["solver", "mean rank"], r.names.map((name, k) => [name, significant(r.ranks[k])])) : null);
@@ -179,10 +179,10 @@ function drawAgreement() {
   const at = (name) => a.solvers.indexOf(name);
   const share = (i, j) => {
     const n = a.common[i][j], m = a.compared[i][j];
-    if (i === j || !n) return element("td", { class: "faint" }, i === j ? "" : "none in common");
+    if (i === j || !n) return element("td", { class: "faint" }, i === j ? "" : element("span", { title: "no problem in common" }, "-"));
     const part = a.objective[i][j] / n, model = m ? a.model[i][j] / m : null, percent = (v) => (v === 1 ? "100 %" : `${(Math.floor(1000 * v) / 10).toFixed(1)} %`);
     const title = `${a.solvers[i]} and ${a.solvers[j]}: ${plural(n, "common problem")}; equal objectives on ${a.objective[i][j]}, largest difference ${significant(a.worst_objective[i][j], 2)}; equal models on ${a.model[i][j]} of ${m}, largest difference ${significant(a.worst_model[i][j], 2)}`;
-    const made = element("td", { title }, element("b", {}, percent(part)), element("br"), element("span", { class: "faint" }, `${n.toLocaleString("en")}; models ${model === null ? "-" : percent(model)}`));
+    const made = element("td", { title }, element("b", {}, percent(part)), element("br"), element("span", { class: "faint" }, n.toLocaleString("en") + (model === 1 ? "" : `; models ${model === null ? "-" : percent(model)}`)));
     const low = Math.min(part, model === null ? 1 : model);
     made.style.setProperty("--heat", part >= 0.99 ? (low >= 0.99 ? "var(--green)" : "var(--orange)") : "var(--red)");
     made.style.setProperty("--much", `${part >= 0.99 ? 16 : 12 + 40 * (1 - part)}%`);
@@ -191,7 +191,7 @@ function drawAgreement() {
   const head = element("tr", {}, element("th", { scope: "col" }, ""), ...order.map((name) => element("th", { scope: "col" }, name)));
   const body = order.map((one) => element("tr", {}, element("th", { scope: "row" }, one), ...order.map((other) => share(at(one), at(other)))));
   host.replaceChildren(element("div", { class: "grid heat", tabindex: "0", role: "region", "aria-label": "Agreement of pairs of solvers" }, element("table", {}, element("thead", {}, head), element("tbody", {}, ...body))),
-    element("p", { class: "lead small" }, "In bold the share with equal objectives; below it the common problems, and the share with equal models. Red: other minima or a wrong answer. Orange: the same objective from different models."));
+    element("p", { class: "lead small" }, "In bold the share with equal objectives; below it the common problems, and the share with equal models where it is not all. Red: other minima or a wrong answer. Orange: the same objective from different models."));
 }
 
 // ---- runs
