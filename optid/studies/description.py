@@ -161,17 +161,23 @@ class Study:
         return as_toml(self)
 
     def check_data(self) -> None:
-        """Read every data file once.
+        """Read every data file, and pose every formulation on a short record, unless that was done already.
 
         Raises:
-            StudyError: lists the files and columns that are not there or cannot be read.
+            StudyError: lists the files and columns that are not there or cannot be read; where all can, the
+                formulations whose arguments or constraints fit none of their data.
         """
         from optid.studies.problems import Problems
-        from optid.studies.study_file import note_unreadable
+        from optid.studies.trial import Records, note_impossible, note_unreadable
 
-        problems = Problems()
-        note_unreadable(self, problems)
+        if getattr(self, "data_checked", False):
+            return
+        problems, records = Problems(), Records(self.folder)
+        note_unreadable(self.data, records, problems)
+        if not problems:
+            note_impossible(self.data, self.formulations, records, problems)
         problems.told(f"study {self.name!r}")
+        object.__setattr__(self, "data_checked", True)
 
     def run(self, db: str | Path | None = None, **settings: Any) -> Any:
         """Run what is left of the study and return its rows.

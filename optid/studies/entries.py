@@ -81,7 +81,9 @@ def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mappin
         problems.add((), f"there is no [[{key}]]: a study needs at least one", value=False)
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
-        problems.add((key,), f"{key} is written as one or more tables [[{key}]]; {shown(entries)} is not")
+        how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
+        listed = ", or at the top solvers = \"auto\"" if key == "solver" else ""
+        problems.add((key,), f"{key} is written as {how}{listed}", value=not isinstance(entries, Mapping))
         return []
     return entries
 
@@ -166,7 +168,7 @@ def _constraint(path: Path, text: str, problems: Problems) -> None:
     try:
         named_constraint(text)
     except Exception as error:  # whatever a builder of a third party raises
-        problems.add(path, f"constraint {text!r}: {error}")
+        problems.add(path, f"{error}" if "constraint" in str(error) else f"constraint {text!r}: {error}")
 
 
 def _arguments(path: Path, name: str, function: Callable[..., Any], options: Mapping[str, Any], constrained: bool,

@@ -26,12 +26,15 @@ class Positions:
     values: dict[Path, tuple[int, int]] = field(default_factory=dict)
 
     def of(self, path: Path, value: bool = False) -> tuple[int, int]:
-        """Return the place of a key, or of its value; of the nearest thing around it where it does not stand there."""
+        """Return the place of a key, or of its value; of what is in it, or around it, where it does not stand there."""
         places = [self.values, self.keys] if value else [self.keys, self.values]
         for length in range(len(path), 0, -1):
             for found in places:
                 if path[:length] in found:
                     return found[path[:length]]
+                inside = [place for key, place in found.items() if key[:length] == path[:length]]
+                if inside:  # an array of tables has no place of its own
+                    return min(inside)
         return 1, 1
 
 

@@ -88,7 +88,9 @@ class Problems(list[Problem]):
         """Return a whole number from low, or note a problem."""
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
             return int(value)
-        self.add(path, f"{_last_word(path)} is a whole number from {low}; {shown(value)} is not")
+        whole = isinstance(value, float) and value.is_integer() and value >= low
+        self.add(path, f"{_last_word(path)} is a whole number from {low}; "
+                 + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
         return None
 
 

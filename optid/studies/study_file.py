@@ -2,14 +2,14 @@
 
 import re
 import tomllib
-import warnings
 from pathlib import Path
 
-from optid.errors import DataError, DataWarning, StudyError
-from optid.studies.description import DataEntry, Study
+from optid.errors import StudyError
+from optid.studies.description import Study
 from optid.studies.entries import read
 from optid.studies.positions import locate
 from optid.studies.problems import Problems
+from optid.studies.trial import Records, note_impossible, note_unreadable
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 
@@ -44,49 +44,15 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
         raise StudyError(f"{label} has a problem:\n  {_syntax(str(error), text)}") from None
     positions, problems = locate(text), Problems()
     found = {"name": title, **read(raw, problems)}
-    unreadable = Problems()
+    records = Records(folder)
     if "data" in raw:
-        _note_unreadable(found["data"], folder, unreadable, at={problem.path[:2] for problem in problems})
-    problems.extend(unreadable)
+        note_unreadable(found["data"], records, problems, wrong={problem.path[:2] for problem in problems})
+    if not problems:
+        note_impossible(found["data"], found["formulations"], records, problems)
     problems.told(label, positions)
-    return Study(**found, folder=folder)
-
-
-def note_unreadable(study: Study, problems: Problems) -> None:
-    """Note the data entries of a study whose files cannot be read."""
-    _note_unreadable(study.data, study.folder, problems, at=set())
-
-
-def _note_unreadable(entries: tuple[DataEntry, ...], folder: Path, problems: Problems, at: set) -> None:
-    for i, entry in enumerate(entries):
-        if ("data", i) in at:  # its keys are wrong already
-            continue
-        for number, name in enumerate(entry.files):
-            key, text = _trouble(folder / name, entry)
-            if text:
-                problems.add(("data", i, key, number) if key == "file" else ("data", i, key), text)
-                break
-
-
-def _trouble(path: Path, entry: DataEntry) -> tuple[str, str]:
-    """The key that is to blame, and why a file cannot be read; two empty texts where it can."""
-    from optid.readers import read as read_record
-    from optid.reading.columns import choose
-    from optid.reading.tables import open_table
-
-    options = dict(entry.options)
-    key = "file"
-    try:
-        table = open_table(path, options.get("columns"), options.get("delimiter", ","), options.get("decimal", "."))
-        for key, letter in (("inputs", "u"), ("outputs", "y")):
-            choose(table.names, options.get(key), letter, table.label)
-        key = "file"
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # they are told when the record is used
-            read_record(path, **options)
-    except DataError as error:
-        return key, str(error)
-    return "", ""
+    study = Study(**found, folder=folder)
+    object.__setattr__(study, "data_checked", True)
+    return study
 
 
 def _syntax(message: str, text: str) -> str:

@@ -1,0 +1,131 @@
+"""What can be found out about a study before it runs: data that cannot be read, formulations that cannot be posed."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from optid.data import Data
+from optid.errors import DataError, DataWarning, LookupFailed, StructureError
+from optid.registry import formulation as look_up
+from optid.registry import named_constraint
+from optid.studies.description import DataEntry, FormulationEntry
+from optid.studies.problems import Problems
+from optid.studies.systems import simulate, system
+
+SHORT = 300
+"""Samples on which a formulation is tried."""
+
+
+class Records:
+    """The records of data entries, each read once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read: dict[str, Data] = {}
+
+    def path(self, name: str) -> Path:
+        """Return where a file of the study is."""
+        return self._folder / name
+
+    def read(self, entry: DataEntry) -> Data:
+        """Return the whole record of an entry that is not simulated.
+
+        Raises:
+            DataError: what `optid.read` refuses.
+        """
+        from optid.readers import read
+
+        if entry.record is not None:
+            return entry.record
+        if entry.name not in self._read:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)  # they are told when the record is used
+                self._read[entry.name] = read([self.path(name) for name in entry.files], **entry.options)
+        return self._read[entry.name]
+
+    def short(self, entry: DataEntry) -> Data:
+        """Return the beginning of a record, or a short simulated one.
+
+        Raises:
+            DataError: what `optid.read` refuses.
+        """
+        if entry.system is not None:
+            return simulate(entry.system, min(SHORT, max(entry.samples or (system(entry.system).samples,))))[0]
+        whole = self.read(entry)
+        first = whole.experiments[0]
+        if first.n_samples <= SHORT:
+            return whole
+        return Data(first.u[:SHORT], first.y[:SHORT], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
+
+
+def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Problems,
+                    wrong: set[tuple[str | int, ...]] | None = None) -> None:
+    """Note the data entries whose files cannot be read.
+
+    Args:
+        entries: of the study.
+        records: where they are read.
+        problems: collects what is wrong.
+        wrong: paths of entries whose keys are known to be wrong: they are left alone.
+    """
+    for i, entry in enumerate(entries):
+        if ("data", i) not in (wrong or ()):
+            _note_trouble(("data", i), entry, records, problems)
+
+
+def _note_trouble(path: tuple[str | int, ...], entry: DataEntry, records: Records, problems: Problems) -> None:
+    """Note what is wrong with the files of one entry, at the key that is to blame."""
+    from optid.reading.columns import choose
+    from optid.reading.tables import open_table
+
+    options, key = dict(entry.options), "file"
+    for number, name in enumerate(entry.files):
+        try:
+            table = open_table(records.path(name), options.get("columns"), options.get("delimiter", ","),
+                               options.get("decimal", "."))
+            for key, letter in (("inputs", "u"), ("outputs", "y")):
+                choose(table.names, options.get(key), letter, table.label)
+            key = "file"
+        except DataError as error:
+            problems.add((*path, key, number) if key == "file" else (*path, key), str(error))
+            return
+    try:
+        if entry.files:
+            records.read(entry)
+    except DataError as error:
+        problems.add((*path, "file"), str(error))
+
+
+def note_impossible(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: Records,
+                    problems: Problems) -> None:
+    """Note the formulations whose arguments or constraints do not fit any of their data.
+
+    Each is posed on a short record; what only a longer one can tell is left to the run, where it becomes a row.
+
+    Args:
+        data: entries of the study.
+        formulations: entries of the study.
+        records: where data are read.
+        problems: collects what is wrong.
+    """
+    for i, entry in enumerate(formulations):
+        reasons = [_refused(entry, records.short(one)) for one in data if not entry.data or one.name in entry.data]
+        if reasons and all(reasons):
+            problems.add(("formulation", i), f"{entry.name!r} cannot be posed: {reasons[0]}", value=False)
+
+
+def _refused(entry: FormulationEntry, record: Data) -> str:
+    """Why a formulation does not accept its arguments on a record; empty where it does, or where that is not known."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            constraints = tuple(named_constraint(text) for text in entry.constraints)
+            more = {"constraints": constraints} if constraints else {}
+            problem = look_up(entry.formulation)[1](record, **entry.options, **more)
+            if not hasattr(problem, "view"):  # a procedure poses its first programme when it is asked for it
+                next(problem)
+    except (StructureError, LookupFailed) as error:
+        return str(error)
+    except Exception:  # a record that is too short, a defect: the run will tell
+        return ""
+    return ""
