@@ -17,7 +17,7 @@ REACH = 3.0
 """Seconds to reach the machine of a scheduler."""
 
 ANSWER = 10.0
-"""Seconds a scheduler has to answer once its machine is reached."""
+"""Seconds a scheduler has to answer once its machine is reached; one with much to do takes some."""
 
 LOOKS = 3
 """Times that versions are compared before a difference counts: source files may be edited while workers look."""
@@ -108,6 +108,7 @@ def _greets(connection: socket.socket) -> bool:
 
     A Client would wait for ever at most other servers.
     """
+    connection.settimeout(ANSWER)
     try:
         greeting = connection.recv(8, socket.MSG_WAITALL)
     except TimeoutError:

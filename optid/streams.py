@@ -17,6 +17,7 @@ from optid.reading.parts import Part
 from optid.reading.sources import Source, open_source
 from optid.reading.survey import Survey, joined, surveyed, widened
 from optid.reduction import fetched, reduced
+from optid.regressors.workers import available_threads
 
 CHUNK = 131072
 """Samples read at a time: two channels of float64 fit into the second-level cache of a common processor."""
@@ -101,7 +102,9 @@ class Stream:
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Samples of each experiment of a stream in parts; a pass is made where only that can tell."""
+        """Samples of each experiment; a pass is made where only that can tell."""
+        if not self.parts:
+            return (sum(len(u) for u, _ in self) if self.n_samples is None else self.n_samples,)
         totals = [0] * self.n_experiments
         for part in self.parts:
             if part.n_samples is None:
@@ -132,7 +135,7 @@ class Stream:
 
     @cached_property
     def _survey(self) -> Survey:
-        return self.reduced(surveyed, partial(joined, self._channels))
+        return self.reduced(surveyed, partial(joined, self._channels), available_threads(None))
 
 
 def open_stream(
@@ -174,7 +177,8 @@ def open_stream(
         scheduler: address of a Dask scheduler ("tcp://host:8786"), or an open `distributed.Client`, whose workers read
             the parts of the record: row groups of Parquet files, whole files of another kind, partitions of Dask
             collections. They must see files under the same path, and run the same versions. The result of a fit is the
-            same to the last digit on any number of workers, and on this machine when it reads the same parts.
+            same to the last digit on any number of workers, and on this machine when it reads the same parts. A fit
+            makes two passes: `persist` a Dask collection that is costly to compute.
 
     Raises:
         DataError: as `read`, here or when the chunk is reached.
@@ -194,8 +198,9 @@ def open_stream(
         with connected(scheduler):  # refused now, not at the first pass
             pass
     parts: list[Part] = []
+    read = [*ins.values(), *outs.values(), *([clock] if clock else [])]
     if scheduler is not None or len(opened) > 1 or opened[0].blocks is None:
-        parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts()]
+        parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts(read)]
         if len({part.experiment for part in parts}) < len(opened):
             raise DataError("a source of the list has no rows.")
     if clock is not None:

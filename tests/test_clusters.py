@@ -169,7 +169,7 @@ def test_a_scheduler_that_cannot_be_reached_is_said_to_be_one_quickly(tmp_path, 
     assert "not the scheduler file" in refused(tmp_path / "scheduler.json")
     (tmp_path / "scheduler.json").write_text(json.dumps({"address": f"tcp://127.0.0.1:{port}"}))
     assert "no scheduler can be reached" in refused(tmp_path / "scheduler.json")
-    monkeypatch.setattr(clusters, "REACH", 0.5)
+    monkeypatch.setattr(clusters, "ANSWER", 0.5)
     for greeting in (b"", b"SSH-2.0-OpenSSH\r\n"):
         with socket.create_server(("127.0.0.1", 0)) as server:
             thread = threading.Thread(target=greet_once, args=(server, greeting))

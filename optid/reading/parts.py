@@ -46,9 +46,9 @@ class FilePart:
     content: None = None
 
     @classmethod
-    def of(cls, paths: Sequence[Path], n_samples: int | None, read: Any, rows: str = "") -> "FilePart":
+    def of(cls, paths: Sequence[Path], n_samples: int | None, read: Any) -> "FilePart":
         """Take the fingerprints of files that are here; workers see them under their absolute paths."""
-        return cls(tuple(path.absolute() for path in paths), tuple(map(fingerprint, paths)), n_samples, read, rows)
+        return cls(tuple(path.absolute() for path in paths), tuple(map(fingerprint, paths)), n_samples, read)
 
     @property
     def label(self) -> str:
@@ -106,8 +106,8 @@ class FramePart:
 
 
 Part = FilePart | FramePart
-"""Successive samples of one experiment: `label`, `experiment`, `n_samples`, `content` (what Dask computes) and `blocks`,
-which starts a new pass over some columns."""
+"""Successive samples of one experiment: `label`, `experiment`, `n_samples`, `content` (what Dask computes) and
+`blocks`, which starts a new pass over some columns."""
 
 
 def is_dask(thing: Any) -> bool:
@@ -129,8 +129,8 @@ def _check_same(path: Path, wanted: tuple[int, str]) -> None:
         found = fingerprint(path)
     except OSError as error:
         raise DataError(
-            f"machine {machine!r} cannot read {str(path)!r} ({error.strerror}). Put the record into a folder that every "
-            "worker sees under the same path, or open it as a Dask collection.") from error
+            f"machine {machine!r} cannot read {str(path)!r} ({error.strerror}). Put the record into a folder that "
+            "every worker sees under the same path, or open it as a Dask collection.") from error
     if found != wanted:
         what = f"{found[0]} bytes, not {wanted[0]}" if found[0] != wanted[0] else "the same size, another content"
         raise DataError(f"machine {machine!r} has another {str(path)!r} than the one that was opened ({what}): it "
@@ -184,7 +184,7 @@ class _RowGroups:
 def parquet_parts(path: Path, chunk: int) -> list[FilePart]:
     """Cut a Parquet file into parts of successive row groups."""
     contents = pyarrow_parquet(path.name).read_metadata(path)
-    parts, groups, rows = [], [], 0
+    prints, parts, groups, rows = (fingerprint(path),), [], [], 0
     for group in range(contents.num_row_groups):
         groups.append(group)
         rows += contents.row_group(group).num_rows
@@ -192,6 +192,6 @@ def parquet_parts(path: Path, chunk: int) -> list[FilePart]:
             read = _RowGroups(path.absolute(), tuple(groups), chunk)
             whole = len(groups) == contents.num_row_groups
             where = "" if whole else f", row groups {groups[0]} to {groups[-1]}"
-            parts.append(FilePart.of((path,), rows, read, where))
+            parts.append(FilePart((path.absolute(),), prints, rows, read, where))
             groups, rows = [], 0
     return parts

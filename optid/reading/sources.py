@@ -26,14 +26,14 @@ class Source:
         n_samples: number of samples, None where only a pass can tell.
         blocks: function of (columns, the one of them that is the clock) that starts a new pass each time; None where
             the source exists in parts only.
-        parts: what can be read apart, in the order of time; of a source with `blocks` only on demand.
+        parts: function of the columns that will be read; returns what can be read apart, in the order of time.
     """
 
     label: str
     names: list[str]
     n_samples: int | None
     blocks: Callable[[Sequence[str], str | None], Iterator[Block]] | None
-    parts: Callable[[], Iterable[Part]]
+    parts: Callable[[Sequence[str]], Iterable[Part]]
 
 
 def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
@@ -60,7 +60,7 @@ def _of_file(path: Path, chunk: int, columns: Sequence[str] | None, delimiter: s
     kind = path.suffix.lower()
     if kind == ".parquet":
         names, rows = _parquet_footer(path)
-        return Source(path.name, names, rows, _ParquetFile(path, chunk), lambda: parquet_parts(path, chunk))
+        return Source(path.name, names, rows, _ParquetFile(path, chunk), lambda _: parquet_parts(path, chunk))
     if kind in (".csv", ".txt", ".tsv"):
         file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
         names, rows, blocks = file.names, None, _CsvBlocks(file, chunk)
@@ -71,7 +71,7 @@ def _of_file(path: Path, chunk: int, columns: Sequence[str] | None, delimiter: s
     else:
         raise DataError(f"{path.name}: streams are read from .csv, .txt, .tsv, .parquet and .npy files, and from "
                         "folders of .parquet files; use read.")
-    return Source(path.name, names, rows, blocks, lambda: [FilePart.of((path,), rows, blocks)])
+    return Source(path.name, names, rows, blocks, lambda _: [FilePart.of((path,), rows, blocks)])
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _of_npy(files: Mapping[str, NpyFile], chunk: int) -> Source:
     if len(set(lengths.values())) != 1:
         raise DataError(f"the channels have different lengths: {lengths}. Cut them to the common part.")
     rows, blocks, paths = next(iter(lengths.values())), _SeveralNpy(files, chunk), [f.path for f in files.values()]
-    return Source("the npy files", list(files), rows, blocks, lambda: [FilePart.of(paths, rows, blocks)])
+    return Source("the npy files", list(files), rows, blocks, lambda _: [FilePart.of(paths, rows, blocks)])
 
 
 def _parquet_footer(path: Path) -> tuple[list[str], int]:
@@ -153,7 +153,7 @@ def _of_folder(folder: Path, chunk: int) -> Source:
             odd = sorted(set(there) ^ set(names))
             raise DataError(f"{path.name} has other columns than {files[0].name} (differing: {', '.join(odd)}): "
                             f"the files of {folder.name!r} are not parts of one table.")
-    return Source(folder.name, names, rows, None, lambda: [p for path in files for p in parquet_parts(path, chunk)])
+    return Source(folder.name, names, rows, None, lambda _: [p for path in files for p in parquet_parts(path, chunk)])
 
 
 def _natural(path: Any) -> list[Any]:
@@ -177,10 +177,15 @@ def _stacked(arrays: Mapping[Any, Any]) -> Any:
 
 def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Source:
     if hasattr(collection, "columns"):
-        names = [str(name) for name in collection.columns]
-        return Source("the Dask data frame", names, None, None, lambda: (
-            FramePart(f"the Dask data frame, partition {i}", tuple(names), chunk, content)
-            for i, content in enumerate(collection.to_delayed())))
+        known = {str(name): name for name in collection.columns}
+
+        def partitions(wanted: Sequence[str]) -> list[Part]:
+            columns = tuple(dict.fromkeys(wanted))  # the others are not even read where Dask can help it
+            contents = collection[[known[name] for name in columns]].to_delayed()
+            return [FramePart(f"the Dask data frame, partition {i}", columns, chunk, content)
+                    for i, content in enumerate(contents)]
+
+        return Source("the Dask data frame", list(known), None, None, partitions)
     if getattr(collection, "ndim", None) not in (1, 2):
         raise DataError("a Dask data frame or array (N, channels) is needed; the array has "
                         f"{getattr(collection, 'ndim', 'no')} dimensions.")
@@ -191,6 +196,6 @@ def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Sour
         raise DataError(f"the Dask array has shape {array.shape}: more channels than samples. Transpose it (x.T).")
     array = array.rechunk({1: -1})
     lengths = [int(n) if n == n else None for n in array.chunks[0]]
-    return Source("the Dask array", names, None if rows != rows else int(rows), None, lambda: (
+    return Source("the Dask array", names, None if rows != rows else int(rows), None, lambda _: (
         FramePart(f"the Dask array, chunk {i}", tuple(names), chunk, content, n_samples=length)
         for i, (content, length) in enumerate(zip(array.to_delayed().ravel(), lengths))))

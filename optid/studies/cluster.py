@@ -134,14 +134,14 @@ class _Flight:
         cell = self._cells[future]
         try:
             answer = future.result(timeout=AGAIN)
-        except TimeoutError:
-            future.add_done_callback(self._landed.put)
-            return None
         except KilledWorker as error:
             answer = lost_row(cell, CRASHED, f"{error.allowed_failures + 1} Dask workers died while they had it")
         except (ClusterError, StudyError):
             raise
         except BaseException as error:
+            if isinstance(error, TimeoutError) and future.status != "error":
+                future.add_done_callback(self._landed.put)
+                return None
             if future.status in ("cancelled", "lost"):
                 raise ClusterError(f"the scheduler went away or gave the study up ({type(error).__name__}).") from error
             if not isinstance(error, Exception):
