@@ -1,6 +1,7 @@
 """Dask clusters of several processes: what cannot be used is refused, and fits of records in parts are the same."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -218,6 +219,26 @@ def test_workers_with_other_versions_are_refused_with_the_difference(client, mon
     monkeypatch.setattr(clusters, "_reader", other)
     with pytest.raises(ClusterError, match=r"worker tcp://.*2 of 2 workers.*clarabel: 0.1.0 here, .* there"):
         check_workers(client, ["numpy", "clarabel"])
+
+
+def test_a_real_worker_with_another_solver_is_refused(tmp_path):
+    """A worker process that finds another clarabel first, as on a machine that was not updated."""
+    info = tmp_path / "clarabel-0.0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: clarabel\nVersion: 0.0.1\n")
+    with distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty:
+        command = [sys.executable, "-m", "dask", "worker", empty.scheduler_address, "--no-nanny", "--nthreads", "1",
+                   "--dashboard-address", ":0", "--local-directory", str(tmp_path)]
+        worker = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, stderr=subprocess.DEVNULL)
+        try:
+            with distributed.Client(empty, set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=120)
+                with pytest.raises(ClusterError, match=r"worker \S+ has other packages: clarabel: \S+ here, 0.0.1"):
+                    check_workers(client, ["optid", "numpy", "clarabel"])
+                assert check_workers(client, ["optid", "numpy"])
+        finally:
+            worker.kill()
+            worker.wait()
 
 
 def test_differences_are_listed_by_package():

@@ -168,6 +168,16 @@ def test_dask_collections_are_records(record, folders):
     assert_same_fit(optid.fit(optid.open_stream(channels, dt=0.1), **STRUCTURE), wanted)
 
 
+def test_only_the_columns_of_the_channels_are_taken_of_a_frame(record):
+    e = record.experiments[0]
+    frame = dd.from_pandas(frame_of(e).assign(note="x", v=1.0), npartitions=3, sort=False)
+    stream = optid.open_stream(frame, outputs={"thrust": "y"})
+    assert all(part.names == ("u", "y", "t") for part in stream.parts)
+    (u, y), *_ = stream
+    np.testing.assert_array_equal(y, e.y[: len(y)])
+    assert stream.outputs == ("thrust",) and u.shape == y.shape
+
+
 def test_nullable_columns_and_chunks_of_unknown_length(record):
     e = record.experiments[0]
     frame = frame_of(e).astype({"u": "Float64", "y": "Float64"})
