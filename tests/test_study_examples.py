@@ -101,3 +101,13 @@ def test_the_table_in_the_documentation_says_that_nothing_is_unverified():
 
     shipped = {name for name, point in registered(FORMULATIONS).items() if point.value.startswith("formulations.")}
     assert names == shipped and all(f"`{name}" in text for name in names)
+
+
+def test_every_key_and_every_study_is_documented():
+    from optid.studies import entries
+
+    text = (FOLDER / "README.md").read_text()
+    for keys in (entries._TOP, entries._DATA, entries._FORMULATION, entries._SOLVER):
+        assert all(f"`{key}`" in text or f"[[{key}]]" in text for key in keys)
+    assert all(f"`{name}.toml`" in text for name in STUDIES)
+    assert all(f"| {count:,} |" in text for count in CELLS.values())
