@@ -122,11 +122,21 @@ def test_of_repetitions_every_one_must_count_and_the_median_time_does():
 
 
 def test_time_is_compile_and_solve_or_what_is_asked_for():
-    row = run("a", seconds=2.0, compile_s=0.5, fit_s=9.0, warm_s=0.25)
+    row = run("a", seconds=2.0, compile_s=0.5, fit_s=9.0, warm_s=0.25, warm_status="optimal")
     assert [tabulate(columns([row]), time=t).time[0, 0] for t in ("solve", "fit", "warm")] == [2.5, 9.0, 0.25]
     assert tabulate(columns([run("a", seconds=0.0)])).time[0, 0] == 1e-6
     with pytest.raises(DataError, match="time is one of solve, fit, warm"):
         tabulate(columns([row]), time="build")
+
+
+def test_a_warm_time_counts_only_where_the_warm_solve_was_verified():
+    rows = [run("a", p, seconds=1.0, warm_s=0.1, warm_status="optimal" if p < 7 else "inaccurate") for p in range(9)]
+    rows += [run("b", p, seconds=0.5, warm_s=0.2, warm_status="locally optimal") for p in range(9)]
+    assert conclude(rows).recommended == ("b",)
+    verdict = conclude(rows, time="warm")
+    assert np.isfinite(verdict.found.time).sum(axis=0).tolist() == [7, 9] and verdict.overall.choice.first == "b"
+    cold = conclude(table_of(times_of(1.0, 2.0)), time="warm")
+    assert cold.headline.word == "Cannot tell" and "warm = true" in cold.headline.text and not cold.recommended
 
 
 def test_problems_that_all_agree_to_be_infeasible_are_taken_out_and_said():
@@ -507,6 +517,8 @@ def test_a_standing_counts_what_it_says():
     assert (a.solved, a.problems, a.fastest) == (6, 6, 5) and (b.solved, b.problems, b.fastest) == (5, 6, 2)
     expected = np.exp(np.mean(np.log(np.array([2.0, 1, 60, 2, 8, 2]) + 0.01))) - 0.01
     assert b.penalised == pytest.approx(expected) and b.failures == {"failed": 1}
+    rows = [{**row, "time_limit": None} for row in table_of(times)]
+    assert conclude(rows).overall.standing("b").penalised == np.inf  # a failure of unknown cost is not left out
     assert a.share == 1.0 and b.against is not None and b.against.n == 5
 
 

@@ -48,6 +48,11 @@ def choice_of_solver(section: Section) -> Statement:
     if not section.standings:
         text = f"Every solver ({listed(section.idle)}) refuses every problem, or was not run."
         return Statement(FAIR, "Nothing was run", text, "solver")
+    if choice.kind == NOBODY and section.found.solved.any():
+        solved = int(section.found.solved.any(axis=1).sum())
+        text = f"{solved:,} of {n:,} problems were solved, but no run has the time to compare; warm times need a study "
+        text += "with warm = true."
+        return Statement(FAIR, "Cannot tell", text, "solver")
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
         text = f"No solver reached the accuracy on any of {n:,} problems ({common})."

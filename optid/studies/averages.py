@@ -16,7 +16,7 @@ def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
         times: positive, in the unit of the shift; ``nan`` entries are left out.
         shift: the larger, the less small times weigh (H. Mittelmann's benchmarks; T. Achterberg, 2007, appendix A).
     """
-    known = times[np.isfinite(times)]
+    known = times[~np.isnan(times)]
     return float(np.exp(np.mean(np.log(known + shift))) - shift) if known.size else float("nan")
 
 

@@ -15,7 +15,7 @@ from optid.showing.page import template, versions
 from optid.showing.wording import Table, number, seconds
 from optid.studies.advice import Statement, choice_of_solver, evidence, model_evidence
 from optid.studies.choice import CANNOT_TELL
-from optid.studies.outcomes import MEANINGS, TIMES
+from optid.studies.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.payload import page_payload
 from optid.studies.quality import FIGURES, Quality
 from optid.studies.rows import OUTCOMES
@@ -122,7 +122,7 @@ def _cards(verdict: Verdict) -> list[dict[str, str]]:
     solved = sum(s.solved for s in section.standings)
     by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
     false = sum(claim.count for claim in verdict.false_claims)
-    proved = int(table["proved"].sum())
+    proved = int((table["proved"] & (states_of_rows(table, verdict.found) == SOLVED)).sum())
     cards = [
         (f"{by_anyone:,} of {len(section.found.data):,}", "problems that some solver solved"),
         (f"{100 * solved / runs:.1f} %" if runs else "none", f"of {runs:,} attempts reached the accuracy"),

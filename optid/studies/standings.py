@@ -28,7 +28,7 @@ class Standing:
         fastest: problems on which nobody was faster.
         time: shifted geometric mean of the seconds on what it solved; not comparable where others solved other
             problems.
-        penalised: the same with every failure counted as the time limit.
+        penalised: the same with every failure counted as the time limit; ``inf`` where a limit is not known.
         against: its time against the first choice on the problems both solved; None for the first choice itself and
             where there is none.
         residual: median verified residual on what it solved.
@@ -114,7 +114,8 @@ def _order(standing: Standing, choice: Choice) -> tuple:
 def _standing(found: Results, s: int, choice: Choice) -> Standing:
     state, times = found.state[:, s], found.time[:, s]
     ran, solved = applicable(found)[:, s], state == SOLVED
-    limits = np.fmax(found.limit, np.nanmax(found.time, axis=1, initial=0.0) if found.time.size else 0.0)
+    slowest = np.nanmax(found.time, axis=1, initial=0.0) if found.time.size else 0.0
+    limits = np.where(np.isfinite(found.limit), np.fmax(found.limit, slowest), np.inf)
     words, counts = np.unique(state[ran & ~solved].astype(str), return_counts=True)
     order = np.argsort(-counts, kind="stable")
     against = None

@@ -12,6 +12,7 @@ from optid.studies.advice import Statement, carries_over, choice_of_formulation,
 from optid.studies.agreement import Agreement, agreement_matrix
 from optid.studies.outcomes import CONTRADICTED, VALUE, Results, columns, tabulate, usual_accuracy
 from optid.studies.quality import Quality, compare_formulations
+from optid.studies.rows import REFUSED
 from optid.studies.standings import Section, compare_solvers
 
 
@@ -64,7 +65,7 @@ class Verdict:
         quality: the formulations by their models.
         agreement: of the solvers.
         false_claims: most frequent first.
-        failures: most frequent first.
+        failures: most frequent first, refusals at the end.
         headline: the verdict in one line.
         statements: further recommendations, warnings, and what cannot be told.
     """
@@ -203,7 +204,7 @@ def _failures(found: Results) -> tuple[Failure, ...]:
         Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
         for (solver, state, shape), reasons in groups.items()
     ]
-    return tuple(sorted(failures, key=lambda f: (-f.count, f.solver, f.state, f.reason)))
+    return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))
 
 
 def _shape(reason: str) -> str:

@@ -36,6 +36,8 @@ function niceStep(span, most) {
 // Ticks of an axis between two transformed ends: [transformed place, label].
 function ticksOf(axis, low, high, most) {
   if (axis.categories) return axis.categories.map((name, k) => [k, name]).filter(([k]) => k >= low && k <= high);
+  const fixed = (axis.ticks || []).filter((v) => v >= low && v <= high);
+  if (fixed.length > 1 && fixed.length <= 2.5 * most) return fixed.map((v) => [v, String(v)]);
   const write = axis.format || ((v) => significant(v));
   if (axis.log && high - low >= 0.7) {
     const factors = high - low < 2.2 && most > 4 ? [1, 2, 5] : [1], step = Math.max(1, Math.ceil((high - low) / most)), found = [];
@@ -55,7 +57,7 @@ function ticksOf(axis, low, high, most) {
 
 let plots = 0;
 
-// spec: label, x and y axes {title, log, categories, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
+// spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
@@ -93,9 +95,9 @@ function makePlot(host, spec, hidden) {
       }
       for (const rule of a ? spec.rules || [] : []) { low = Math.min(low, Math.log10(rule.y)); high = Math.max(high, Math.log10(rule.y)); }
       if (low > high) [low, high] = [0, 1];
-      const room = (high - low) * 0.04 || 0.5;
+      const room = (high - low) * 0.04 || 0.5, above = a && spec.rules ? 2 * room : room;
       const at = (v) => (axis.log ? Math.log10(v) : v);
-      return [axis.low === undefined ? low - room : at(axis.low), axis.high === undefined ? high + room : Math.max(at(axis.high), low + 1e-6)];
+      return [axis.low === undefined ? low - room : at(axis.low), axis.high === undefined ? high + above : Math.max(at(axis.high), low + 1e-6)];
     });
   }
 
