@@ -1,5 +1,6 @@
 """The table: means over seeds, peers against optid on the same seeds, bad data in a word, and the figures asked for."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -78,18 +79,20 @@ def rows_text(row: Row, lines: list[Line]) -> list[str]:
             "| optid better by | seeds |", "|---|---|---|---|---|---|---|"]
     for one in lines:
         if not one.scores:
-            text.append(f"| {label(one.peer)} | {one.lines or '-'} | {_cell(one.reason)} | - | - | - | - |")
+            text.append(f"| {label(one.peer)} | {one.lines or '-'} | {cell(one.reason)} | - | - | - | - |")
             continue
         against = "-" if one.peer in OURS or not ours else " / ".join(
             f"{difference(ours[0], one, figure):+.3f}" for figure in ("one_step", "simulation"))
-        remark = f" {_cell(one.reason)}" if one.reason else ""
+        remark = f" {cell(one.reason)}" if one.reason else ""
         text.append(f"| {label(one.peer)} | {one.lines} | {one.seconds:.3g}{remark} | {one.mean('one_step'):.3f} | "
                     f"{one.mean('simulation'):.3f} | {against} | {len(one.scores)} |")
     return [*text, ""]
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.replace("|", "/").split())[:160]
+def cell(text: str, length: int = 160) -> str:
+    """A text that fits into a cell of a table, without the colours of a terminal."""
+    text = " ".join(re.sub(r"\x1b?\[[0-9;]*m", "", text).replace("|", "/").split())
+    return text if len(text) <= length else text[: length - 4].rsplit(" ", 1)[0] + " ..."
 
 
 def label(peer: str) -> str:
