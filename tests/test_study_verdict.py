@@ -656,6 +656,53 @@ def test_the_counts_add_up():
         verdict.found.state == "not run").sum()  # fmt: skip
 
 
+def test_the_standings_equal_those_of_a_data_frame():
+    """The same figures by grouping and pivoting in pandas."""
+    import pandas
+
+    rows = [row for row in synthetic(1800, 8) if row["system"]]  # one repetition each
+    frame = pandas.DataFrame(rows)
+    good = (frame.outcome == "done") & frame.status_verified.isin(["optimal", "locally optimal"]) & ~frame.false_claim
+    frame["t"] = (frame.compile_s + frame.solve_s).where(good)
+    at = ["data", "formulation", "samples", "noise", "seed"]
+    wide = frame.pivot_table(index=at, columns="solver", values="t", dropna=False, sort=False)
+    wide = wide.dropna(how="all").loc[:, lambda w: w.notna().any()]
+    section = conclude(rows).overall
+    ran = frame[frame.outcome != "refused"].groupby("solver").size()
+    fastest = wide.eq(wide.min(axis=1), axis=0).sum()
+    for s in section.standings:
+        t = wide[s.solver].dropna()
+        assert (s.solved, s.problems, s.fastest) == (len(t), ran[s.solver], fastest[s.solver])
+        assert s.time == pytest.approx(scipy.stats.gmean(t + 0.01) - 0.01)
+        if s.against is not None and s.against.n:
+            both = (wide[s.solver] / wide[section.choice.first]).dropna()
+            assert s.against.n == len(both) and s.against.value == pytest.approx(scipy.stats.gmean(both))
+    for section in conclude(rows).sections:
+        part = wide.xs(section.name, level="formulation")
+        most = part.notna().sum().max()
+        able = [c for c in part if part[c].notna().sum() >= most - int(0.01 * len(section.found.data))]
+        means = np.log(part[able].dropna()).mean()
+        assert section.choice.first == means.idxmin() and set(section.choice.candidates) == set(able)
+
+
+@pytest.mark.parametrize("problems", [6, 12, 60])
+def test_equal_solvers_are_seldom_told_apart(problems):
+    rng = np.random.default_rng(problems)
+    kinds = []
+    for _ in range(400):
+        times = np.exp(rng.normal(size=(problems, 1)) + 0.4 * rng.normal(size=(problems, 2)))
+        kinds.append(choose(times, ("a", "b"), 0.1, paired_ratio, none=1.0).kind)
+    assert kinds.count(FIRST) / 400 <= 0.075 and kinds.count(TIE) / 400 >= 0.925
+
+
+def test_solvers_that_differ_are_told_apart():
+    rng = np.random.default_rng(1)
+    first = [choose(np.exp(0.4 * rng.normal(size=(30, 2)) + [0.0, 0.5]), ("a", "b"), 0.1, paired_ratio, none=1.0)
+             for _ in range(200)]  # fmt: skip
+    assert sum(c.kind == FIRST and c.first == "a" for c in first) / 200 > 0.9
+    assert not any(c.kind == FIRST and c.first == "b" for c in first)
+
+
 # ---- what is given
 
 
