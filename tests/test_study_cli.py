@@ -197,6 +197,8 @@ FAILED = {"status_verified": "failed", "reached": False, "proved": False, "objec
     ([row("a", **LOCAL), row("b", solve_s=0.03)],
      "Use b: it reached the verified accuracy of 1e-08 in 30 ms, proved globally optimal; next is a with 10 ms "
      "(without a proof)."),
+    ([row("a", **LOCAL), row("b", solve_s=0.03, **LOCAL)],
+     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, not proved globally optimal; next is b with 30 ms."),
     ([row("a", objective=1.01, **LOCAL), row("b", solve_s=3.0)],
      "Use b: it reached the verified accuracy of 1e-08 in 3 s, proved globally optimal; a did not."),
     ([row("a", **FAILED), row("b", **FAILED)], "No solver reached the verified accuracy of 1e-08: failed: a and b."),

@@ -83,7 +83,7 @@ class Comparison:
                 return "No solver takes this formulation: choose others (optid solvers)."
             return f"No solver reached the verified accuracy of {self.accuracy:.0e}: {self._why_not()}."
         first, *others = solved
-        proof = ", proved globally optimal" if first.proved else ""
+        proof = f", {'' if first.proved else 'not '}proved globally optimal"
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
         if close:
             names = [line.solver for line in (first, *close)]
