@@ -129,6 +129,69 @@ def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
     assert len(rows) == 3 == len(finished(path))
 
 
+@pytest.mark.parametrize("after_commit", [False, True])
+def test_ctrl_c_while_a_batch_is_written_loses_nothing(path, grid, monkeypatch, after_commit):
+    from optid.studies import database
+
+    monkeypatch.setattr(running, "BATCH", 4)
+    real, calls = database.append, []
+
+    def interrupted(db, rows):
+        calls.append(len(rows))
+        if after_commit:
+            real(db, rows)
+        if len(calls) == 3:  # the first two: what the journal and other labels left
+            raise KeyboardInterrupt
+        if not after_commit:
+            real(db, rows)
+
+    monkeypatch.setattr(database, "append", interrupted)
+    grid([cell(k) for k in range(9)])
+    with pytest.raises(KeyboardInterrupt):
+        run(STUDY, path, execute=Hands())
+    assert calls[2] == 4 and len(finished(path)) == 4
+    rest = Hands()
+    run(STUDY, path, execute=rest)
+    assert rest.ran == [4, 5, 6, 7, 8]
+
+
+def test_a_run_killed_while_the_database_is_made_leaves_nothing_in_the_way(path, grid):
+    import duckdb
+
+    for name in (".new", ".new.wal"):
+        path.with_name(path.name + name).write_bytes(b"half a file")
+    grid([cell(0)])
+    run(STUDY, path, execute=Hands())
+    assert [p.name for p in path.parent.iterdir()] == ["study.duckdb"]
+    with duckdb.connect(str(path), read_only=True) as connection:
+        assert connection.execute("SELECT count(*) FROM rows").fetchall() == [(1,)]
+
+
+@pytest.mark.parametrize("line", ['{"key": 1}', "half a row",
+                                  '{"study": "s", "key": "k", "repetition": 0, "sover": 1}'])
+def test_a_journal_of_another_version_is_told(path, grid, line):
+    grid([cell(0)])
+    journal = path.with_name("study.duckdb.journal")
+    journal.write_text(line + "\n")
+    with pytest.raises(DatabaseError, match="journal holds what is no row of this version.*Remove it"):
+        run(STUDY, path, execute=Hands())
+    assert journal.exists()
+    journal.unlink()
+    assert len(run(STUDY, path, execute=Hands())) == 1
+
+
+@pytest.mark.parametrize("settings, words", [
+    ({"workers": 0}, "at least one"), ({"workers": 2.0}, "a whole number"), ({"workers": True}, "a whole number"),
+    ({"workers": 2, "scheduler": "tcp://x:1"}, "Leave workers or scheduler out"),
+    ({"retry": ["done", "crahsed"]}, "Did you mean 'crashed'"),
+])
+def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(path, grid, settings, words):
+    grid([cell(0)])
+    with pytest.raises(StudyError, match=words):
+        run(STUDY, path, **settings)
+    assert list(path.parent.iterdir()) == []
+
+
 def test_cells_that_come_back_without_a_row_are_told(path, grid):
     grid([cell(k) for k in range(3)])
     with pytest.raises(StudyError, match="2 cells of 3 came back without a row"):

@@ -4,6 +4,7 @@ A writer opens the file for each batch and closes it again, so that a report can
 killed study leaves a database that opens. Every batch is one transaction.
 """
 
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ PATIENCE = 10.0  # seconds to wait for another process that has the file open fo
 
 @contextmanager
 def opened(path: str | Path, write: bool = False) -> "Iterator[duckdb.DuckDBPyConnection]":
-    """Open a database of studies; made with its tables when it is not there and ``write`` is asked for.
+    """Open a database of studies; it is made when it is not there and ``write`` is asked for.
 
     Args:
         path: the file.
@@ -37,14 +38,24 @@ def opened(path: str | Path, write: bool = False) -> "Iterator[duckdb.DuckDBPyCo
     path = Path(path)
     if not write and not path.is_file():
         raise DatabaseError(f"{path}: no such database; `optid study run` makes one")
+    if not path.exists():
+        _create(path)
     connection = _connected(path, write)
     try:
-        if write and not _tables(connection):
-            _create(connection)
         _check(path, connection)
         yield connection
     finally:
         connection.close()
+
+
+def make(path: str | Path) -> None:
+    """Make a database when it is not there, and see that it can be written.
+
+    Raises:
+        DatabaseError: as in `writing`.
+    """
+    with writing(path):
+        pass
 
 
 def _connected(path: Path, write: bool) -> "duckdb.DuckDBPyConnection":
@@ -58,7 +69,7 @@ def _connected(path: Path, write: bool) -> "duckdb.DuckDBPyConnection":
             return duckdb.connect(str(path), read_only=not write, config={"threads": 1})
         except duckdb.Error as error:
             text = str(error).splitlines()[0]
-            if "lock" not in text.lower():
+            if "set lock" not in text.lower():
                 raise DatabaseError(f"{path} cannot be opened: {text}") from None
             if time.monotonic() > until:
                 raise DatabaseError(f"{path} has been in use by another process for {PATIENCE:.0f} s: {text}") from None
@@ -69,7 +80,23 @@ def _tables(connection: "duckdb.DuckDBPyConnection") -> set[str]:
     return {name for (name,) in connection.execute("SELECT table_name FROM duckdb_tables()").fetchall()}
 
 
-def _create(connection: "duckdb.DuckDBPyConnection") -> None:
+def _create(path: Path) -> None:
+    """Make the file under another name first: whoever is killed here leaves nothing that does not open."""
+    new = path.with_name(path.name + ".new")
+    unsaved = new.with_name(new.name + ".wal")
+    for rest in (new, unsaved):
+        rest.unlink(missing_ok=True)
+    connection = _connected(new, write=True)
+    try:
+        _fill(connection)
+    finally:
+        connection.close()
+    if unsaved.exists():
+        raise DatabaseError(f"{path} cannot be written: there is no room for its tables")
+    os.replace(new, path)
+
+
+def _fill(connection: "duckdb.DuckDBPyConnection") -> None:
     columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
     from optid import __version__
 

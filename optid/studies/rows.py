@@ -192,6 +192,8 @@ def _cell_value(column: Column, value: Any) -> Any:
         return None
     if isinstance(value, bool) != (column.kind == "flag") or not isinstance(value, _TYPES[column.kind]):
         raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
+    if isinstance(value, str):  # a solver's words may hold bytes that are no text
+        return value.encode(errors="replace").decode().replace("\0", "")
     return float(value) if column.kind == "number" else value
 
 
@@ -221,7 +223,11 @@ def _finite(value: Any) -> Any:
 
 def markdown(columns: Iterable[Column] = COLUMNS) -> str:
     """Return the documentation of the schema as two Markdown tables: columns and outcomes."""
-    lines = [f"Schema version {SCHEMA_VERSION}. A column without a value is NULL; there is no NaN and no infinity.", "",
+    lines = ["# The rows of a study", "",
+             f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the DuckDB "
+             "file and in what `optid study export` writes. A column without a value is NULL; there is no NaN and no "
+             "infinity. A row whose place in the grid is taken by a newer one (changed data, versions, options) is in "
+             "the table `superseded`, the text of the study file in `studies`, the schema version in `meta`.", "",
              "| column | type | unit | meaning |", "|---|---|---|---|"]
     lines += [f"| `{c.name}` | {c.sql}{' (JSON)' if c.kind == 'json' else ''}{' NOT NULL' if c.always else ''} "
               f"| {c.unit} | {c.meaning} |" for c in columns]

@@ -84,6 +84,8 @@ def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) ->
 
 
 def _executor(grid: Sequence[Cell], workers: int | None, scheduler: str | None) -> Executor:
+    if workers is not None and scheduler is not None:
+        raise StudyError("workers are processes of this machine; a cluster has its own. Leave workers or scheduler out")
     if scheduler is not None:
         from optid.studies import cluster
 
@@ -91,6 +93,7 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: str | None) 
         return lambda todo: cluster.execute(todo, scheduler=scheduler)
     from optid.studies import workers as processes
 
+    processes.check_number(workers)
     return lambda todo: processes.execute(todo, workers=workers)
 
 
@@ -99,18 +102,25 @@ class _Writer:
 
     def __init__(self, db: Path) -> None:
         self._db = db
-        database.finished(db)  # refuses a database of another version before anything is written
+        database.make(db)  # refuses one of another version before anything is written
         self._journal = Journal(db)
         self._pending: list[Row] = []
         self._since = time.monotonic()
-        known_rows = database.identities(db)
-        left_over = [row for row in self._journal.rows()
-                     if (row["study"], row["key"], row["repetition"]) not in known_rows]
         try:
-            self.write(left_over)
+            self.absorb()
         except BaseException:
             self._journal.close()
             raise
+
+    def absorb(self) -> None:
+        """Write to the database what is in the journal and not in the database, wherever a run was stopped."""
+        there = database.identities(self._db)
+        try:
+            self.write([row for row in self._journal.rows()
+                        if (row["study"], row["key"], row["repetition"]) not in there])
+        except (ValueError, LookupError) as error:
+            raise DatabaseError(f"{self._journal.path} holds what is no row of this version ({error}). Remove it: the "
+                                "cells that only it knows are run again") from error
 
     def add(self, row: Row) -> None:
         self._journal.add(row)
@@ -153,8 +163,8 @@ def _work(todo: list[Cell], total: int, execute: Executor, writer: _Writer, prog
                     progress(done, total, row)
         except DatabaseError:
             raise
-        except BaseException:  # Ctrl-C, a lost cluster
-            writer.flush()
+        except BaseException:  # Ctrl-C at any point, a lost cluster
+            writer.absorb()
             raise
     writer.flush()
     if expected:

@@ -37,6 +37,16 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def check_number(workers: int | None) -> None:
+    """Refuse a number of processes that is none.
+
+    Raises:
+        StudyError: not a whole number from 1.
+    """
+    if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
+        raise StudyError(f"workers = {workers!r}: a whole number of processes, at least one, is needed")
+
+
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
             workers: int | None = None) -> Iterator[Row]:
     """Run every cell in a worker and yield its row, in the order in which they end.
@@ -49,12 +59,11 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         workers: number of processes; one per core when not given.
 
     Raises:
-        StudyError: fewer than one worker, a function that has no name to import, workers that do not start (with their
-            last words), or psutil is missing (with the pip line).
+        StudyError: no whole number of workers, a function that has no name to import, workers that do not start (with
+            their last words), or psutil is missing (with the pip line).
     """
     todo = deque(cells)
-    if workers is not None and workers < 1:
-        raise StudyError(f"workers = {workers}: at least one process is needed")
+    check_number(workers)
     pool = Pool(function, min(workers or cores(), max(len(todo), 1)))
     try:
         yield from pool.run(todo)
