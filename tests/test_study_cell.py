@@ -8,6 +8,7 @@ import pytest
 
 from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
+from optid.errors import StudyError
 from optid.solution import Status
 from optid.studies import cell as cells
 from optid.studies.cell import lost_row, run_cell
@@ -175,6 +176,12 @@ def test_an_infeasible_cell_is_done():
     row = run_cell(one("ipopt", constraints=("monotone:increasing", "slope:-5,-4")))
     assert row["outcome"] == "done" and not row["reached"], row["reason"]
     assert row["status_verified"] in ("infeasible", "failed", "inaccurate")
+
+
+def test_a_seed_that_no_database_holds_is_refused():
+    with pytest.raises(StudyError, match="is too large"):
+        one(seeds=(2**70,))
+    assert run_cell(one(seeds=(2**62 - 1,)))["seed"] == 2**62 - 1
 
 
 def test_the_row_of_a_cell_that_made_none():

@@ -337,6 +337,35 @@ def test_every_trouble_in_one_study(path, grid):
     assert len(finished(path)) == 10
 
 
+def test_a_real_study_from_python_to_its_frame():
+    """Simulated and in-memory records, a procedure, a refusal and a missing solver, in workers of their own."""
+    import numpy as np
+
+    from optid import Data
+    from optid.studies.cell import run_cell
+    from optid.studies.grid import cells
+
+    pytest.importorskip("pandas")
+    u = np.random.default_rng(0).uniform(-1, 1, 300)
+    record = Data(u, np.convolve(u, [0.0, 0.5, 0.3])[:300] + 0.01 * np.sin(np.arange(300.0)), dt=0.1)
+    study = Study(
+        "real", (DataEntry("simulated", system="dead_zone", samples=(200,)), DataEntry("mine", record=record)),
+        (FormulationEntry("exact", "hammerstein_arx.exact", (), {"na": 1, "nb": 2, "basis": "triangular:5"}),
+         FormulationEntry("linear", "arx", (), {"na": 1, "nb": 2})),
+        (SolverEntry("gn", "gauss_newton"), SolverEntry("clarabel", "clarabel"), SolverEntry("gurobi", "gurobi")),
+        repetitions=2, warm=True)
+    frame = study.run(workers=2)
+    assert len(frame) == 2 * 2 * 3 * 2
+    outcomes = frame.groupby(["formulation", "solver"])["outcome"].agg(lambda words: "/".join(sorted(set(words))))
+    assert outcomes["exact", "gn"] == outcomes["linear", "clarabel"] == "done"
+    assert outcomes["exact", "clarabel"] == outcomes["exact", "gurobi"] == outcomes["linear", "gurobi"] == "refused"
+    done = frame[frame["outcome"] == "done"]
+    assert done["reached"].all() and done["one_step_fit"].notna().all() and done["warm_s"].notna().all()
+    here = {cell.key: run_cell(cell)["objective"] for cell in cells(study)}
+    for key, objective in zip(done["key"], done["objective"]):
+        assert objective == pytest.approx(here[key], rel=1e-12)
+
+
 DRIVER = """
 import sys
 sys.path.insert(0, {tests!r})

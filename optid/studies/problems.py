@@ -9,6 +9,8 @@ import numpy as np
 from optid.errors import StudyError
 from optid.studies.positions import Path, Positions
 
+LARGEST = 2**62  # whole numbers from here on have no place in the database
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -87,7 +89,10 @@ class Problems(list[Problem]):
     def whole(self, path: Path, value: Any, low: int) -> int | None:
         """Return a whole number from low, or note a problem."""
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
-            return int(value)
+            if value < LARGEST:
+                return int(value)
+            self.add(path, f"{_last_word(path)} = {value} is too large: it must be below 2**62")
+            return None
         whole = isinstance(value, float) and value.is_integer() and value >= low
         self.add(path, f"{_last_word(path)} is a whole number from {low}; "
                  + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
