@@ -4,6 +4,8 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from optid.data import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.registry import formulation as look_up
@@ -43,19 +45,20 @@ class Records:
                 self._read[entry.name] = read([self.path(name) for name in entry.files], **entry.options)
         return self._read[entry.name]
 
-    def short(self, entry: DataEntry) -> Data:
-        """Return the beginning of a record, or a short simulated one.
+    def beginning(self, entry: DataEntry, samples: float = SHORT) -> Data:
+        """Return the beginning of a record, or a simulated one, of so many samples at most.
 
         Raises:
             DataError: what `optid.read` refuses.
         """
         if entry.system is not None:
-            return simulate(entry.system, min(SHORT, max(entry.samples or (system(entry.system).samples,))))[0]
+            longest = max(entry.samples or (system(entry.system).samples,))
+            return simulate(entry.system, int(min(samples, longest)))[0]
         whole = self.read(entry)
         first = whole.experiments[0]
-        if first.n_samples <= SHORT:
+        if first.n_samples <= samples:
             return whole
-        return Data(first.u[:SHORT], first.y[:SHORT], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
+        return Data(first.u[:int(samples)], first.y[:int(samples)], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
 
 
 def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Problems,
@@ -109,7 +112,10 @@ def note_impossible(data: Sequence[DataEntry], formulations: Sequence[Formulatio
         problems: collects what is wrong.
     """
     for i, entry in enumerate(formulations):
-        reasons = [_refused(entry, records.short(one)) for one in data if not entry.data or one.name in entry.data]
+        records_of = [one for one in data if not entry.data or one.name in entry.data]
+        if not all(_refused(entry, records.beginning(one)) for one in records_of):
+            continue
+        reasons = [_refused(entry, records.beginning(one, np.inf)) for one in records_of]  # was it too short?
         if reasons and all(reasons):
             problems.add(("formulation", i), f"{entry.name!r} cannot be posed: {reasons[0]}", value=False)
 
