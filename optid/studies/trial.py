@@ -58,7 +58,8 @@ class Records:
         first = whole.experiments[0]
         if first.n_samples <= samples:
             return whole
-        return Data(first.u[:int(samples)], first.y[:int(samples)], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
+        kept = int(samples)
+        return Data(first.u[:kept], first.y[:kept], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
 
 
 def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Problems,
