@@ -136,9 +136,10 @@ def page(comparison: Comparison) -> list[str]:
 
 def bad_text(comparison: Comparison) -> list[str]:
     """The table of what every entry does with bad records."""
-    text = ["### Bad data", "", "What the code of the first row does with a record that something is wrong with; an "
-            "answer is one without a word", "and with a fit as good as without the trouble (unstable plant: above 90 %).",
-            "", "| peer | " + " | ".join(bad_records()) + " |", "|---|---|---|---|---|"]
+    text = ["### Bad data", "",
+            "What the code of the first row does with a record that something is wrong with. An answer is one without",
+            "a word and with a fit as good as without the trouble (unstable plant: above 90 %).", "",
+            "| peer | " + " | ".join(bad_records()) + " |", "|---|---|---|---|---|"]
     for entry in comparison.entries:
         if words := comparison.bad(entry):
             text.append(f"| {label(entry.stem)} | " + " | ".join(cell(word, 130) for word in words.values()) + " |")
