@@ -11,9 +11,11 @@ from optid.backends import Answer, BackEnd, back_ends
 from optid.errors import StudyError
 from optid.solution import Status
 from optid.studies import cell as cells
+from optid.studies import memory
 from optid.studies.cell import lost_row, run_cell
 from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.grid import cells as expand
+from optid.studies.memory import Peak
 from optid.studies.rows import NAMES
 
 OPTIONS = {"na": 2, "nb": 2, "basis": "triangular:6"}
@@ -96,6 +98,60 @@ def test_a_file_without_truth(tmp_path):
     assert row["outcome"] == "done" and row["parameter_error"] is None and row["data_hash"]
     assert row["n_samples"] == 400 and row["n_estimation"] == 280
     assert row["one_step_fit"] > 95.0 and row["samples"] is None and row["seed"] is None
+
+
+def test_a_file_that_changed_since_the_study_started_is_no_longer_its_data(tmp_path):
+    file = tmp_path / "x.csv"
+    rng = np.random.default_rng(0)
+    np.savetxt(file, rng.standard_normal((200, 2)), delimiter=",", header="u,y", comments="")
+    entry = DataEntry("mine", files=("x.csv",), options={"inputs": ["u"], "outputs": ["y"]})
+    cell = one("clarabel", "arx", entry=entry, options={"na": 1, "nb": 1}, folder=tmp_path)
+    assert run_cell(cell)["outcome"] == "done"
+    cells._records.clear()
+    file.write_text(file.read_text() + "1.0,2.0\n")
+    row = run_cell(cell)
+    assert row["outcome"] == "error" and "changed since" in row["reason"]
+    file.unlink()
+    assert run_cell(cell)["outcome"] == "error"
+
+
+def test_the_first_quick_cell_of_its_kind_is_run_twice(monkeypatch):
+    calls = []
+    monkeypatch.setattr(cells, "fit", lambda *a, real=cells.fit, **k: calls.append(k["solver"]) or real(*a, **k))
+    monkeypatch.setattr(cells, "_rehearsed", set())
+    for solver in ("gauss_newton", "gauss_newton", "ipopt", "clarabel"):  # the last refuses
+        run_cell(one(solver))
+    assert calls == ["gauss_newton"] * 3 + ["ipopt"] * 2 + ["clarabel"]
+    monkeypatch.setattr(cells, "_rehearsed", set())
+    monkeypatch.setattr(cells, "REHEARSED", 0.0)
+    calls.clear()
+    run_cell(one())
+    assert calls == ["gauss_newton"]
+
+
+def test_memory_above_the_limit_that_nobody_saw_is_an_outcome(monkeypatch):
+    def hungry(*arguments, real=cells.fit, **settings):
+        np.ones(60_000_000)
+        return real(*arguments, **settings)
+
+    limit = Peak().start + 300.0
+    assert run_cell(one(memory_limit=limit))["outcome"] == "done"
+    monkeypatch.setattr(cells, "fit", hungry)
+    row = run_cell(one(memory_limit=limit))
+    assert row["outcome"] == "memory limit" and row["peak_mb"] > limit and row["objective"] is None
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_peak_of_memory_is_that_since_the_start(monkeypatch, tmp_path, exact):
+    if not exact:
+        monkeypatch.setattr(memory, "_CLEAR", tmp_path / "not" / "there")
+    before = Peak()
+    held = np.ones(40_000_000)
+    assert before.mb() > before.start + 300.0
+    after = Peak()
+    assert after.start > 300.0
+    del held
+    assert after.mb() < after.start + 50.0
 
 
 def test_nothing_held_out():
