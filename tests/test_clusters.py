@@ -18,6 +18,7 @@ from optid.clusters import check_workers, connected, difference, versions
 from optid.errors import ClusterError, DataError, RankError
 from optid.regressors import Layout, collect
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 da = pytest.importorskip("dask.array")
 dd = pytest.importorskip("dask.dataframe")
@@ -35,7 +36,9 @@ def folders(record, tmp_path):
 
 @pytest.fixture(scope="module")
 def cluster():
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as local:
+    patient = {"distributed.deploy.lost-worker-timeout": "600s"}  # else one that starts slowly is given up
+    with (dask.config.set(patient),
+          distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as local):
         yield local
 
 

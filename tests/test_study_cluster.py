@@ -23,6 +23,7 @@ from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.grid import cells as cells_of
 from optid.studies.rows import NAMES
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 
 TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve_s", "warm_s", "total_s", "peak_mb",
@@ -31,7 +32,9 @@ TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve
 
 @pytest.fixture(scope="module")
 def local():
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as one:
+    patient = {"distributed.deploy.lost-worker-timeout": "600s"}  # else one that starts slowly is given up
+    with (dask.config.set(patient),
+          distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as one):
         yield one
 
 
@@ -170,6 +173,7 @@ nb = 1
 def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, local, monkeypatch, tmp_path):
     """It is not run for ever: Dask gives up a task after some workers."""
     monkeypatch.setattr(local.scheduler, "allowed_failures", 0)
+    monkeypatch.setattr(cluster, "TURNS", 1)
     todo = [cell(0, seconds=60.0)]
     killer = threading.Timer(4.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in client.run(os.getpid).values()])
     killer.start()

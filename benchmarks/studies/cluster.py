@@ -165,9 +165,11 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=6_000_000)
     parser.add_argument("--workers", type=int, default=2)
     given = parser.parse_args()
+    import dask
     from distributed import Client, LocalCluster
 
     with (tempfile.TemporaryDirectory() as scratch,
+          dask.config.set({"distributed.deploy.lost-worker-timeout": "600s"}),  # killed ones come back however slowly
           LocalCluster(n_workers=given.workers, threads_per_worker=1, dashboard_address=":0",
                        silence_logs=50) as cluster,
           Client(cluster, set_as_default=False) as client):

@@ -8,7 +8,7 @@ import json
 import pickle
 import uuid
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -28,6 +28,7 @@ TICK = 1.0  # seconds between looks at the cluster while no cell ends
 AHEAD = 2  # cells that are under way per thread of the cluster: one runs, one is there when it ends
 DESERTED = 300.0  # seconds without any worker until that is an error; batch systems replace workers within minutes
 AGAIN = 5.0  # seconds to fetch a row; it is gone when its worker died just after the cell, and then the cell runs again
+TURNS = 3  # times a cell is given to the cluster, which gives up each time when some of its workers have died over it
 SHIPPED = 1 << 30  # bytes of data files that are sent to a worker that does not have them
 
 Row = dict[str, Any]
@@ -93,6 +94,7 @@ class _Flight:
         self._name = f"optid-{uuid.uuid4().hex[:12]}"
         self._landed: SimpleQueue[Any] = SimpleQueue()
         self._cells: dict[Any, Cell] = {}  # by future
+        self._turns: Counter[tuple[str, int]] = Counter()  # of cells whose Dask workers died
         self._count = 0
         self._looked = self._peopled = monotonic()
         self._threads = sum(client.nthreads().values())
@@ -133,9 +135,18 @@ class _Flight:
 
         cell = self._cells[future]
         try:
+            if future.status == "error":  # fetching it would leave a complaint in the log
+                raise future.exception(timeout=AGAIN)
             answer = future.result(timeout=AGAIN)
-        except KilledWorker as error:
-            answer = lost_row(cell, CRASHED, f"{error.allowed_failures + 1} Dask workers died while they had it")
+        except KilledWorker as error:  # a cell cannot kill a Dask worker, but it may have been there by chance
+            self._forget(future)
+            self._turns[cell.key, cell.repetition] += 1
+            turns = self._turns[cell.key, cell.repetition]
+            if turns < TURNS:
+                self._send(cell)
+                return None
+            count = turns * (error.allowed_failures + 1)
+            return lost_row(cell, CRASHED, f"{count} Dask worker{'s' * (count > 1)} died while they had it")
         except (ClusterError, StudyError):
             raise
         except BaseException as error:
@@ -147,8 +158,7 @@ class _Flight:
             if not isinstance(error, Exception):
                 raise
             answer = lost_row(cell, ERROR, f"the Dask worker could not run it: {type(error).__name__}: {error}")
-        del self._cells[future]
-        future.release()
+        self._forget(future)
         if answer is None:
             return self._sent_with_files(cell)
         there = json.loads(answer["versions"])
@@ -156,6 +166,10 @@ class _Flight:
             raise ClusterError(f"a worker on {answer['machine']} has other packages: {text}. Install the same versions "
                                "there, and start again: the rows so far are kept.")
         return answer
+
+    def _forget(self, future: Any) -> None:
+        del self._cells[future]
+        future.release()
 
     def _sent_with_files(self, cell: Cell) -> Row | None:
         entry = cell.data_source
