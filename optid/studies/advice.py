@@ -43,8 +43,9 @@ def choice_of_solver(section: Section) -> Statement:
     """Say which solver to use on the problems of a section, or why that cannot be told."""
     choice, n = section.choice, len(section.found.data)
     if not n:
-        agreed = " Every problem is infeasible, and the solvers agree." if section.infeasible else ""
-        return Statement(FAIR, "Nothing to compare", f"There is no run of a solver.{agreed}", "solver")
+        agreed = f"{section.infeasible:,} problems are infeasible, and the solvers agree."
+        text = agreed if section.infeasible else "There is no run of a solver."
+        return Statement(FAIR, "Nothing to compare", text, "solver")
     if not section.standings:
         text = f"Every solver ({listed(section.idle)}) refuses every problem, or was not run."
         return Statement(FAIR, "Nothing was run", text, "solver")
@@ -158,7 +159,7 @@ def _runner_up(section: Section) -> str:
     rivals = [name for name in choice.candidates if name != choice.first]
     if rivals:
         name = min(rivals, key=lambda rival: choice.against[rival].value)
-        return f"The next that solves as many, {name}, {_against(section, name)}."
+        return f"The next as reliable, {name}, {_against(section, name)}."
     others = [s for s in section.standings if s.solver != choice.first]
     if not any(s.solved for s in others):
         return f"Nobody else solved any: {listed([s.solver for s in others])}."
@@ -204,7 +205,7 @@ def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     p = "below 0.001" if ranking.probability < 0.001 else f"{ranking.probability:.2g}"
     evidence = f"{ranking.test}, {ranking.n} data sets, probability {p}"
     if ranking.probability >= ranking.level:
-        text = f"Over the data sets no {noun} ranks differently from another ({evidence})."
+        text = f"Over the data sets the ranks of the {noun}s do not differ beyond chance ({evidence})."
         return Statement(FAIR, "Other data: no difference", text, "data sets")
     best = ranking.names[0]
     same = [name for name in ranking.names[1:] if not ranking.differ(best, name)]
@@ -263,23 +264,25 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
         return choice_of_formulation(quality) or choice_of_solver(overall)
     if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)
-    if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n:
+    beaten = any(s.choice.kind == FIRST and s.choice.first not in (choice.first, *choice.tied) for s in sections)
+    if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n and not beaten:
         return choice_of_solver(overall)
-    picks = [(section, section.choice) for section in sections]
-    decided = [pick for _, pick in picks if pick.kind in (FIRST, TIE, ONLY_ONE)]
+    decided = [section for section in sections if section.choice.kind in (FIRST, TIE, ONLY_ONE)]
     if not decided:
         return choice_of_solver(overall)
-    firsts = list(dict.fromkeys(pick.first for pick in decided))
-    if len(firsts) == 1:
-        names = [section.name for section, pick in picks if pick in decided]
-        text = f"{firsts[0]} comes first, or ties for it, in {of(len(decided), len(picks), 'formulation')}: "
-        text += f"{listed(names)}."
-        return Statement(GOOD if len(decided) == len(picks) else FAIR, f"Use {firsts[0]}", text, "solver")
-    named = {first: [section.name for section, pick in picks if pick.first == first] for first in firsts}
+    firsts = list(dict.fromkeys(section.choice.first for section in decided))
+    if len(firsts) == 1 and len(decided) == len(sections):
+        text = f"{firsts[0]} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}."
+        return Statement(GOOD, f"Use {firsts[0]}", text, "solver")
+    named = {first: [section.name for section in decided if section.choice.first == first] for first in firsts}
     best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
-    solved = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    text = f"No solver does everything: {solved.solver} solved most, {of(solved.solved, n)}."
-    tone = GOOD if len(decided) == len(picks) else FAIR
+    most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
+    text = f"{most.solver} solved most, {of(most.solved, n)}."
+    if most.solved < 0.99 * n:
+        text = f"No solver does everything: {text}"
+    if len(decided) < len(sections):
+        text += f" For {len(sections) - len(decided)} of {len(sections)} formulations it cannot be told."
+    tone = GOOD if len(decided) == len(sections) else FAIR
     if len(best) <= LONGEST:
         return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
     return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")

@@ -8,6 +8,7 @@ import numpy as np
 from optid.studies.averages import MINIMUM_PAIRS, Paired
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
+VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2
 RELIABLE = 0.01  # share of the problems by which the number solved may stay behind the most reliable
 
 
@@ -16,7 +17,7 @@ class Choice:
     """The outcome of a comparison.
 
     Attributes:
-        kind: "first" (one is ahead), "tie" (nobody is ahead of those named), "cannot tell" (too few data; `missing`
+        kind: "first" (one is ahead), "tie" (those named are known to be close), "cannot tell" (too few data; `missing`
             says which), "only one" (nothing to compare with), "nobody" (not one problem solved).
         first: who is ahead, of a tie the one with the best mean; "" where there is nobody.
         tied: the others that cannot be told apart from it.
@@ -53,7 +54,8 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
 
     Returns:
         The choice. Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of
-        their comparison excludes equality and the difference is of practical meaning.
+        their comparison excludes equality and the difference is of practical meaning; they tie where that interval is
+        narrow, and cannot be told where it is not.
     """  # fmt: skip
     counts = np.isfinite(costs).sum(axis=0)
     solved, problems = {name: int(c) for name, c in zip(names, counts)}, len(costs)
@@ -80,6 +82,10 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         few = next(name for name in tied if not against[name].enough)
         missing = (f"needs at least {MINIMUM_PAIRS} {noun}s that both {names[lead]} and {few} solve; "
                    f"there {'is' if against[few].n == 1 else 'are'} {against[few].n}")  # fmt: skip
+    elif vague := [name for name in tied if _vague(against[name], minor, none)]:
+        kind, pair = CANNOT_TELL, against[vague[0]]
+        missing = (f"needs more than {pair.n} {noun}s to tell {names[lead]} and {vague[0]} apart: the interval of "
+                   f"their comparison, {pair.low:.3g} to {pair.high:.3g}, is too wide")  # fmt: skip
     return Choice(kind, names[lead], tied, candidates, against, solved, problems, missing)
 
 
@@ -92,6 +98,12 @@ def _apart(pair: Paired, minor: float, none: float) -> bool:
     """Whether the other one is worse, for sure and by more than a trifle."""
     threshold = none * (1 + minor) if none else minor
     return pair.enough and pair.low > none and pair.value > threshold
+
+
+def _vague(pair: Paired, minor: float, none: float) -> bool:
+    """Whether the interval holds differences `VAGUE` times those of practical meaning: that is ignorance, not a tie."""
+    low, high = (1 / (1 + VAGUE * minor), 1 + VAGUE * minor) if none else (-VAGUE * minor, VAGUE * minor)
+    return pair.low < low or pair.high > high
 
 
 def listed(names: tuple[str, ...] | list[str], most: int = 4) -> str:
