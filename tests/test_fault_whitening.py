@@ -12,6 +12,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
+from optid.faults.nuisance import largest_factor
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.kalman import kalman_gain
 
@@ -158,6 +159,30 @@ def test_model_errors_count_as_noise(real_data):
     freedom = (400 - 4) * np.trace(root @ model.noise.innovation @ root.T) / 2  # the initial state takes four
     assert np.mean(naive) > 1.05 * freedom
     assert abs(np.mean(aware) / freedom - 1) < 4 * np.sqrt(2 / freedom / 60)
+
+
+def test_the_largest_factor_is_an_upper_bound():
+    rng, s2 = np.random.default_rng(0), np.geomspace(0.05, 4, 20)
+    for true in (1.5, 4.0):
+        found = [largest_factor(s2, (1 + true * s2) * rng.chisquare(1, 20)) for _ in range(400)]
+        assert abs(np.mean(np.array(found) >= true) - 0.95) < 0.035
+    assert largest_factor(s2, np.zeros(20)) == 1.0
+
+
+def test_a_healthy_record_enlarges_a_covariance_that_is_too_small():
+    """Models drawn from the covariance they claim, and from four times as much."""
+    model = small()
+    long, u = levels(400, 0), levels(300, 1)
+    origin = Data(long, inject(model, long))
+    claimed = model_uncertainty(model, origin)
+    healthy = Data(u, inject(model, u, seed=50))
+    assert model_uncertainty(model, origin, healthy=healthy).inflation < 3  # the model is right
+    factors = []
+    for seed in range(7):
+        wrong = drawn(replace(claimed, root=2 * claimed.root), seed)
+        noise = NoiseCovariances.of_innovations(wrong.K, claimed.predictor.covariance)
+        factors.append(model_uncertainty(replace(wrong, noise=noise), origin, healthy=healthy).inflation)
+    assert np.median(factors) > 3
 
 
 def whiten_with(model, data, identified, uncertainty=None):

@@ -11,6 +11,10 @@ fitted to them: their covariance is taken from their energy over the degrees of 
 noise may have no power at some frequency (often at zero, where a constant and an initial state were fitted, too): a
 predictor that believes it never forgets a deviation. So measurement noise is added, the share of the innovations that
 the gain has parameters for every sample of the record.
+
+The covariance is that of the linearised predictions. The errors of a model by maximum likelihood from a short record
+are larger. A later healthy record shows by how much: `model_uncertainty(model, data, healthy=...)` multiplies P by the
+largest factor that the record allows.
 """
 
 from collections.abc import Callable
@@ -36,6 +40,15 @@ STEP = 1e-5
 
 KNOWN = 1e-12
 """Directions with less than this share of the largest information are those that change no prediction."""
+
+CONFIDENCE = 0.95
+"""Of the upper bound of the factor of the covariance that a healthy record shows."""
+
+FACTORS = 1.0, 1000.0, 300
+"""The smallest factor, the largest, and how many are looked at."""
+
+DRAWS = 4000
+"""Simulated energies behind the bound of the factor."""
 
 DIFFUSE = 1e6
 """Standard deviation, in sizes of its effect, of an initial state of which nothing is known."""
@@ -69,12 +82,14 @@ class ModelUncertainty:
         predictor: of the noise with what the record leaves open; windows are judged by it.
         root: (parameters, q) with covariance root root'.
         readings: number of readings behind it, less one for each initial state estimated.
+        inflation: factor of the covariance that a healthy record asked for; 1 without one.
     """
 
     model: "HammersteinSS"
     predictor: Predictor
     root: Array
     readings: int
+    inflation: float = 1.0
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
         """Return what the uncertainty leaves in the whitened innovations of a record.
@@ -94,7 +109,7 @@ class ModelUncertainty:
         return Nuisance(U, s)
 
 
-def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
+def model_uncertainty(model: "HammersteinSS", data: Data, *, healthy: Data | None = None) -> ModelUncertainty:
     """Return the covariance of the parameters of a model, from the record it was identified from.
 
     All entries of the matrices that are not zero throughout, the gain, the offsets and the coefficients of the
@@ -103,6 +118,8 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
     Args:
         model: with noise covariances.
         data: the record it was identified from.
+        healthy: a later healthy record, which was not used to identify it. The covariance is multiplied by the upper
+            bound (`CONFIDENCE`) of the factor that this record asks for, never by less than one.
 
     Raises:
         DataError: fewer than two readings for each direction of the parameters that changes the predictions.
@@ -138,7 +155,43 @@ def model_uncertainty(model: "HammersteinSS", data: Data) -> ModelUncertainty:
     scale = np.sqrt(energy / (readings - int(known.sum())))
     root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
-    return ModelUncertainty(gained, steady, root, readings)
+    found = ModelUncertainty(gained, steady, root, readings)
+    return found if healthy is None else _inflated(found, healthy)
+
+
+def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
+    """Multiply the covariance by the largest factor that a healthy record allows."""
+    raw, gained = in_units_of(found.model, healthy), found.model
+    given = gained.initial_state(raw, "predict")
+    spreads, seen = [], []
+    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+        present = ~np.isnan(part.y)
+        nuisance = found.nuisance(part, x0, present)
+        errors = np.where(present, part.y - simulation.run(_job(gained, part), x0), 0.0)
+        axes = nuisance.s < np.sqrt(DIFFUSE)  # the others are those of the initial state
+        spreads.append(nuisance.s[axes] ** 2)
+        seen.append((nuisance.U[:, axes].T @ found.predictor.whitened(errors, present).ravel()) ** 2)
+    s2, z2 = np.concatenate(spreads), np.concatenate(seen)
+    factor = largest_factor(s2, z2)
+    return replace(found, root=np.sqrt(factor) * found.root, inflation=factor)
+
+
+def largest_factor(s2: Array, z2: Array) -> float:
+    """Return the upper bound of the factor c of the variances 1 + c s^2, one at least.
+
+    It is the largest c with which so small an energy has a probability of 1 - `CONFIDENCE`, the axes weighted by what
+    they tell of c near one: exact for Gaussian innovations that are linear in the parameters. Few axes, or a small
+    effect of the parameters on them, say little of c and leave it large.
+
+    Args:
+        s2: (q,) squared singular values of the nuisance.
+        z2: (q,) squared whitened innovations along its axes.
+    """
+    weights, factors = s2 / (1 + s2) ** 2, np.geomspace(*FACTORS)
+    drawn = np.random.default_rng(0).chisquare(1, (DRAWS, s2.size))
+    least = np.quantile(drawn @ (weights * (1 + np.outer(factors, s2))).T, 1 - CONFIDENCE, axis=0)
+    allowed = factors[least <= weights @ z2]
+    return float(allowed[-1]) if allowed.size else 1.0
 
 
 def _forgetting(model: "HammersteinSS", samples: int) -> Predictor:

@@ -106,9 +106,11 @@ def diagnose(
     record = record_of(plant.model, data)
     found = _dictionary(plant.model, faults)
     steady = steady_predictor(plant.model, healthy, rescale)
+    uncertainty, remark = uncertainty_of(plant, model_uncertainty)
+    if steady is None and uncertainty is not None:
+        steady = uncertainty.predictor  # whose covariance counts the degrees of freedom that the fit took
     if steady is not None:
         found = replace(found, predictor=steady)
-    uncertainty, remark = uncertainty_of(plant, model_uncertainty)
     if uncertainty is None:
         uncertainty = uncertain_start(plant.model, found.predictor)
     noise = {"uncertainty": replace(uncertainty, predictor=found.predictor), "scale": found.predictor}
