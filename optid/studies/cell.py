@@ -94,7 +94,8 @@ def prepare() -> None:
     from optid.validation.predictions import one_step, simulated
 
     data = dead_zone(n=100).data
-    for formulation, options in (("hammerstein_arx.exact", {"basis": "triangular:4"}), ("arx", {})):
+    tried: dict[str, dict[str, Any]] = {"hammerstein_arx.exact": {"basis": "triangular:4"}, "arx": {}}
+    for formulation, options in tried.items():
         model = fit(data, formulation, na=1, nb=1, prove=False, **options).model
         one_step(model, data)
         simulated(model, data)
