@@ -107,7 +107,9 @@ def model_evidence(quality: Quality, name: str) -> str:
     pair = choice.against.get(name)
     if pair is None or not pair.n:
         return "no record in common with the best" if choice.first else choice.missing
-    tied = "tied: " if name in choice.tied and pair.enough else ""
+    tied = "tied: " if name in choice.tied and choice.kind == TIE else ""
+    if quality.measure == "parameter_error":
+        return f"{tied}{pair.value:.3g} × the error ({pair.low:.3g} to {pair.high:.3g})"
     ahead = pair.value <= -0.005
     value, low, high = (-pair.value, -pair.high, -pair.low) if ahead else (pair.value, pair.low, pair.high)
     interval = f" ({_points(low)} to {_points(high)})" if pair.n > 1 else ""
@@ -224,31 +226,40 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
     if len(quality.formulations) < 2 or not any(quality.solved.values()):
         return None
     if choice.kind == NOBODY:
-        text = "No model has a simulation fit on samples it has not seen: keep a hold-out share."
+        text = "No model has a simulation fit on samples it has not seen (keep a hold-out share) or a known truth."
         return Statement(FAIR, "Models: cannot tell", text, "formulation")
     if not choice.first:
         return Statement(FAIR, "Models: cannot tell", f"The comparison {choice.missing}.", "formulation")
-    lead = f"{choice.first} has a mean simulation fit of {quality.figures['simulation_fit'][choice.first].mean:.2f} % "
-    lead += f"on unseen samples of {of(choice.solved[choice.first], n, 'record')}"
+    lead = f"{choice.first} has {_model_figure(quality)} {of(choice.solved[choice.first], n, 'record')}"
     if choice.kind == CANNOT_TELL:
         text = f"The comparison {choice.missing}. So far {lead}."
         return Statement(FAIR, "Models: cannot tell yet", text, "formulation")
     if choice.kind == TIE:
-        pairs = [(name, choice.against[name]) for name in choice.tied[:3]]
-        each = "; ".join(f"{name} stays {_points(pair.value)} points behind (95 %: {_points(pair.low)} to "
-                         f"{_points(pair.high)}, {pair.n:,} records)" for name, pair in pairs)  # fmt: skip
-        text = f"{lead}. No difference beyond chance or 0.1 points: {each}."
+        each = "; ".join(f"{name} {_behind(quality, choice.against[name])}" for name in choice.tied[:3])
+        trifle = "10 %" if quality.measure == "parameter_error" else "0.1 points"
+        text = f"{lead}. No difference beyond chance or {trifle}: {each}."
         return Statement(GOOD, f"Equal models: {listed((choice.first, *choice.tied))}", text, "formulation")
     rivals = [name for name in choice.candidates if name != choice.first]
-    if rivals:
-        name = min(rivals, key=lambda rival: choice.against[rival].value)
-        pair = choice.against[name]
-        text = (f"{lead}; the next, {name}, stays {_points(pair.value)} points behind on {pair.n:,} records "
-                f"(95 %: {_points(pair.low)} to {_points(pair.high)}).")  # fmt: skip
-    else:
+    if not rivals:
         text = f"{lead}; no other was solved on half as many records."
         return Statement(FAIR, "Models: cannot tell", text, "formulation")
+    name = min(rivals, key=lambda rival: choice.against[rival].value)
+    text = f"{lead}; the next, {name}, {_behind(quality, choice.against[name])}."
     return Statement(GOOD, f"Best models: {choice.first}", text, "formulation")
+
+
+def _model_figure(quality: Quality) -> str:
+    mean = quality.figures[quality.measure][quality.choice.first].mean
+    if quality.measure == "parameter_error":
+        return f"a mean parameter error of {100 * mean:.3g} % on"
+    return f"a mean simulation fit of {mean:.2f} % on unseen samples of"
+
+
+def _behind(quality: Quality, pair: Paired) -> str:
+    if quality.measure == "parameter_error":
+        return f"has {pair.value:.3g} times the error (95 %: {pair.low:.3g} to {pair.high:.3g}, {pair.n:,} records)"
+    interval = f"(95 %: {_points(pair.low)} to {_points(pair.high)}, {pair.n:,} records)"
+    return f"stays {_points(pair.value)} points behind {interval}"
 
 
 def headline(overall: Section, sections: list[Section], quality: Quality) -> Statement:
@@ -261,7 +272,9 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
     """
     choice, n = overall.choice, len(overall.found.data)
     if len(overall.standings) == 1:
-        return choice_of_formulation(quality) or choice_of_solver(overall)
+        models = choice_of_formulation(quality)
+        decided = models is not None and quality.choice.kind in (FIRST, TIE) and models.tone == GOOD
+        return models if models is not None and decided else choice_of_solver(overall)
     if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)
     beaten = any(s.choice.kind == FIRST and s.choice.first not in (choice.first, *choice.tied) for s in sections)

@@ -82,7 +82,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "formulations": [section.name for section in verdict.sections],
         "requested": f"{verdict.accuracy:.0e}",
         "tolerance": f"{verdict.found.tolerance:.0e}",
-        "measure": f"{' + '.join(TIMES[verdict.time])}: {TIME_WORDS[verdict.time]}",
+        "clock": f"{' + '.join(TIMES[verdict.time])}: {TIME_WORDS[verdict.time]}",
         "states": [*OUTCOMES.items(), *MEANINGS.items()],
         "call": command or "optid study report STUDY.duckdb -o study.html",
         "versions": [*versions(), *_machines(verdict)],
@@ -92,6 +92,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "digest": digest,
         "payload": embedded(page_payload(verdict)),
         "single": len(verdict.overall.standings) < 2,
+        "measure": verdict.quality.measure.replace("_", " "),
         "sections": [("verdict", "Verdict"), ("solvers", "Solvers"), ("figures", "Figures"), ("failures", "Failures"),
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
     }  # fmt: skip
@@ -140,8 +141,9 @@ def _picks(verdict: Verdict) -> list[dict[str, Any]]:
         first = section.choice.first
         lead = section.standing(first) if first else None
         if single:
-            mean = verdict.quality.figures["simulation_fit"][section.name].mean
-            word = f"{mean:.2f} %" if np.isfinite(mean) else "no fit"
+            mean = verdict.quality.figures[verdict.quality.measure][section.name].mean
+            shown = f"{100 * mean:.3g} %" if verdict.quality.measure == "parameter_error" else f"{mean:.2f} %"
+            word = shown if np.isfinite(mean) else "-"
             best = section.name in (verdict.quality.choice.first, *verdict.quality.choice.tied)
             tone, why = "good" if best else "fair", model_evidence(verdict.quality, section.name)
         else:

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.studies.averages import paired_difference
+from optid.studies.averages import paired_difference, paired_ratio
 from optid.studies.choice import Choice, choose
 from optid.studies.outcomes import NOT_RUN, Results
 from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
-MINOR = 0.1  # points of simulation fit that nobody would see in a plot
+MINOR = 0.1  # points of simulation fit that nobody would see in a plot; 10 % of a parameter error
+SMALLEST = 1e-12  # parameter errors below are roundoff
 WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
 SLACK = 0.5  # share of the records by which a formulation may stay behind: fits compare on common records anyway
 
@@ -37,7 +38,9 @@ class Quality:
         records: their number.
         solved: {formulation: records on which some solver reached the accuracy}.
         figures: {column: {formulation: figure}}; fits below `WORST` count as that.
-        choice: by simulation fit on the hold-out samples.
+        measure: column of the comparison: the simulation fit on the hold-out samples, or where no model has one the
+            parameter error.
+        choice: by this measure, in points of fit or as a ratio of errors.
         ranking: by the same over data sets.
         truth: whether the truth is known for some model.
     """
@@ -46,6 +49,7 @@ class Quality:
     records: int
     solved: dict[str, int]
     figures: dict[str, dict[str, Figure]]
+    measure: str
     choice: Choice
     ranking: Ranking
     truth: bool
@@ -78,11 +82,16 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
     }
     data = np.array([""] * records, dtype=object)
     data[case] = [f"{s}\0{d}" for s, d in zip(found.study, found.data)]
-    losses = 100.0 - values["simulation_fit"]
-    choice = choose(losses, names, MINOR, paired_difference, slack=SLACK, noun="record")
+    by_error = not np.isfinite(values["simulation_fit"]).any() and np.isfinite(values["parameter_error"]).any()
+    if by_error:
+        measure, losses = "parameter_error", np.maximum(values["parameter_error"], SMALLEST)
+        choice = choose(losses, names, MINOR, paired_ratio, none=1.0, slack=SLACK, noun="record")
+    else:
+        measure, losses = "simulation_fit", 100.0 - values["simulation_fit"]
+        choice = choose(losses, names, MINOR, paired_difference, slack=SLACK, noun="record")
     solved = {name: int((row[:, f] >= 0).sum()) for f, name in enumerate(names)}
     truth = bool(np.isfinite(values["parameter_error"]).any())
-    return Quality(names, records, solved, figures, choice, _ranking(found, losses, data, names), truth)
+    return Quality(names, records, solved, figures, measure, choice, _ranking(found, losses, data, names), truth)
 
 
 def _ranking(found: Results, losses: np.ndarray, data: np.ndarray, names: tuple[str, ...]) -> Ranking:
@@ -95,7 +104,8 @@ def _ranking(found: Results, losses: np.ndarray, data: np.ndarray, names: tuple[
     everywhere = np.array([all(tried[data == d, f].any() for d in labels) for f in range(len(names))], dtype=bool)
     kept = tuple(name for name, there in zip(names, everywhere) if there)
     out = tuple(name for name, there in zip(names, everywhere) if not there)
-    return rank_over_data_sets(scores_by_data_set(ranks_of_problems(losses[:, everywhere]), data), kept, out)
+    scores = scores_by_data_set(ranks_of_problems(losses[:, everywhere]), data)
+    return rank_over_data_sets(scores, kept, out, noun="formulation")
 
 
 def _mean(values: np.ndarray) -> float:

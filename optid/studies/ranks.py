@@ -133,7 +133,7 @@ def signed_ranks(differences: np.ndarray) -> float:
 
 
 def rank_over_data_sets(scores: np.ndarray, names: tuple[str, ...], left_out: tuple[str, ...] = (),
-                        level: float = 0.05) -> Ranking:
+                        level: float = 0.05, noun: str = "solver") -> Ranking:
     """Rank solvers over data sets and test the differences.
 
     Args:
@@ -141,18 +141,19 @@ def rank_over_data_sets(scores: np.ndarray, names: tuple[str, ...], left_out: tu
         names: the k solvers.
         left_out: solvers that could not take part, for the record.
         level: significance level.
+        noun: what is ranked.
 
     Returns:
         The ranking: Wilcoxon's signed ranks for two solvers, Friedman and Nemenyi for more. Fewer than
         `MINIMUM_DATA_SETS` data sets or two solvers give no test, and `missing` says so.
     """  # fmt: skip
-    n, k = scores.shape if scores.size else (0, len(names))
-    means = np.mean(rankdata(scores, axis=1), axis=0) if n else np.full(k, np.nan)
+    n, k = len(scores), len(names)
+    means = np.mean(rankdata(scores, axis=1), axis=0) if n and k else np.full(k, np.nan)
     order = sorted(range(k), key=lambda s: (means[s], names[s]))
     named, sorted_means = tuple(names[s] for s in order), means[order]
     missing = []
     if k < 2:
-        missing.append(f"at least 2 solvers that ran on every data set; there {'is' if k == 1 else 'are'} {k}")
+        missing.append(f"at least 2 {noun}s that ran on every data set; there {'is' if k == 1 else 'are'} {k}")
     if n < MINIMUM_DATA_SETS:
         missing.append(f"at least {MINIMUM_DATA_SETS} data sets; there {'is' if n == 1 else 'are'} {n}")
     nan = float("nan")
