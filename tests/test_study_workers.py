@@ -166,7 +166,7 @@ print("once", [row["outcome"] for row in execute([cell(0)], behave)])
 
 @pytest.mark.parametrize("number", [0, -2])
 def test_no_workers_are_refused(number):
-    with pytest.raises(StudyError, match="at least one process"):
+    with pytest.raises(StudyError, match="at least one, is needed"):
         list(execute([cell(0)], behave, workers=number))
 
 
@@ -179,6 +179,11 @@ def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatc
     monkeypatch.setattr("optid.studies.worker_process.PROGRAM", "import no_such_module_{parent}  # {path} {descriptor}")
     with pytest.raises(StudyError, match="5 workers, one after another, .*exit code 1, ModuleNotFoundError"):
         list(execute([cell(0)], behave))
+
+
+def test_a_path_object_in_the_search_path_is_no_obstacle(monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path, Path("/nowhere")])
+    assert by_key([cell(0)])[0]["outcome"] == "done"
 
 
 def test_nothing_to_do_starts_nobody():

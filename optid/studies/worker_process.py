@@ -45,7 +45,8 @@ class WorkerProcess:
     def __init__(self, function: bytes) -> None:
         ours, theirs = socket.socketpair()
         self._words = tempfile.TemporaryFile("ab+")
-        program = PROGRAM.format(path=sys.path, descriptor=theirs.fileno(), parent=os.getpid())
+        path = [str(place) for place in sys.path]  # a script may have put a Path into it
+        program = PROGRAM.format(path=path, descriptor=theirs.fileno(), parent=os.getpid())
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", program], pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL,
