@@ -367,10 +367,10 @@ def test_a_point_and_a_run_open_their_details_and_escape_closes_them(opened, row
     opened.where("#accuracy .plot svg")
     place = opened.run(CROSS)
     opened.mouse("mouseMoved", *place)
-    assert "residual" in opened.run("document.querySelector('#accuracy .tip').textContent")
+    opened.wait("document.querySelector('#accuracy .tip').textContent.includes('residual')", 10)
     opened.mouse("mousePressed", *place, button="left", clickCount=1)
     opened.mouse("mouseReleased", *place, button="left", clickCount=1)
-    assert opened.run("document.getElementById('detail').open")
+    opened.wait("document.getElementById('detail').open", 10)
     opened.click("#detail .close")
     assert not opened.run("document.getElementById('detail').open")
 
