@@ -143,7 +143,8 @@ def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
         DataError: an impossible share, or a stream.
     """
     if isinstance(record, Stream):
-        raise DataError("--split needs the record in memory; leave --stream and --scheduler out, or give --test another file")
+        raise DataError("--split needs the record in memory; leave --stream and --scheduler out, or give --test "
+                        "another file")
     return record.split(share)
 
 
