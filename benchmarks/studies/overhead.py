@@ -91,7 +91,8 @@ def functions_for(seconds: float) -> int:
     """Number of basis functions with which a relaxation takes about so long inside build and solve."""
     found = {}
     for functions in FUNCTIONS:
-        found[functions] = inside(run_cell(cells(relaxation(functions, 1))[0]))
+        cell = cells(relaxation(functions, 1))[0]
+        found[functions] = min(inside(run_cell(cell)) for _ in range(3))
         if found[functions] > 2 * seconds:
             break
     return min(found, key=lambda functions: abs(found[functions] - seconds))
