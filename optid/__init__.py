@@ -44,7 +44,7 @@ _HOME = {
     "RecursiveARX": "recursion",
     "Fault": "faults",
     "bootstrap": "resampling",
-    "Study": "studies.description",
+    "Study": "studies.definition.description",
     "design": "experiment",
     "frequency_response": "experiment",
 }

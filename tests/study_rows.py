@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.studies.rows import as_json, complete, place
+from optid.studies.storage.rows import as_json, complete, place
 
 START = datetime(2026, 3, 1, 8, 0, tzinfo=UTC)
 # solver: (factor of its time, share of runs that fail, share of false claims, exponent of the growth with N)

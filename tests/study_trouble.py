@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from optid.studies.description import DataEntry
+from optid.studies.definition.description import DataEntry
 from optid.studies.grid import Cell
-from optid.studies.rows import as_json, complete, place
+from optid.studies.storage.rows import as_json, complete, place
 
 FINE = "fine"
 

@@ -10,13 +10,13 @@ from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
 from optid.errors import StudyError
 from optid.solution import Status
-from optid.studies import cell as cells
-from optid.studies import memory
-from optid.studies.cell import lost_row, run_cell
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.execution import cell as cells
+from optid.studies.execution import memory
+from optid.studies.execution.cell import lost_row, run_cell
+from optid.studies.execution.memory import Peak
 from optid.studies.grid import cells as expand
-from optid.studies.memory import Peak
-from optid.studies.rows import NAMES
+from optid.studies.storage.rows import NAMES
 
 OPTIONS = {"na": 2, "nb": 2, "basis": "triangular:6"}
 

@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.errors import StudyError
 from optid.examples import example
-from optid.studies.comparison import compare
-from optid.studies.database import read_rows
-from optid.studies.rows import complete
+from optid.studies.storage.database import read_rows
+from optid.studies.storage.rows import complete
+from optid.studies.verdicts.comparison import compare
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
 STUDY = """
@@ -116,7 +116,7 @@ def test_data_that_changed_are_refused_until_accepted(folder):
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
-    from optid.studies import running
+    from optid.studies.execution import running
 
     def interrupted(study, db, *, progress, **settings):
         progress(0, 18, None)
@@ -136,7 +136,7 @@ def test_the_built_in_study_is_one(tmp_path, monkeypatch):
 
 
 def test_systems_are_listed():
-    from optid.studies.systems import SYSTEMS
+    from optid.studies.sources.systems import SYSTEMS
 
     found = run("study", "systems")
     assert found.exit_code == 0 and all(name in found.stdout for name in SYSTEMS)

@@ -17,11 +17,12 @@ from typer.testing import CliRunner
 
 from optid.cli.app import app
 from optid.errors import ClusterError, StudyError
-from optid.studies import Study, cluster, running, workers
-from optid.studies.database import finished, read_rows
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies import Study
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.execution import cluster, running, workers
 from optid.studies.grid import cells as cells_of
-from optid.studies.rows import NAMES
+from optid.studies.storage.database import finished, read_rows
+from optid.studies.storage.rows import NAMES
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
@@ -191,7 +192,7 @@ def test_closing_ends_the_cells_under_way(client, tmp_path):
     wait_for(lambda: log.exists() and len(log.read_text().splitlines()) >= 2)
     under_way.close()
     mine = [p for pid in client.run(os.getpid).values() for p in psutil.Process(pid).children()]
-    wait_for(lambda: not any(p.is_running() and "studies.worker" in " ".join(p.cmdline()) for p in mine))
+    wait_for(lambda: not any(p.is_running() and "studies.execution.worker" in " ".join(p.cmdline()) for p in mine))
     assert len(log.read_text().splitlines()) <= 4  # the others never start
     todo = [cell(k) for k in range(4)]
     by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)  # the cluster is as good as before
@@ -236,7 +237,7 @@ def copies_of(name, dask_worker):
 
 def pretend_no_files(folder):
     """On a Dask worker: files below a folder are not there."""
-    from optid.studies import cluster_worker
+    from optid.studies.execution import cluster_worker
 
     real = getattr(cluster_worker, "_real_content", None) or cluster_worker._content
     cluster_worker._real_content = real

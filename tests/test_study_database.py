@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from study_rows import rows
 
-from optid.studies import database
-from optid.studies.database import DatabaseError, append, data_hashes, export, finished, opened, read_rows
-from optid.studies.rows import COLUMNS, NAMES
+from optid.studies.storage import database
+from optid.studies.storage.database import DatabaseError, append, data_hashes, export, finished, opened, read_rows
+from optid.studies.storage.rows import COLUMNS, NAMES
 
 duckdb = pytest.importorskip("duckdb")
 

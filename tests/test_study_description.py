@@ -13,11 +13,11 @@ import optid
 from optid.errors import LookupFailed, StudyError
 from optid.examples import EXAMPLES
 from optid.studies import grid
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
-from optid.studies.positions import locate
-from optid.studies.records import load
-from optid.studies.systems import SYSTEMS, simulate
-from optid.studies.truth import Truth
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition.positions import locate
+from optid.studies.sources.records import load
+from optid.studies.sources.systems import SYSTEMS, simulate
+from optid.studies.sources.truth import Truth
 
 SMALL = """
 name = "small"
@@ -191,7 +191,8 @@ def test_a_broken_formulation_of_a_third_party_is_told(monkeypatch):
     from optid.registry import FORMULATIONS, registered
 
     known = {**registered(FORMULATIONS), "mine": EntryPoint("mine", "no_such_package:mine", FORMULATIONS)}
-    monkeypatch.setattr("optid.studies.entries.registered", lambda group: known if group == FORMULATIONS else {})
+    monkeypatch.setattr("optid.studies.definition.entries.registered",
+                        lambda group: known if group == FORMULATIONS else {})
     found = problems(SMALL.replace('"arx"', '"mine"').replace('constraints = ["monotone:increasing"]', ""))
     assert found == ["line 12, column 15: formulation 'mine' cannot be loaded: ModuleNotFoundError: No module named "
                      "'no_such_package'"]

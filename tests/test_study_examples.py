@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from optid.studies import grid
-from optid.studies.built_in import example_study
-from optid.studies.description import Study
+from optid.studies.definition.built_in import example_study
+from optid.studies.definition.description import Study
 
 FOLDER = Path(__file__).parent.parent / "examples" / "studies"
 STUDIES = sorted(path.stem for path in FOLDER.glob("*.toml"))
@@ -104,7 +104,7 @@ def test_the_table_in_the_documentation_says_that_nothing_is_unverified():
 
 
 def test_every_key_and_every_study_is_documented():
-    from optid.studies import entries
+    from optid.studies.definition import entries
 
     text = (FOLDER / "README.md").read_text()
     for keys in (entries._TOP, entries._DATA, entries._FORMULATION, entries._SOLVER):

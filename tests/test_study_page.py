@@ -11,10 +11,10 @@ from browser import CHROMIUM, NO_BROWSER, Browser
 from study_rows import rows as synthetic
 
 from optid.errors import DataError
-from optid.studies.outcomes import columns, states_of_rows, tabulate
 from optid.studies.page import embedded, render, write_page
 from optid.studies.payload import page_payload
-from optid.studies.verdict import conclude
+from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate
+from optid.studies.verdicts.verdict import conclude
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">"\'&amp;\u2028{{ 7 * 7 }}'

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from study_rows import rows as synthetic
 
-from optid.studies import database
-from optid.studies.journal import Journal
-from optid.studies.rows import COLUMNS, NAMES, OUTCOMES, STATUSES, as_json, complete, place
+from optid.studies.storage import database
+from optid.studies.storage.journal import Journal
+from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, STATUSES, as_json, complete, place
 
 pytest.importorskip("duckdb")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from study_rows import rows
 
-from optid.studies.rows import BY_NAME, COLUMNS, NAMES, OUTCOMES, as_json, complete, markdown
+from optid.studies.storage.rows import BY_NAME, COLUMNS, NAMES, OUTCOMES, as_json, complete, markdown
 
 
 def test_columns_have_distinct_names_and_a_meaning():

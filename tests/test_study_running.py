@@ -11,12 +11,12 @@ import study_trouble
 from study_trouble import behave, cell, row
 
 from optid.errors import DatabaseError, StudyError
-from optid.studies import running, workers
-from optid.studies.database import finished, opened, read_rows
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
-from optid.studies.journal import Journal, locked
-from optid.studies.rows import NAMES
-from optid.studies.running import run, run_to_frame
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.execution import running, workers
+from optid.studies.execution.running import run, run_to_frame
+from optid.studies.storage.database import finished, opened, read_rows
+from optid.studies.storage.journal import Journal, locked
+from optid.studies.storage.rows import NAMES
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
               (FormulationEntry("f", "arx", (), {"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
@@ -131,7 +131,7 @@ def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
 
 @pytest.mark.parametrize("after_commit", [False, True])
 def test_ctrl_c_while_a_batch_is_written_loses_nothing(path, grid, monkeypatch, after_commit):
-    from optid.studies import database
+    from optid.studies.storage import database
 
     monkeypatch.setattr(running, "BATCH", 4)
     real, calls = database.append, []
@@ -270,7 +270,7 @@ def test_two_runs_at_once_are_refused(path, grid):
 def test_the_lock_of_a_killed_run_is_free(path):
     program = f"""
 from pathlib import Path
-from optid.studies.journal import locked
+from optid.studies.storage.journal import locked
 with locked(Path({str(path)!r})):
     print("held", flush=True)
     input()
@@ -342,7 +342,7 @@ def test_a_real_study_from_python_to_its_frame():
     import numpy as np
 
     from optid import Data
-    from optid.studies.cell import run_cell
+    from optid.studies.execution.cell import run_cell
     from optid.studies.grid import cells
 
     pytest.importorskip("pandas")
@@ -371,7 +371,7 @@ import sys
 sys.path.insert(0, {tests!r})
 from functools import partial
 from study_trouble import behave, cell
-from optid.studies import running, workers
+from optid.studies.execution import running, workers
 from test_study_running import STUDY
 running.cells = lambda study: [cell(k, seconds=0.02, log={log!r}) for k in range({count})]
 running.run(STUDY, {path!r}, execute=partial(workers.execute, function=behave, workers=2))
@@ -410,7 +410,7 @@ import resource, signal, sys
 sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
 from study_trouble import cell
 from optid.errors import DatabaseError
-from optid.studies import running
+from optid.studies.execution import running
 from test_study_running import STUDY, Hands
 grid = [cell(k) for k in range(3000)]
 running.cells = lambda study: grid[:10]

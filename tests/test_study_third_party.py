@@ -59,7 +59,7 @@ def test_it_is_conformant(installed):
     code = ("import optid\n"
             "from optid.backends import find\n"
             "from optid.conformance import check_back_end, check_formulation\n"
-            "from optid.studies.systems import simulate\n"
+            "from optid.studies.sources.systems import simulate\n"
             "rows = check_back_end(find('predictor_corrector'))\n"
             "check_formulation('fir.decaying', simulate('linear', 300)[0], length=30)\n"
             "print(len(rows), sum(str(row.solution.status) == 'optimal' for row in rows))")
@@ -71,7 +71,7 @@ def test_it_takes_part_in_a_study(installed, tmp_path):
     (tmp_path / "study.toml").write_text(STUDY)
     printed = run(installed, "-m", "optid", "study", "run", "study.toml", "-w", "1", folder=tmp_path)
     assert "6 cells to run" in printed
-    from optid.studies.database import read_rows
+    from optid.studies.storage.database import read_rows
 
     rows = read_rows(tmp_path / "study.duckdb")
     status = {(f, s): (o, v) for f, s, o, v in zip(rows["formulation_name"], rows["solver"], rows["outcome"],

@@ -13,13 +13,13 @@ from study_rows import rows as synthetic
 
 from optid import solving
 from optid.errors import DataError
-from optid.studies.agreement import agreement_matrix, model_distance
-from optid.studies.averages import paired_difference, paired_ratio, shifted_geometric_mean
-from optid.studies.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
-from optid.studies.growth import time_growth
-from optid.studies.outcomes import columns, states_of_rows, tabulate, tolerance
-from optid.studies.profiles import performance_profiles, time_ratios
-from optid.studies.ranks import (
+from optid.studies.verdicts.agreement import agreement_matrix, model_distance
+from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
+from optid.studies.verdicts.growth import time_growth
+from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate, tolerance
+from optid.studies.verdicts.profiles import performance_profiles, time_ratios
+from optid.studies.verdicts.ranks import (
     MINIMUM_DATA_SETS,
     critical_difference,
     friedman,
@@ -27,7 +27,7 @@ from optid.studies.ranks import (
     ranks_of_problems,
     signed_ranks,
 )
-from optid.studies.verdict import conclude
+from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
 
@@ -756,7 +756,7 @@ def test_studies_of_one_database_are_kept_apart():
 
 def test_a_database_is_read(tmp_path):
     pytest.importorskip("duckdb")
-    from optid.studies import database
+    from optid.studies.storage import database
 
     rows = synthetic(300, 2)
     database.append(tmp_path / "s.duckdb", rows)

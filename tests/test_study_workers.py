@@ -13,9 +13,9 @@ import study_trouble
 from study_trouble import behave, cell
 
 from optid.errors import StudyError
-from optid.studies import workers
-from optid.studies.rows import NAMES
-from optid.studies.workers import execute
+from optid.studies.execution import workers
+from optid.studies.execution.workers import execute
+from optid.studies.storage.rows import NAMES
 
 
 def by_key(cells, **settings):
@@ -129,7 +129,8 @@ def test_closing_ends_the_workers_at_once():
     clock = time.monotonic()
     rows.close()
     assert gone(pid) and time.monotonic() - clock < 2.0
-    assert not [p for p in psutil.Process().children(recursive=True) if "optid.studies.worker" in " ".join(p.cmdline())]
+    mine = psutil.Process().children(recursive=True)
+    assert not [p for p in mine if "optid.studies.execution.worker" in " ".join(p.cmdline())]
 
 
 def test_workers_die_with_a_parent_that_is_killed(tmp_path):
@@ -137,7 +138,7 @@ def test_workers_die_with_a_parent_that_is_killed(tmp_path):
 import sys
 sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
 from study_trouble import behave, cell
-from optid.studies.workers import execute
+from optid.studies.execution.workers import execute
 for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behave, workers=2):
     print(row["unknowns"], flush=True)
 """
@@ -157,7 +158,7 @@ def test_no_guard_of_the_main_module_is_needed(tmp_path):
 import sys
 sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
 from study_trouble import behave, cell
-from optid.studies.workers import execute
+from optid.studies.execution.workers import execute
 print("once", [row["outcome"] for row in execute([cell(0)], behave)])
 """)
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
@@ -176,7 +177,8 @@ def test_a_function_without_a_name_is_refused():
 
 
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
-    monkeypatch.setattr("optid.studies.worker_process.PROGRAM", "import no_such_module_{parent}  # {path} {descriptor}")
+    program = "import no_such_module_{parent}  # {path} {descriptor}"
+    monkeypatch.setattr("optid.studies.execution.worker_process.PROGRAM", program)
     with pytest.raises(StudyError, match="5 workers, one after another, .*exit code 1, ModuleNotFoundError"):
         list(execute([cell(0)], behave))
 

@@ -28,9 +28,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 import optid
-from optid.studies import Study, database, running
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.rows import BY_NAME, NAMES
+from optid.studies import Study
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.execution import running
+from optid.studies.storage import database
+from optid.studies.storage.rows import BY_NAME, NAMES
 
 BASIS = "triangular:6"
 FORMULATIONS = {

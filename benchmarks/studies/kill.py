@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from optid.studies.database import finished, read_rows
-from optid.studies.description import Study
+from optid.studies.definition.description import Study
 from optid.studies.grid import cells
+from optid.studies.storage.database import finished, read_rows
 
 STUDY = """
 name = "three hundred cells"

@@ -25,9 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optid.studies import running, workers
-from optid.studies.cell import run_cell
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.execution import running, workers
+from optid.studies.execution.cell import run_cell
 from optid.studies.grid import cells
 
 HAMMERSTEIN = {"na": 2, "nb": 2, "basis": "triangular:8"}

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from optid.studies.database import append
 from optid.studies.page import write_page
+from optid.studies.storage.database import append
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import CHROMIUM, NO_BROWSER, Browser

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from optid.studies.database import read_rows
+from optid.studies.storage.database import read_rows
 
 SOLVERS = '''
 """Back ends that do not behave."""

@@ -14,7 +14,7 @@ from scipy.linalg import null_space
 from scipy.signal import lfilter
 
 import optid
-from optid.studies.systems import SYSTEMS, simulate
+from optid.studies.sources.systems import SYSTEMS, simulate
 
 A, B = np.array([-1.5, 0.7]), np.array([0.8, 0.6])
 NODES = np.linspace(-1, 1, 9)

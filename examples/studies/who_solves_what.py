@@ -10,7 +10,7 @@ import pandas as pd
 
 import optid
 from optid.backends import back_ends
-from optid.studies.outcomes import tolerance
+from optid.studies.verdicts.outcomes import tolerance
 
 HERE = Path(__file__).with_suffix("")
 

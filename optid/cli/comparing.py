@@ -85,9 +85,9 @@ def compare(
     """
     from optid.cli import arguments as words
     from optid.errors import StudyError
-    from optid.studies import running
-    from optid.studies.comparison import compare as side_by_side
-    from optid.studies.description import Study
+    from optid.studies.definition.description import Study
+    from optid.studies.execution import running
+    from optid.studies.verdicts.comparison import compare as side_by_side
 
     words.check_folders(report, db)
     entry, suggestion = _entry(data, how, example, seed)
@@ -163,8 +163,8 @@ def _as_options(text: str) -> str:
 
 def _show(found: Any, posed: str, record: str) -> None:
     from optid.showing.wording import number, seconds
-    from optid.studies.choice import listed
-    from optid.studies.outcomes import SOLVED
+    from optid.studies.verdicts.choice import listed
+    from optid.studies.verdicts.outcomes import SOLVED
 
     def clock(value: float) -> str:
         return "-" if value != value else seconds(value)

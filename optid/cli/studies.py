@@ -67,9 +67,10 @@ def run(
     """
     from optid.cli.arguments import check_folders
     from optid.errors import StudyError
-    from optid.studies import database, running
-    from optid.studies.built_in import example_study
-    from optid.studies.description import Study
+    from optid.studies.definition.built_in import example_study
+    from optid.studies.definition.description import Study
+    from optid.studies.execution import running
+    from optid.studies.storage import database
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
@@ -105,7 +106,7 @@ def report(
     """
     from optid.cli.arguments import check_folders
     from optid.studies.page import write_page
-    from optid.studies.verdict import conclude
+    from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
     verdict = conclude(db, accuracy=accuracy, time=clock)
@@ -125,7 +126,7 @@ def export(
     Example: optid study export study.duckdb rows.parquet
     """
     from optid.cli.arguments import check_folders
-    from optid.studies import database
+    from optid.studies.storage import database
 
     check_folders(target)
     say(f"{database.export(db, target)} rows written to {target}")
@@ -134,7 +135,7 @@ def export(
 @study.command(cls=Command)
 def systems() -> None:
     """List the simulated systems that a study file may name."""
-    from optid.studies.systems import SYSTEMS
+    from optid.studies.sources.systems import SYSTEMS
 
     table = Table(title="Simulated systems", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold",
                   pad_edge=False)
@@ -196,7 +197,8 @@ def _short(text: str) -> str:
 
 def _plan(described: Any, db: Path) -> None:
     """Print the size of a study and what is left of it."""
-    from optid.studies import database, grid
+    from optid.studies import grid
+    from optid.studies.storage import database
 
     cells = grid.cells(described)
     grid_left = grid.left(cells, database.finished(db))
@@ -208,8 +210,8 @@ def _plan(described: Any, db: Path) -> None:
 
 def _summary(db: Path, name: str) -> None:
     """Print how the cells ended, by solver, and the verdict in one line."""
-    from optid.studies.database import read_rows
-    from optid.studies.verdict import conclude
+    from optid.studies.storage.database import read_rows
+    from optid.studies.verdicts.verdict import conclude
 
     rows = read_rows(db, study=name)
     table = Table(title=name, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)

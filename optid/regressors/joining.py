@@ -1,7 +1,8 @@
 """Sums over the parts of a record that are read apart.
 
-A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter
-than the lags. Sums of different trees differ by rounding alone: a sum of n products in any order is off by at most n
+A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is
+associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter than the
+lags. Sums of different trees differ by rounding alone: a sum of n products in any order is off by at most n
 rounding errors of the sum of their magnitudes (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2),
 in practice by far less, and a tree over parts by less than one pass.
 """

@@ -5,6 +5,12 @@ A leaf: nothing in optid imports it but the command line and the public name `op
 
 from optid.lazy import on_first_use
 
-_HOME = {"Study": "description", "Cell": "grid", "conclude": "verdict", "Verdict": "verdict", "write_page": "page"}
+_HOME = {
+    "Study": "definition.description",
+    "Cell": "grid",
+    "conclude": "verdicts.verdict",
+    "Verdict": "verdicts.verdict",
+    "write_page": "page",
+}
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME, set())

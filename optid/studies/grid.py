@@ -12,8 +12,8 @@ import numpy as np
 from optid.backends import find
 from optid.data import Data
 from optid.errors import SolverMissing, StudyError
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry, Study
-from optid.studies.systems import system
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.sources.systems import system
 from optid.studies.versions import determining
 
 KEY_VERSION = 1

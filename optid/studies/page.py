@@ -13,13 +13,13 @@ from markupsafe import Markup
 from optid import __version__
 from optid.showing.page import template, versions
 from optid.showing.wording import Table, number, seconds
-from optid.studies.advice import Statement, choice_of_solver, evidence, model_evidence
-from optid.studies.choice import CANNOT_TELL
-from optid.studies.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.payload import page_payload
-from optid.studies.quality import FIGURES, Quality
-from optid.studies.rows import OUTCOMES
-from optid.studies.verdict import Verdict, conclude
+from optid.studies.storage.rows import OUTCOMES
+from optid.studies.verdicts.advice import Statement, choice_of_solver, evidence, model_evidence
+from optid.studies.verdicts.choice import CANNOT_TELL
+from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
+from optid.studies.verdicts.quality import FIGURES, Quality
+from optid.studies.verdicts.verdict import Verdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}

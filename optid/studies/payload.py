@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from optid.studies.advice import carries_over, choice_of_solver
-from optid.studies.agreement import Agreement
-from optid.studies.outcomes import TIMES, states_of_rows
-from optid.studies.profiles import Profile
-from optid.studies.rows import BY_NAME, COLUMNS
-from optid.studies.standings import Section, Standing
-from optid.studies.verdict import Verdict
+from optid.studies.storage.rows import BY_NAME, COLUMNS
+from optid.studies.verdicts.advice import carries_over, choice_of_solver
+from optid.studies.verdicts.agreement import Agreement
+from optid.studies.verdicts.outcomes import TIMES, states_of_rows
+from optid.studies.verdicts.profiles import Profile
+from optid.studies.verdicts.standings import Section, Standing
+from optid.studies.verdicts.verdict import Verdict
 
 TEXT_BUDGET = 1_500_000  # characters of different texts that a column may bring to the page
 POINTS = 400  # steps of a profile that a screen can show

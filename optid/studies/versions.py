@@ -30,7 +30,7 @@ def determining(formulation: str, solver: str, simulated: bool = False) -> dict[
     for name in ("gauss_newton", "uno", "ipopt", "clarabel", "scs") if solver == "auto" else (solver,):
         found |= _of_back_end(name)
     if simulated:
-        found["source of the systems"] = source_hash("optid.studies.systems")
+        found["source of the systems"] = source_hash("optid.studies.sources.systems")
     return found
 
 

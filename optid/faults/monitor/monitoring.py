@@ -163,7 +163,8 @@ class Monitor:
             and (g.basis.interval is None or g.basis.outside != "error") for g in model.nonlinearities
         )
         self._one = np.empty(1)
-        self._u, self._y = np.empty((1, model.m)), np.empty((1, model.l))
+        self._sample = np.empty(model.m + model.l)  # one array, so that one look finds what is infinite
+        self._u, self._y = self._sample[None, : model.m], self._sample[None, model.m :]
         self._f = np.empty((1, int(t.i[0, at.NF])))
         self._input_of = np.array(model.input_of, dtype=np.int64)
         width = 6 + len(self.labels) + max(c.dimension for c in self._chosen)
@@ -251,7 +252,7 @@ class Monitor:
                 f"sample {self.samples}: u = {u!r} and y = {y!r}; {self._u.size} and {self._y.size} numbers are "
                 "needed, NaN for one that is missing."
             ) from None
-        if np.isinf(self._u).any() or np.isinf(self._y).any():
+        if np.isinf(self._sample).any():
             raise DataError(f"sample {self.samples}: an infinite value; use NaN for one that is missing.")
         self._expand(self._u, self._f)
         _, found, refused = march(self._tables, self._state, self._feedback, self._f, self._y, self._event)

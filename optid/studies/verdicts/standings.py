@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.studies.averages import Paired, paired_ratio, shifted_geometric_mean
-from optid.studies.choice import Choice, choose
-from optid.studies.growth import Growth, time_growth
-from optid.studies.outcomes import SOLVED, Results, agreed_infeasible, applicable
-from optid.studies.profiles import Profile, performance_profiles, time_ratios
-from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
-from optid.studies.rows import REFUSED
+from optid.studies.storage.rows import REFUSED
+from optid.studies.verdicts.averages import Paired, paired_ratio, shifted_geometric_mean
+from optid.studies.verdicts.choice import Choice, choose
+from optid.studies.verdicts.growth import Growth, time_growth
+from optid.studies.verdicts.outcomes import SOLVED, Results, agreed_infeasible, applicable
+from optid.studies.verdicts.profiles import Profile, performance_profiles, time_ratios
+from optid.studies.verdicts.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
 MINOR = 0.1  # times closer than 10 % are equal for all practical purposes
 

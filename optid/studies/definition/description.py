@@ -15,7 +15,7 @@ class DataEntry:
     Attributes:
         name: its label.
         files: data files, one experiment each, relative to the folder of the study.
-        system: name of a simulated system (`optid.studies.systems`).
+        system: name of a simulated system (`optid.studies.sources.systems`).
         record: a record in memory, from Python only.
         samples: lengths of the simulated records; empty for the system's own.
         noise: standard deviations of the noise relative to the noise-free output; empty for the system's own.
@@ -109,9 +109,9 @@ class Study:
     folder: Path = field(default_factory=Path, compare=False)
 
     def __post_init__(self) -> None:
-        from optid.studies.entries import read
-        from optid.studies.problems import Problems
-        from optid.studies.writing import as_raw
+        from optid.studies.definition.entries import read
+        from optid.studies.definition.problems import Problems
+        from optid.studies.definition.writing import as_raw
 
         problems = Problems()
         found = read(as_raw({f.name: getattr(self, f.name) for f in fields(self)}, problems), problems)
@@ -130,7 +130,7 @@ class Study:
         Raises:
             StudyError: every problem with its line and column; data that cannot be read count as such.
         """
-        from optid.studies.study_file import read_study
+        from optid.studies.definition.study_file import read_study
 
         return read_study(Path(path))
 
@@ -146,7 +146,7 @@ class Study:
         Raises:
             StudyError: as for `from_toml`.
         """
-        from optid.studies.study_file import parse_study
+        from optid.studies.definition.study_file import parse_study
 
         return parse_study(text, Path(folder), label)
 
@@ -156,7 +156,7 @@ class Study:
         Raises:
             StudyError: a record in memory, which no file holds.
         """
-        from optid.studies.writing import as_toml
+        from optid.studies.definition.writing import as_toml
 
         return as_toml(self)
 
@@ -167,8 +167,8 @@ class Study:
             StudyError: lists the files and columns that are not there or cannot be read; where all can, the
                 formulations whose arguments or constraints fit none of their data.
         """
-        from optid.studies.problems import Problems
-        from optid.studies.trial import Records, note_impossible, note_unreadable
+        from optid.studies.definition.problems import Problems
+        from optid.studies.definition.trial import Records, note_impossible, note_unreadable
 
         if getattr(self, "data_checked", False):
             return
@@ -184,13 +184,13 @@ class Study:
 
         Args:
             db: database file, from which an interrupted study goes on; a temporary one when not given.
-            settings: workers, scheduler, progress and accept_changed_data of `optid.studies.running.run`.
+            settings: workers, scheduler, progress and accept_changed_data of `optid.studies.execution.running.run`.
 
         Returns:
-            A pandas frame with the columns of `optid.studies.rows`; a list of dictionaries where pandas is not
+            A pandas frame with the columns of `optid.studies.storage.rows`; a list of dictionaries where pandas is not
             installed.
         """
-        from optid.studies.running import run_to_frame
+        from optid.studies.execution.running import run_to_frame
 
         return run_to_frame(self, db, **settings)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import StudyError
-from optid.studies.positions import Path, Positions
+from optid.studies.definition.positions import Path, Positions
 
 LARGEST = 2**62  # whole numbers from here on have no place in the database
 

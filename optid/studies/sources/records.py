@@ -6,10 +6,10 @@ import numpy as np
 
 from optid.data import Data
 from optid.errors import DataError
-from optid.studies.description import DataEntry
+from optid.studies.definition.description import DataEntry
 from optid.studies.grid import Cell
-from optid.studies.systems import simulate
-from optid.studies.truth import Truth
+from optid.studies.sources.systems import simulate
+from optid.studies.sources.truth import Truth
 
 ANOTHER = 2**31
 """Added to the seed of a simulated record for the hold-out, which is a record of its own."""

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from optid.errors import StudyError
 from optid.isolated import GRACE
-from optid.studies.cell import lost_row, prepare, run_cell
+from optid.studies.execution.cell import lost_row, prepare, run_cell
+from optid.studies.execution.worker import RAISED, READY
 from optid.studies.grid import Cell
-from optid.studies.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
-from optid.studies.worker import RAISED, READY
+from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 
 if TYPE_CHECKING:
-    from optid.studies.worker_process import WorkerProcess
+    from optid.studies.execution.worker_process import WorkerProcess
 
 TICK = 0.1  # seconds between looks at time and memory of the workers
 FAMILY = 1.0  # seconds between looks at the children of workers, which take a scan of all processes
@@ -80,7 +80,7 @@ class Pool:
 
     def __init__(self, function: Callable[..., Any], size: int) -> None:
         try:
-            from optid.studies.worker_process import WorkerProcess
+            from optid.studies.execution.worker_process import WorkerProcess
         except ImportError:
             raise StudyError("workers are watched with psutil: pip install 'optid[study]'") from None
         try:

@@ -18,10 +18,10 @@ from typing import Any
 
 from optid.clusters import PACKAGES, connected, difference
 from optid.errors import ClusterError, StudyError
-from optid.studies import cluster_worker
-from optid.studies.cell import lost_row, run_cell
+from optid.studies.execution import cluster_worker
+from optid.studies.execution.cell import lost_row, run_cell
 from optid.studies.grid import Cell, content_hash
-from optid.studies.rows import CRASHED, ERROR
+from optid.studies.storage.rows import CRASHED, ERROR
 from optid.studies.versions import determining
 
 TICK = 1.0  # seconds between looks at the cluster while no cell ends

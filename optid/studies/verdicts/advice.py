@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 from optid.showing.wording import seconds
-from optid.studies.averages import Paired
-from optid.studies.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
-from optid.studies.quality import Quality
-from optid.studies.ranks import Ranking
-from optid.studies.standings import Section, Standing
+from optid.studies.verdicts.averages import Paired
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
+from optid.studies.verdicts.quality import Quality
+from optid.studies.verdicts.ranks import Ranking
+from optid.studies.verdicts.standings import Section, Standing
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.errors import DatabaseError, OptidError
-from optid.studies.rows import COLUMNS, NAMES, SCHEMA_VERSION, complete
+from optid.studies.storage.rows import COLUMNS, NAMES, SCHEMA_VERSION, complete
 
 if TYPE_CHECKING:
     import duckdb

@@ -12,13 +12,13 @@ import numpy as np
 
 from optid.data import Data
 from optid.errors import StudyError
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.entries import ALL
-from optid.studies.problems import Problems, shown
-from optid.studies.systems import SYSTEMS
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.definition.entries import ALL
+from optid.studies.definition.problems import Problems, shown
+from optid.studies.sources.systems import SYSTEMS
 
 if TYPE_CHECKING:
-    from optid.studies.description import Study
+    from optid.studies.definition.description import Study
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ALONE = ("accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout")

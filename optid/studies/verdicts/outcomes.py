@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
-from optid.studies.rows import BY_NAME, DONE, NON_FINITE, REFUSED, SUCCESS
+from optid.studies.storage.rows import BY_NAME, DONE, NON_FINITE, REFUSED, SUCCESS
 
 SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", "infeasible"

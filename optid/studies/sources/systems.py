@@ -12,7 +12,7 @@ from optid import examples, plants
 from optid.data import Data
 from optid.errors import DataError, LookupFailed, nearest
 from optid.plants.feedback import EXAMPLE1, TWO_MODES, FeedbackSystem
-from optid.studies.truth import Truth
+from optid.studies.sources.truth import Truth
 
 LENGTH = 200  # samples of an impulse response: it has decayed by then in every system here
 

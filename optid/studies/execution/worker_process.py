@@ -17,11 +17,13 @@ from typing import Any
 import psutil
 
 from optid.isolated import death
-from optid.studies.cell import lost_row
+from optid.studies.execution.cell import lost_row
+from optid.studies.execution.memory import MB
 from optid.studies.grid import Cell
-from optid.studies.memory import MB
 
-PROGRAM = "import sys; sys.path[:] = {path!r}; from optid.studies.worker import main; main({descriptor}, {parent})"
+PROGRAM = (
+    "import sys; sys.path[:] = {path!r}; from optid.studies.execution.worker import main; main({descriptor}, {parent})"
+)
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 TOLD = 100_000  # bytes of a dead worker's last words that are looked at
 LONGEST = 300  # characters of them in a reason

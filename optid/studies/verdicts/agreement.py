@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from optid.studies.outcomes import VALUE, Results
+from optid.studies.verdicts.outcomes import VALUE, Results
 
 MODEL = 1e-3  # a point is known to the square root of the accuracy of its objective
 

@@ -2,10 +2,10 @@
 
 from importlib.resources import files
 
-from optid.studies.description import Study
+from optid.studies.definition.description import Study
 
 
 def example_study() -> Study:
     """Return the built-in study."""
-    text = files("optid.studies").joinpath("example.toml").read_text(encoding="utf-8")
+    text = files("optid.studies.definition").joinpath("example.toml").read_text(encoding="utf-8")
     return Study.from_text(text, label="the built-in study")

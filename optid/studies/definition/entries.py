@@ -11,10 +11,10 @@ from optid.bases import parse
 from optid.data import Data
 from optid.errors import OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
-from optid.studies.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.positions import Path
-from optid.studies.problems import Problems, one_or_several, shown
-from optid.studies.systems import SYSTEMS
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.definition.positions import Path
+from optid.studies.definition.problems import Problems, one_or_several, shown
+from optid.studies.sources.systems import SYSTEMS
 
 AUTO, ALL = "auto", "all"
 

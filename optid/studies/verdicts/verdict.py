@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from optid.studies.advice import Statement, carries_over, choice_of_formulation, choice_of_solver, headline
-from optid.studies.agreement import Agreement, agreement_matrix
-from optid.studies.outcomes import CONTRADICTED, VALUE, Results, columns, tabulate, usual_accuracy
-from optid.studies.quality import Quality, compare_formulations
-from optid.studies.rows import REFUSED
-from optid.studies.standings import Section, compare_solvers
+from optid.studies.storage.rows import REFUSED
+from optid.studies.verdicts.advice import Statement, carries_over, choice_of_formulation, choice_of_solver, headline
+from optid.studies.verdicts.agreement import Agreement, agreement_matrix
+from optid.studies.verdicts.outcomes import CONTRADICTED, VALUE, Results, columns, tabulate, usual_accuracy
+from optid.studies.verdicts.quality import Quality, compare_formulations
+from optid.studies.verdicts.standings import Section, compare_solvers
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", l
         DatabaseError: the database cannot be read.
     """
     if isinstance(rows, str | Path):
-        from optid.studies.database import read_rows
+        from optid.studies.storage.database import read_rows
 
         rows = read_rows(rows)
     table = columns(rows)

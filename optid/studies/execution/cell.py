@@ -19,11 +19,11 @@ from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.fitting import Fit, fit
 from optid.solution import Solution, Times
 from optid.solving import NOT_FINITE, solve
-from optid.studies.environment import machine
+from optid.studies.execution.environment import machine
+from optid.studies.execution.memory import Peak
 from optid.studies.grid import Cell, content_hash
-from optid.studies.memory import Peak
-from optid.studies.records import Record, load
-from optid.studies.rows import (
+from optid.studies.sources.records import Record, load
+from optid.studies.storage.rows import (
     DONE,
     ERROR,
     MEMORY_LIMIT,

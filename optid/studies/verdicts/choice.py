@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.studies.averages import MINIMUM_PAIRS, Paired
+from optid.studies.verdicts.averages import MINIMUM_PAIRS, Paired
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
 VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2

@@ -5,11 +5,11 @@ import tomllib
 from pathlib import Path
 
 from optid.errors import StudyError
-from optid.studies.description import Study
-from optid.studies.entries import read
-from optid.studies.positions import locate
-from optid.studies.problems import Problems
-from optid.studies.trial import Records, note_impossible, note_unreadable
+from optid.studies.definition.description import Study
+from optid.studies.definition.entries import read
+from optid.studies.definition.positions import locate
+from optid.studies.definition.problems import Problems
+from optid.studies.definition.trial import Records, note_impossible, note_unreadable
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 

@@ -13,8 +13,8 @@ from tempfile import mkdtemp
 from typing import Any
 
 from optid.errors import ClusterError, StudyError
+from optid.studies.execution.workers import Pool
 from optid.studies.grid import Cell, content_hash
-from optid.studies.workers import Pool
 
 
 @dataclass
@@ -131,7 +131,7 @@ def _content(files: tuple[str, ...]) -> str:
 
 @lru_cache(maxsize=64)
 def _hash(files: tuple[str, ...], _: tuple[tuple[int, int], ...]) -> str:
-    from optid.studies.description import DataEntry
+    from optid.studies.definition.description import DataEntry
 
     try:
         return content_hash(DataEntry(name="files", files=files), Path())

@@ -10,9 +10,9 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
-from optid.studies.description import DataEntry, FormulationEntry
-from optid.studies.problems import Problems
-from optid.studies.systems import simulate, system
+from optid.studies.definition.description import DataEntry, FormulationEntry
+from optid.studies.definition.problems import Problems
+from optid.studies.sources.systems import simulate, system
 
 SHORT = 300
 """Samples on which a formulation is tried."""

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from optid.errors import DatabaseError, StudyError, nearest
-from optid.studies import database
-from optid.studies.cell import known, lost_row
-from optid.studies.description import Study
+from optid.studies.definition.description import Study
+from optid.studies.execution.cell import known, lost_row
 from optid.studies.grid import Cell, cells, check_unchanged, left
-from optid.studies.journal import Journal, locked
-from optid.studies.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
+from optid.studies.storage import database
+from optid.studies.storage.journal import Journal, locked
+from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 
 BATCH, EVERY = 500, 2.0  # rows, and seconds, after which what is in the journal goes to the database
 
@@ -87,11 +87,11 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: str | None) 
     if workers is not None and scheduler is not None:
         raise StudyError("workers are processes of this machine; a cluster has its own. Leave workers or scheduler out")
     if scheduler is not None:
-        from optid.studies import cluster
+        from optid.studies.execution import cluster
 
         cluster.check(grid, scheduler)
         return lambda todo: cluster.execute(todo, scheduler=scheduler)
-    from optid.studies import workers as processes
+    from optid.studies.execution import workers as processes
 
     processes.check_number(workers)
     return lambda todo: processes.execute(todo, workers=workers)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from optid.showing.wording import seconds
-from optid.studies.choice import listed
-from optid.studies.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, columns, tabulate
-from optid.studies.rows import ERROR, REFUSED
-from optid.studies.standings import MINOR
+from optid.studies.storage.rows import ERROR, REFUSED
+from optid.studies.verdicts.choice import listed
+from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, columns, tabulate
+from optid.studies.verdicts.standings import MINOR
 
 
 @dataclass(frozen=True)

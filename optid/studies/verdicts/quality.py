@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.studies.averages import paired_difference, paired_ratio
-from optid.studies.choice import Choice, choose
-from optid.studies.outcomes import NOT_RUN, Results
-from optid.studies.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
+from optid.studies.verdicts.averages import paired_difference, paired_ratio
+from optid.studies.verdicts.choice import Choice, choose
+from optid.studies.verdicts.outcomes import NOT_RUN, Results
+from optid.studies.verdicts.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
 MINOR = 0.1  # points of simulation fit that nobody would see in a plot; 10 % of a parameter error
 SMALLEST = 1e-12  # parameter errors below are roundoff

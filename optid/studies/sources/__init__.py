@@ -1,0 +1,1 @@
+"""Where records come from: files, and simulated systems with their truth."""

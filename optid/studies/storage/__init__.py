@@ -1,0 +1,1 @@
+"""Rows: what they hold, the database and the journal that outlives a kill."""

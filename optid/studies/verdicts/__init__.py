@@ -1,0 +1,1 @@
+"""From rows to a verdict: profiles, averages, ranks, growth, agreement, and advice in words."""
