@@ -1,8 +1,7 @@
 """Means over the seeds of a study, formulations side by side: python figures.py STUDY.toml STUDY.duckdb COLUMN ...
 
 What has no row in the database yet is run first. Columns are those of the rows (optid.studies.storage.rows); "excess"
-is the
-objective over that of the first formulation, minus one, in the same record.
+is the objective over that of the first formulation, minus one, in the same record.
 """
 
 import sys
