@@ -48,6 +48,7 @@ _HOME = {
     "design": "experiment",
     "frequency_response": "experiment",
 }
-_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "noise", "faults", "tracking"}
+_MODULES = {"signals", "bases", "plots", "report", "errors", "examples", "plants", "noise", "faults", "tracking",
+            "studies"}
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME, _MODULES)

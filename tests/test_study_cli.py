@@ -132,7 +132,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
 def test_the_built_in_study_is_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = run("study", "run", "--example", "--dry-run")
-    assert found.exit_code == 0 and "80 cells, 80 of them to run" in found.stdout
+    assert found.exit_code == 0 and "96 cells, 96 of them to run" in found.stdout
 
 
 def test_systems_are_listed():

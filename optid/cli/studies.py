@@ -1,4 +1,4 @@
-"""The commands of studies: run, report, export."""
+"""The commands of studies: run, report, export, systems, schema."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -148,6 +148,14 @@ def systems() -> None:
     output().print(table)
     output().print(Text("samples and noise are those used where a study names none; noise is relative to the "
                         "noise-free output.", "dim"))
+
+
+@study.command(cls=Command)
+def schema() -> None:
+    """Print what a row of the database holds, as Markdown."""
+    from optid.studies.storage.rows import markdown
+
+    typer.echo(markdown(), nl=False)
 
 
 @contextmanager
