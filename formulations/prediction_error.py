@@ -325,15 +325,16 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
                 reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
-                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}))
+                # every length of step was tried, so that what is promised within one optimum is curvature
+                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}, AGREE))
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
     reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
               "value")
-    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}))
+    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}, STALLED))
 
 
-def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any]
+def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any], share: float
            ) -> Generator[Program, Solution, Evidence]:
     """Judge where the steps ended by one more undamped programme; it may promise what a curved boundary does."""
     solution = yield here.program
@@ -341,9 +342,9 @@ def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any]
     if not solution.has_point or here.outside > INSIDE:
         return _evidence(posed, here, Status.LIMIT, reason, figures)
     gain = here.at.value - _quadratic(here.at, posed.pack(solution.values) - here.x)
-    if abs(gain) > STALLED * here.at.value + floor:
+    if abs(gain) > share * here.at.value + floor:
         return _evidence(posed, here, Status.LIMIT, reason, figures)
-    return _evidence(posed, here, *_judged(solution, gain, here.at.value, floor, STALLED), figures)
+    return _evidence(posed, here, *_judged(solution, gain, here.at.value, floor, share), figures)
 
 
 def criterion_floor(criterion: Criterion) -> float:
