@@ -45,6 +45,9 @@ NOWHERE = 1e-9
 PATIENCE = 5
 """Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
 
+PARTS = 10
+"""Halvings of an undamped step that are tried where no damped one descends."""
+
 STEPS = 100
 
 COMPARED = 1e-6
@@ -324,17 +327,37 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
+                shorter = yield from _shortened(posed, here, weight)
+                if shorter is not None:
+                    previous, here, damping, growth = here, shorter, 0.0, 4.0
+                    continue
                 reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
-                # every length of step was tried, so that what is promised within one optimum is curvature
-                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}, AGREE))
+                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}))
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
     reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
               "value")
-    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}, STALLED))
+    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}))
 
 
-def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any], share: float
+def _shortened(posed: Posed, here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
+    """Take a part of the undamped step: however damped, programmes end on a boundary that may be curved outwards.
+
+    A part of the way there is off it, where the point to start from is.
+    """
+    solution = yield here.program
+    if not solution.has_point:
+        return None
+    step = posed.pack(solution.values) - here.x
+    for part in 0.5 ** np.arange(1, PARTS + 1):
+        new = _reached(posed, here.x + part * step)
+        gain = here.at.value - _quadratic(here.at, part * step)
+        if new is not None and gain > 0 and here.merit(weight) - new.merit(weight) >= 1e-3 * gain:
+            return new
+    return None
+
+
+def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any]
            ) -> Generator[Program, Solution, Evidence]:
     """Judge where the steps ended by one more undamped programme; it may promise what a curved boundary does."""
     solution = yield here.program
@@ -342,9 +365,9 @@ def _ended(posed: Posed, here: _Iterate, reason: str, figures: Mapping[str, Any]
     if not solution.has_point or here.outside > INSIDE:
         return _evidence(posed, here, Status.LIMIT, reason, figures)
     gain = here.at.value - _quadratic(here.at, posed.pack(solution.values) - here.x)
-    if abs(gain) > share * here.at.value + floor:
+    if abs(gain) > STALLED * here.at.value + floor:
         return _evidence(posed, here, Status.LIMIT, reason, figures)
-    return _evidence(posed, here, *_judged(solution, gain, here.at.value, floor, share), figures)
+    return _evidence(posed, here, *_judged(solution, gain, here.at.value, floor, STALLED), figures)
 
 
 def criterion_floor(criterion: Criterion) -> float:
