@@ -1,4 +1,4 @@
-"""Shared test set-up: deterministic property tests and the folder with real data."""
+"""Shared test set-up: deterministic property tests, the folder with real data, a Dask cluster."""
 
 import os
 from pathlib import Path
@@ -20,3 +20,22 @@ def real_data() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("real data: set OPTID_DATA to the folder that holds the records")
     return Path(folder)
+
+
+@pytest.fixture(scope="module")
+def two_processes():
+    """A Dask cluster of two processes."""
+    dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
+    patient = {"distributed.deploy.lost-worker-timeout": "600s"}  # else one that starts slowly is given up
+    with (dask.config.set(patient),
+          distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster):
+        yield cluster
+
+
+@pytest.fixture
+def client(two_processes):
+    """A client of that cluster, when all its workers are there."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.Client(two_processes, set_as_default=False) as one:
+        one.wait_for_workers(2, timeout=180)  # the nanny replaces those that the test before killed
+        yield one

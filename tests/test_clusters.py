@@ -34,30 +34,15 @@ def folders(record, tmp_path):
     return record_folders(record, tmp_path)
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    patient = {"distributed.deploy.lost-worker-timeout": "600s"}  # else one that starts slowly is given up
-    with (dask.config.set(patient),
-          distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as local):
-        yield local
-
-
-@pytest.fixture
-def client(cluster):
-    with distributed.Client(cluster, set_as_default=False) as one:
-        one.wait_for_workers(2, timeout=180)  # the nanny replaces those that the test before killed
-        yield one
-
-
 def digits(fit):
     statistics = fit.program.compressed.statistics
     return np.concatenate([statistics.gram.ravel(), fit.model.a, fit.model.b[0]])
 
 
-def test_parquet_folders_on_workers(record, folders, cluster, client):
+def test_parquet_folders_on_workers(record, folders, two_processes, client):
     whole = optid.fit(record, **STRUCTURE)
     here = optid.fit(optid.open_stream(folders), **STRUCTURE)
-    there = optid.fit(optid.open_stream(folders, scheduler=cluster.scheduler_address), **STRUCTURE)
+    there = optid.fit(optid.open_stream(folders, scheduler=two_processes.scheduler_address), **STRUCTURE)
     again = optid.fit(optid.open_stream([str(folder) for folder in folders], scheduler=client), **STRUCTURE)
     assert_same_fit(there, whole)
     for other in (there, again):
@@ -97,7 +82,7 @@ def test_triangular_factors_are_reduced_too(client):
     np.testing.assert_allclose(there.root / norms, whole.root / norms, rtol=0, atol=1e-15 * whole.condition)
 
 
-def test_a_worker_killed_in_the_middle_changes_no_digit(record, cluster, client, tmp_path):
+def test_a_worker_killed_in_the_middle_changes_no_digit(record, two_processes, client, tmp_path):
     """The fifth partition kills the process that computes it, once; what that worker had done is done again."""
     e = record.experiments[0]
     flag = tmp_path / "killed"
@@ -124,8 +109,8 @@ def test_a_worker_killed_in_the_middle_changes_no_digit(record, cluster, client,
     np.testing.assert_array_equal(digits(there), digits(here))
 
 
-def test_a_partition_that_kills_every_worker_is_an_error_in_words(cluster, client, monkeypatch):
-    monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)
+def test_a_partition_that_kills_every_worker_is_an_error_in_words(two_processes, client, monkeypatch):
+    monkeypatch.setattr(two_processes.scheduler, "allowed_failures", 0)
 
     def deadly(block):
         import os
@@ -189,8 +174,8 @@ def greet_once(server, greeting):
         time.sleep(1)
 
 
-def test_a_client_that_does_not_run_is_refused(cluster):
-    client = distributed.Client(cluster, set_as_default=False)
+def test_a_client_that_does_not_run_is_refused(two_processes):
+    client = distributed.Client(two_processes, set_as_default=False)
     client.close()
     assert "the Client is closed" in refused(client)
 

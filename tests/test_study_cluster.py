@@ -3,15 +3,14 @@
 import os
 import signal
 import threading
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from zlib import crc32
 
 import numpy as np
-import psutil
 import pytest
+from processes import cell_workers, gone, wait_for
 from study_trouble import behave, cell
 from typer.testing import CliRunner
 
@@ -31,21 +30,6 @@ TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve
          "base_mb", "started"}
 
 
-@pytest.fixture(scope="module")
-def local():
-    patient = {"distributed.deploy.lost-worker-timeout": "600s"}  # else one that starts slowly is given up
-    with (dask.config.set(patient),
-          distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as one):
-        yield one
-
-
-@pytest.fixture
-def client(local):
-    with distributed.Client(local, set_as_default=False) as one:
-        one.wait_for_workers(2, timeout=180)  # the nanny replaces those that the test before killed
-        yield one
-
-
 def by_key(found, todo):
     """Rows by number of the cell; every cell has exactly one."""
     rows = {int(row["key"], 16): row for row in found}
@@ -54,21 +38,7 @@ def by_key(found, todo):
     return rows
 
 
-def gone(pid):
-    try:
-        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return True
-
-
-def wait_for(condition, seconds=30.0):
-    until = time.monotonic() + seconds
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert condition()
-
-
-def test_rows_are_those_of_one_machine(client, local):
+def test_rows_are_those_of_one_machine(client, two_processes):
     """Several formulations, a refused pair, systems of the catalogue: equal in every column but times and memory."""
     study = Study(name="both", time_limit=60.0, seeds=(1, 2),
                   data=(DataEntry("rig", system="dead_zone", samples=(200,), noise=(0.1,)),),
@@ -79,7 +49,8 @@ def test_rows_are_those_of_one_machine(client, local):
                   solvers=(SolverEntry("gn", "gauss_newton"), SolverEntry("clarabel", "clarabel")))
     todo = cells_of(study)
     here = {(row["key"], row["repetition"]): row for row in workers.execute(todo, workers=1)}
-    there = {(row["key"], row["repetition"]): row for row in cluster.execute(todo, scheduler=local.scheduler_address)}
+    found = cluster.execute(todo, scheduler=two_processes.scheduler_address)
+    there = {(row["key"], row["repetition"]): row for row in found}
     assert set(here) == set(there) and len(here) == len(todo) == 8
     assert Counter(row["outcome"] for row in here.values())["done"] >= 4
     for key, row in here.items():
@@ -171,9 +142,9 @@ nb = 1
     assert not (tmp_path / "s.duckdb").exists()
 
 
-def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, local, monkeypatch, tmp_path):
+def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, two_processes, monkeypatch, tmp_path):
     """It is not run for ever: Dask gives up a task after some workers."""
-    monkeypatch.setattr(local.scheduler, "allowed_failures", 0)
+    monkeypatch.setattr(two_processes.scheduler, "allowed_failures", 0)
     monkeypatch.setattr(cluster, "TURNS", 1)
     todo = [cell(0, seconds=60.0)]
     killer = threading.Timer(4.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in client.run(os.getpid).values()])
@@ -190,9 +161,9 @@ def test_closing_ends_the_cells_under_way(client, tmp_path):
     row = next(under_way)
     assert int(row["key"], 16) == 0
     wait_for(lambda: log.exists() and len(log.read_text().splitlines()) >= 2)
+    assert any(map(cell_workers, client.run(os.getpid).values()))
     under_way.close()
-    mine = [p for pid in client.run(os.getpid).values() for p in psutil.Process(pid).children()]
-    wait_for(lambda: not any(p.is_running() and "studies.execution.worker" in " ".join(p.cmdline()) for p in mine))
+    wait_for(lambda: not any(map(cell_workers, client.run(os.getpid).values())))
     assert len(log.read_text().splitlines()) <= 4  # the others never start
     todo = [cell(k) for k in range(4)]
     by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)  # the cluster is as good as before

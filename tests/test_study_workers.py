@@ -1,15 +1,16 @@
 """Workers: whatever a cell does to its process is a row, and the others go on."""
 
+import os
 import re
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
 import study_trouble
+from processes import cell_workers, gone, wait_for
 from study_trouble import behave, cell
 
 from optid.errors import StudyError
@@ -25,19 +26,6 @@ def by_key(cells, **settings):
     assert len(rows) == len(cells) == len(found) and set(found) == {int(c.key, 16) for c in cells}
     assert all(tuple(row) == NAMES for row in rows)
     return found
-
-
-def gone(pid):
-    with suppress(psutil.NoSuchProcess):
-        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
-    return True
-
-
-def wait_for(condition, seconds=20.0):
-    until = time.monotonic() + seconds
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.02)
-    assert condition()
 
 
 def test_workers_are_reused():
@@ -126,11 +114,11 @@ def test_a_cell_that_cannot_be_sent_is_a_row():
 def test_closing_ends_the_workers_at_once():
     rows = execute([cell(0), cell(1, "loop"), cell(2, "loop")], behave, workers=2)
     pid = next(rows)["unknowns"]
+    assert pid in cell_workers(os.getpid())
     clock = time.monotonic()
     rows.close()
     assert gone(pid) and time.monotonic() - clock < 2.0
-    mine = psutil.Process().children(recursive=True)
-    assert not [p for p in mine if "optid.studies.execution.worker" in " ".join(p.cmdline())]
+    assert not cell_workers(os.getpid())
 
 
 def test_workers_die_with_a_parent_that_is_killed(tmp_path):
