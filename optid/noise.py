@@ -43,6 +43,16 @@ RATIOS = (1e-2, 1.0, 1e2)
 TRIED = 2
 """Starts that are refined, the best of all."""
 
+BLOCK, BLOCKS, PER_ENTRY = 1024, 6, 50
+"""Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
+in."""
+
+ELSEWHERE = 0.01
+"""Difference of two log-likelihoods beyond which their gains are not the same optimum."""
+
+NEAR = 1e-8
+"""Damping of the first step from the optimum of a part."""
+
 
 class Noise(NamedTuple):
     """The noise model of a state-space model.
@@ -81,8 +91,7 @@ def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
     if not np.nanmax(np.abs(np.vstack(rest)), initial=0.0) > ROUNDING * level:
         return Noise(observer, NoiseCovariances.of_innovations(observer, covariance_of(rest)))
     A = model.A - observer @ model.C
-    found = [refined(A, model.C, gain, rest) for gain in _starts(A, model.C, rest)[:TRIED]]
-    gain, covariance = min(found, key=lambda pair: log_determinant(pair[1]))
+    gain, covariance = _most_likely(A, model.C, rest)
     return Noise(observer + gain, NoiseCovariances.of_innovations(observer + gain, covariance))
 
 
@@ -148,6 +157,31 @@ def output_noise(model: "HammersteinSS") -> Array:
         return np.full((model.l, model.l), np.inf)
     states = solve_discrete_lyapunov(model.A, model.K @ model.noise.innovation @ model.K.T)
     return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
+
+
+def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
+    """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part.
+
+    The optimum of the part lies a few standard errors of the whole away, which two or three steps overcome.
+    """
+    part = _part(rest, C.size)
+    found = [refined(A, C, gain, part) for gain in _starts(A, C, part)[:TRIED]]
+    found.sort(key=lambda pair: log_determinant(pair[1]))
+    if part is not rest:
+        same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
+        optima = [found[0], *(other for other in found[1:] if log_determinant(other[1]) > same)]
+        found = [refined(A, C, gain, rest, NEAR) for gain, _ in optima]
+    return min(found, key=lambda pair: log_determinant(pair[1]))
+
+
+def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
+    """Blocks spread evenly over a long record; all of it where it is short or where they show too little."""
+    wanted, total = max(BLOCK * BLOCKS, PER_ENTRY * entries), sum(map(len, rest))
+    blocks = [r[start : start + BLOCK] for r in rest for start in range(0, len(r), BLOCK)]
+    part = blocks[:: max(1, total // wanted)]
+    complete = sum(int(np.sum(~np.isnan(r).any(axis=1))) for r in part)
+    shown = 2 * complete >= wanted and np.all(np.diag(covariance_of(part)) > 0)
+    return part if total > 2 * wanted and shown else rest
 
 
 def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:

@@ -13,11 +13,14 @@ from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
 
-STEPS, TOLERANCE, LARGEST = 50, 1e-10, 1e8
-"""Steps at most; gain of the logarithm below which they have arrived; damping beyond which none descends."""
+STEPS = 50
+"""Steps at most."""
+
+ARRIVED = 1e-4
+"""Gain of the log-likelihood still to be expected at which a search ends; half a unit is one standard error."""
 
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
+def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], damping: float = 1e-4) -> tuple[Array, Array]:
     """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
 
     A step that makes the predictor unstable is replaced by the stable gain of the same spectrum.
@@ -27,27 +30,28 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> tuple[Arr
         C: (l, n).
         gain: (n, l) start.
         rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
+        damping: of the first step, relative to the diagonal of the normal equations.
 
     Returns:
         The gain and the covariance (l, l) of its innovations.
     """
-    best, damping = innovations_covariance(A, C, gain, rest), 1e-4
+    best, before = innovations_covariance(A, C, gain, rest), 0.0
     for _ in range(STEPS):
         normal, right = _equations(A, C, gain, rest, best)
-        found, trial = None, gain
-        while damping < LARGEST and found is None:
-            step = _solved(normal + damping * np.diag(np.diag(normal)), right).reshape(gain.shape[::-1]).T
-            trial = _stable(A, C, gain + step, best)
+        promised, descends = np.inf, False
+        while not descends and promised > ARRIVED:
+            step = _solved(normal + damping * np.diag(np.diag(normal)), right)
+            promised = 0.5 * float(right @ step)
+            trial = _stable(A, C, gain + step.reshape(gain.shape[::-1]).T, best)
             covariance = innovations_covariance(A, C, trial, rest)
-            if log_determinant(covariance) < log_determinant(best):
-                found = covariance
-            damping *= 0.1 if found is not None else 10.0
-        if found is None:
+            descends = log_determinant(covariance) < log_determinant(best)
+            damping *= 0.1 if descends else 10.0
+        if not descends:
             break
-        gained = log_determinant(best) - log_determinant(found)
-        gain, best = trial, found
-        if gained < TOLERANCE:
+        gain, best = trial, covariance
+        if promised * (promised / before if before else 1.0) < ARRIVED:  # steps shrink at a rate or faster
             break
+        before = promised
     return gain, best
 
 
@@ -69,10 +73,13 @@ def covariance_of(signals: Sequence[Array]) -> Array:
     count = signals[0].shape[1]
     sums, pairs = np.zeros((count, count)), np.zeros((count, count))
     for s in signals:
-        here = ~np.isnan(s)
-        filled = np.where(here, s, 0.0)
-        sums += filled.T @ filled
-        pairs += here.T.astype(float) @ here.astype(float)
+        products, present = s.T @ s, np.full((count, count), float(len(s)))
+        if np.isnan(products).any():
+            here = ~np.isnan(s)
+            filled, here = np.where(here, s, 0.0), here.astype(float)
+            products, present = filled.T @ filled, here.T @ here
+        sums += products
+        pairs += present
     found = sums / np.maximum(pairs, 1.0)
     return (found + found.T) / 2
 

@@ -41,28 +41,35 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         model: a model in the units of the data.
         data: the record it was identified on.
     """
-    gain = observer_gain(model.A, model.C)
-    errors, outputs = [], []
-    for e in data.experiments:
-        for start, stop in runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1))):
-            f, y = model.expanded(e.u[start:stop]), e.y[start:stop]
-            drive = f @ model.B.T + y @ model.L.T + model.offset_x
-            for column, g, o in zip(model.E.T, model.feedback, model.output_of):
-                drive = drive + np.outer(g(y[:, o]), column)
-            direct = f @ model.D.T + model.offset_y
-            errors.append(prediction_errors(model.A, model.C, gain, drive, direct, y))
-            outputs.append(y)
-    if not errors or np.all(np.std(np.concatenate(errors), axis=0) <= EXACT * np.std(np.concatenate(outputs), axis=0)):
-        return model, "none: the prediction errors vanish, there is no noise to model"
+    stretches = [(e.u[start:stop], e.y[start:stop]) for e in data.experiments
+                 for start, stop in runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1)))]
     try:
-        k, noise = innovation_form(model.A, model.C, gain, errors)
-        if any(data.missing[name] for name in data.inputs):  # the complete stretches alone
-            return replace(model, K=k, noise=noise), ""
-        from optid.noise import with_noise
+        regression_lags([len(y) for _, y in stretches], *model.K.shape)
+        if any(data.missing[name] for name in data.inputs):
+            found = _of_stretches(model, stretches)
+        else:
+            from optid.noise import with_noise
 
-        return with_noise(model, data), ""
+            found = with_noise(model, data)
     except StructureError as reason:
         return model, f"none: {reason}"
+    spread = np.std(np.concatenate([y for _, y in stretches]), axis=0)
+    if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
+        return model, "none: the prediction errors vanish, there is no noise to model"
+    return found, ""
+
+
+def _of_stretches(model: "HammersteinSS", stretches: Sequence[tuple[Array, Array]]) -> "HammersteinSS":
+    """Return the model with the innovation form of the prediction errors of complete stretches (u, y)."""
+    gain, errors = observer_gain(model.A, model.C), []
+    for u, y in stretches:
+        f = model.expanded(u)
+        drive = f @ model.B.T + y @ model.L.T + model.offset_x
+        for column, g, o in zip(model.E.T, model.feedback, model.output_of):
+            drive = drive + np.outer(g(y[:, o]), column)
+        errors.append(prediction_errors(model.A, model.C, gain, drive, f @ model.D.T + model.offset_y, y))
+    k, noise = innovation_form(model.A, model.C, gain, errors)
+    return replace(model, K=k, noise=noise)
 
 
 def prediction_errors(a: Array, c: Array, gain: Array, drive: Array, direct: Array, y: Array) -> Array:
@@ -102,6 +109,19 @@ def _settling(inner: Array) -> int:
     return 2000 if radius >= 0.99 else int(min(2000, 10 + len(inner) + np.log(1e-8) / np.log(max(radius, 0.1))))
 
 
+def regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
+    """Return the lags of the autoregression of the errors of l outputs, in complete runs of some lengths, order n.
+
+    Raises:
+        StructureError: too few for a noise model.
+    """
+    total = sum(lengths)
+    lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))
+    if max(lengths, default=0) <= 2 * lags or total < 10 * (lags + n) * l:
+        raise StructureError(f"{total} prediction errors are too few for a noise model.")
+    return lags
+
+
 def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) -> tuple[Array, NoiseCovariances]:
     """Return K (n, l) and the covariances of the noises from the errors of an observer.
 
@@ -116,11 +136,9 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
     """
     from optid.subspace.kernels import state_run
 
-    (n, l), total = gain.shape, sum(map(len, errors))  # noqa: E741
-    lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))
+    n, l = gain.shape  # noqa: E741
+    lags = regression_lags([len(part) for part in errors], n, l)
     errors = [part for part in errors if len(part) > 2 * lags]
-    if not errors or total < 10 * (lags + n) * l:
-        raise StructureError(f"{total} prediction errors are too few for a noise model.")
     root = np.zeros((lags * l + l, lags * l + l))
     for part in errors:
         for rows in _lagged(part, lags):
