@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+GRADIENT = 10.0  # gradients are less sharp than values: at a smooth minimum an error e in f is one of sqrt(e) in them
+
 
 class Status(Enum):
     """Why a solve stopped, after our own residuals have judged the solver's claim."""
@@ -148,6 +150,14 @@ class Solution:
         if self.bound is None or not self.has_point:
             return float("inf")
         return relative_gap(self.objective, self.bound.value, self.scale)
+
+
+def tolerance(accuracy: float) -> float:
+    """Return the residual up to which a claim of success at a requested relative accuracy stands.
+
+    It holds for violation and complementarity; the stationarity may be `GRADIENT` times as large.
+    """
+    return max(100.0 * accuracy, 1e-7)
 
 
 def relative_gap(objective: float, bound: float, scale: float) -> float:

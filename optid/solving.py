@@ -12,13 +12,12 @@ from optid.errors import SolverRefused, StructureError
 from optid.isolated import run_isolated
 from optid.judging import judge, measure_violation, value_size
 from optid.program import Program, Values
-from optid.solution import Bound, Residuals, Solution, Status, Times, relative_gap
+from optid.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
 
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
 NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
-GRADIENT = 10.0  # gradients are less sharp than values: at a smooth minimum an error e in f is one of sqrt(e) in them
 
 
 def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
@@ -138,11 +137,6 @@ def _overflowed(program: Program) -> bool:
     return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
 
 
-def _tolerance(accuracy: float) -> float:
-    """Residual up to which a claim of success at the requested accuracy stands."""
-    return max(100.0 * accuracy, 1e-7)
-
-
 def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status, str]:
     """Judge a claim that comes without a point."""
     if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
@@ -156,9 +150,9 @@ def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status,
 
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
     """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
-    tolerance = _tolerance(accuracy)
+    limit = tolerance(accuracy)
     claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
-    outside = residuals.violation > tolerance
+    outside = residuals.violation > limit
     amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
     if answer.status is Status.INFEASIBLE and not outside:
         return Status.FAILED, f"{name} says infeasible at a point that satisfies every constraint"
@@ -168,7 +162,7 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
         if residuals.violation > LIE:
             return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
         return Status.INACCURATE, amount
-    if residuals.stationarity > GRADIENT * tolerance or residuals.complementarity > tolerance:
+    if residuals.stationarity > GRADIENT * limit or residuals.complementarity > limit:
         return Status.INACCURATE, (
             f"{name + ' claims success' if claims else answer.word}, but the point is not stationary: "
             f"residual {residuals.stationarity:.1e}, complementarity {residuals.complementarity:.1e}")
@@ -186,7 +180,7 @@ def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) ->
         return False
     if np.isfinite(point.residuals.stationarity) or program.kind == "NLP":
         return False
-    return relative_gap(point.objective, bound.value, program.scale) > _tolerance(accuracy)
+    return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
 
 
 def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from study_rows import rows as synthetic
 
 from optid import solving
+from optid.backends import Answer
 from optid.errors import DataError
+from optid.solution import Residuals, Status
 from optid.studies.verdicts.agreement import agreement_matrix, model_distance
 from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
 from optid.studies.verdicts.growth import time_growth
-from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate, tolerance
+from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate
 from optid.studies.verdicts.profiles import performance_profiles, time_ratios
 from optid.studies.verdicts.ranks import (
     MINIMUM_DATA_SETS,
@@ -58,9 +60,13 @@ def table_of(times, **more):
 # ---- which runs count
 
 
-def test_the_tolerance_is_the_one_that_solving_judges_by():
-    for accuracy in (1e-2, 1e-4, 1e-6, 1e-8, 1e-12):
-        assert tolerance(accuracy) == solving._tolerance(accuracy)
+@given(st.sampled_from([1e-3, 1e-6, 1e-8, 1e-12]), st.tuples(*[st.floats(-12.0, 1.0)] * 3))
+def test_at_its_own_accuracy_a_run_counts_exactly_where_solving_says_so(accuracy, exponents):
+    violation, stationarity, complementarity = (float(10**e) for e in exponents)
+    residuals = Residuals(violation, "gain", stationarity, complementarity)
+    status, _ = solving._status(Answer(Status.OPTIMAL, "solved"), residuals, accuracy, "a")
+    row = run("a", accuracy=accuracy, violation=violation, stationarity=stationarity, complementarity=complementarity)
+    assert (tabulate(columns([row])).state[0, 0] == "solved") == (status is Status.LOCAL)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +83,9 @@ def test_the_tolerance_is_the_one_that_solving_judges_by():
         ({"status_verified": ""}, "failed"),
         ({"objective": NAN}, "non-finite"),
         ({"violation": 2e-6}, "less accurate"),
-        ({"stationarity": 2e-6}, "less accurate"),
+        ({"stationarity": 2e-6}, "solved"),  # gradients may be ten times as large
+        ({"stationarity": 2e-5}, "less accurate"),
+        ({"complementarity": 2e-6}, "less accurate"),
         ({"stationarity": NAN}, "solved"),
         ({"objective": 1.0 + 2e-6}, "worse minimum"),
         ({"objective": 1.0 + 5e-7}, "solved"),

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from optid.solution import GRADIENT
 from optid.studies.storage.rows import BY_NAME, COLUMNS
 from optid.studies.verdicts.advice import carries_over, choice_of_solver
 from optid.studies.verdicts.agreement import Agreement
-from optid.studies.verdicts.outcomes import TIMES, states_of_rows
+from optid.studies.verdicts.outcomes import TIMES, seconds_of, states_of_rows, worst_residual
 from optid.studies.verdicts.profiles import Profile
 from optid.studies.verdicts.standings import Section, Standing
 from optid.studies.verdicts.verdict import Verdict
@@ -103,13 +104,11 @@ def _agreement(agreement: Agreement) -> dict[str, Any]:
 
 
 def _columns(table: Mapping[str, np.ndarray], states: np.ndarray, time: str) -> list[dict[str, Any]]:
-    parts = TIMES[time]
-    seconds = table[parts[-1]] + sum(np.nan_to_num(table[part]) for part in parts[:-1])
-    residual = np.fmax(table["violation"], table["stationarity"])
     made = [
         _texts("state", "solved, or why it does not count", states),
-        _numbers("time_s", "the time compared: " + " + ".join(parts), "s", seconds, 5),
-        _numbers("residual", "larger of violation and stationarity", "", residual, 3),
+        _numbers("time_s", "the time compared: " + " + ".join(TIMES[time]), "s", seconds_of(table, time), 5),
+        _numbers("residual", f"largest of violation, complementarity and stationarity / {GRADIENT:g}", "",
+                 worst_residual(table), 3),
     ]
     for column in COLUMNS:
         values = table[column.name]

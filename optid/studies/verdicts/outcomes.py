@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
+from optid.solution import GRADIENT, tolerance
 from optid.studies.storage.rows import BY_NAME, DONE, NON_FINITE, REFUSED, SUCCESS
 
 SOLVED, NOT_RUN = "solved", "not run"
@@ -29,11 +30,6 @@ MEANINGS = {
     NOT_RUN: "no run in the database",
 }
 """What the words of the failure table mean beyond the outcomes and statuses of a row."""
-
-
-def tolerance(accuracy: float) -> float:
-    """Return the residual up to which a requested accuracy counts as reached: the rule of `optid.solving`."""
-    return max(100.0 * accuracy, 1e-7)
 
 
 def columns(rows: Any) -> dict[str, np.ndarray]:
@@ -127,7 +123,7 @@ class Results:
         time: median over the repetitions in seconds, (P, S); ``nan`` unless solved.
         objective: (P, S), of the runs whose verified accuracy was reached, local minima included; ``nan`` otherwise.
         size: yardstick of differences of objectives, (P,).
-        residual: worst verified residual, (P, S), wherever there is a point.
+        residual: worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point.
         limit: time limit in seconds, (P,).
         row: number of the row that speaks for the entry, (P, S); -1 where there is none.
         tolerance: residual up to which a run counts.
@@ -202,9 +198,9 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     if time not in TIMES:
         raise DataError(f"time is one of {', '.join(TIMES)}, not {time!r}")
     limit = tolerance(usual_accuracy(table) if accuracy is None else accuracy)
-    residual = _worst_residual(table)
+    residual = worst_residual(table)
     states = _row_states(table, residual, limit)
-    seconds = _seconds(table, TIMES[time])
+    seconds = seconds_of(table, time)
     if time == "warm":  # the second solve counts by its own verified status
         seconds = np.where(np.isin(table["warm_status"], SUCCESS), seconds, np.nan)
     labels = (table[c] for c in ("study", "data", "formulation"))
@@ -252,13 +248,18 @@ def _largest(*choices: np.ndarray) -> float:
     return next((float(np.max(c[np.isfinite(c)])) for c in choices if np.isfinite(c).any()), float("nan"))
 
 
-def _worst_residual(table: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Larger of violation and stationarity; ``nan`` without a point."""
-    return np.fmax(table["violation"], table["stationarity"])
+def worst_residual(table: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return what is held against the tolerance, (rows,); ``nan`` without a point.
+
+    It is the largest of violation, complementarity and stationarity, the last one divided by `GRADIENT`: solving allows
+    gradients that much more.
+    """
+    return np.fmax(np.fmax(table["violation"], table["complementarity"]), table["stationarity"] / GRADIENT)
 
 
-def _seconds(table: Mapping[str, np.ndarray], parts: tuple[str, ...]) -> np.ndarray:
-    """Sum of the parts; only the last one must be there."""
+def seconds_of(table: Mapping[str, np.ndarray], time: str) -> np.ndarray:
+    """Return the time that is compared, (rows,); ``nan`` where it is not known."""
+    parts = TIMES[time]  # only the last one must be there
     total = table[parts[-1]] + sum(np.nan_to_num(table[part]) for part in parts[:-1])
     return np.where(total > 0, total, np.where(total == 0, 1e-6, np.nan))  # a clock that stood still: a microsecond
 
@@ -302,7 +303,7 @@ def states_of_rows(table: Mapping[str, np.ndarray], found: Results) -> np.ndarra
         table: the rows.
         found: what `tabulate` made of them.
     """
-    states = _row_states(table, _worst_residual(table), found.tolerance)
+    states = _row_states(table, worst_residual(table), found.tolerance)
     for word in (WORSE_MINIMUM, CONTRADICTED):
         states[found.row[found.state == word]] = word
     return states
