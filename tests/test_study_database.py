@@ -76,6 +76,25 @@ def test_a_cell_under_another_label_moves_the_former_row_aside(path):
         assert connection.execute("SELECT solver FROM superseded").fetchall() == [(made[3]["solver"],)]
 
 
+def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones_come_back(path):
+    made = rows(10)
+    identities = [(row["key"], row["repetition"]) for row in made]
+    append(path, made)
+    append(path, [{**made[0], "study": "another"}])
+    database.keep(path, "synthetic", identities[:6])
+    assert finished(path, "synthetic") == set(identities[:6]) and len(finished(path, "another")) == 1
+    assert database.former(path) == database.former(path, "synthetic") == 4 and database.former(path, "another") == 0
+    late = {**made[8], "objective": 5.0, "started": "2027-01-01T00:00:00+00:00"}
+    append(path, [late])
+    database.keep(path, "synthetic", identities[:6])
+    database.keep(path, "synthetic", identities)  # made[8] is there twice: the newest comes back
+    found = [(row["key"], row["objective"]) for row in database.rows_of(path, "synthetic", identities[6:])]
+    assert found == [(row["key"], row["objective"]) for row in (*made[6:8], late, made[9])]
+    assert database.former(path) == 1
+    database.keep(path, "synthetic", [])
+    assert finished(path, "synthetic") == set() and database.former(path) == 11
+
+
 def test_studies_in_one_database_do_not_touch_each_other(path):
     made = rows(10)
     append(path, made)

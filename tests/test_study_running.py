@@ -256,6 +256,36 @@ def test_changed_data_are_refused_unless_told(path, grid):
     run(STUDY, path, execute=made)
 
 
+def test_changed_data_stay_accepted_when_an_entry_was_taken_out(path, grid):
+    from dataclasses import replace
+
+    entry = DataEntry("mine", files=("/somewhere/x.csv",))
+    old = [replace(cell(k), data="mine", data_source=entry, data_hash="a" * 64) for k in range(2)]
+    new = [replace(c, key=f"{100 + k:064x}", data_hash="b" * 64) for k, c in enumerate(old)]
+    made = lambda todo: iter([row(c, data_hash=c.data_hash) for c in todo])  # noqa: E731
+    grid(old)
+    run(STUDY, path, execute=made)
+    grid(new[:1])
+    for accepted in (True, False):
+        run(STUDY, path, execute=made, accept_changed_data=accepted)
+        assert set(read_rows(path)["data_hash"]) == {"b" * 64}
+    grid(old)
+    hands = Hands()
+    run(STUDY, path, execute=hands, accept_changed_data=True)
+    assert hands.ran == []  # the former content again: its rows were kept
+
+
+def test_an_entry_that_is_taken_out_leaves_the_report_and_comes_back_without_a_run(path, grid):
+    cells = [cell(k, solver) for k, solver in enumerate(("fine", "leave", "fine"))]
+    for now in (cells, cells[::2], cells):
+        grid(now)
+        hands = Hands()
+        rows = run(STUDY, path, execute=hands)
+        assert [r["key"] for r in rows] == [c.key for c in now]
+        assert set(read_rows(path)["solver"]) == {c.solver for c in now}
+    assert hands.ran == []
+
+
 def test_two_runs_at_once_are_refused(path, grid):
     import os
 

@@ -59,6 +59,7 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         try:
             if not accept_changed_data:
                 check_unchanged(grid, database.data_hashes(db))
+            database.keep(db, study.name, [(cell.key, cell.repetition) for cell in grid])
             database.set_aside(db, study.name, retry)
             writer.write(_relabelled(db, grid))
             todo = left(grid, database.finished(db, study.name))

@@ -6,7 +6,7 @@ killed study leaves a database that opens. Every batch is one transaction.
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -272,6 +272,37 @@ def rows_of(path: str | Path, study: str | None, identified: Sequence[tuple[str,
     return [by_identity[identity] for identity in identified if identity in by_identity]
 
 
+def keep(path: str | Path, study: str, cells: Collection[tuple[str, int]]) -> None:
+    """Make the rows of a study those of its grid as it is now.
+
+    Rows of other cells (entries taken out of the study, other data, options or versions) move to the table
+    ``superseded``, and rows of these cells that are there come back, the newest of each, so that an entry that is
+    taken out and put in again is not run again.
+
+    Args:
+        path: the database.
+        study: title of the study.
+        cells: (key, repetition) of the cells of its grid.
+
+    Raises:
+        DatabaseError: as in `writing`.
+    """
+    names = ", ".join(f'"{name}"' for name in NAMES)
+    asked = "study = ? AND (key, repetition) {} (SELECT key, repetition FROM grid)"
+    same = ("EXISTS (SELECT 1 FROM rows AS r WHERE r.study = superseded.study AND r.key = superseded.key "
+            "AND r.repetition = superseded.repetition{})")
+    back = f"{asked.format('IN')} AND NOT {same.format('')}"
+    newest = "row_number() OVER (PARTITION BY key, repetition ORDER BY started DESC) = 1"
+    with writing(path) as connection:
+        connection.register("grid", {"key": np.array([key for key, _ in cells], dtype=object),
+                                     "repetition": np.array([repetition for _, repetition in cells], dtype=np.int64)})
+        connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {asked.format('NOT IN')}", [study])
+        connection.execute(f"DELETE FROM rows WHERE {asked.format('NOT IN')}", [study])
+        connection.execute(f"INSERT INTO rows SELECT {names} FROM superseded WHERE {back} QUALIFY {newest}", [study])
+        connection.execute(f"DELETE FROM superseded WHERE study = ? AND "
+                           f"{same.format(' AND r.started = superseded.started')}", [study])
+
+
 def set_aside(path: str | Path, study: str, outcomes: Sequence[str]) -> None:
     """Move the rows of a study with these outcomes to the table ``superseded``, so that their cells are run again.
 
@@ -285,6 +316,22 @@ def set_aside(path: str | Path, study: str, outcomes: Sequence[str]) -> None:
     with writing(path) as connection:
         connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {chosen}", [study, *outcomes])
         connection.execute(f"DELETE FROM rows WHERE {chosen}", [study, *outcomes])
+
+
+def former(path: str | Path, study: str | None = None) -> int:
+    """Return how many rows are in the table ``superseded``: kept, but in no report.
+
+    Args:
+        path: the database.
+        study: only rows of this study.
+
+    Raises:
+        DatabaseError: as in `opened`.
+    """
+    condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
+    with opened(path) as connection:
+        found = connection.execute(f"SELECT count(*) FROM superseded {condition}", values).fetchone()
+    return int(found[0]) if found else 0
 
 
 def describe(path: str | Path, study: str, description: str) -> None:

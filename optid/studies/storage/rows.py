@@ -226,8 +226,9 @@ def markdown(columns: Iterable[Column] = COLUMNS) -> str:
     lines = ["# The rows of a study", "",
              f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the DuckDB "
              "file and in what `optid study export` writes. A column without a value is NULL; there is no NaN and no "
-             "infinity. A row whose place in the grid is taken by a newer one (changed data, versions, options) is in "
-             "the table `superseded`, the text of the study file in `studies`, the schema version in `meta`.", "",
+             "infinity. A row of a cell that the study no longer has (entries taken out, changed data, versions or "
+             "options), or that was run again, is in the table `superseded`, from where a run takes back what the "
+             "study has again; the text of the study file is in `studies`, the schema version in `meta`.", "",
              "| column | type | unit | meaning |", "|---|---|---|---|"]
     lines += [f"| `{c.name}` | {c.sql}{' (JSON)' if c.kind == 'json' else ''}{' NOT NULL' if c.always else ''} "
               f"| {c.unit} | {c.meaning} |" for c in columns]
