@@ -296,7 +296,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
     floor = criterion_floor(posed.criterion)
     previous: _Iterate | None = None
-    damping, growth, weight, last, idle = 0.0, 4.0, 0.0, np.inf, 0
+    damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, STEPS + 1):
         solution = yield here.program if not damping else posed.pose(here.x, here.at, damping)
@@ -317,7 +317,7 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:
             status, reason = _judged(solution, gain, here.at.value, floor, share)
             best = here if new is None or new.outside > INSIDE else new
-            return _evidence(posed, best, status, reason, {**figures, "programmes": count})
+            return _evidence(posed, best, status, reason, {**figures, "programmes": count + more})
         expected = gain + weight * here.amount
         fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
         if new is not None and (not entered or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
@@ -327,17 +327,18 @@ def _constrained(posed: Posed, here: _Iterate, figures: Mapping[str, Any]
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
-                shorter = yield from _shortened(posed, here, weight)
+                shorter, more = (yield from _shortened(posed, here, weight)), more + 1
                 if shorter is not None:
                     previous, here, damping, growth = here, shorter, 0.0, 4.0
+                    entered = entered or here.outside <= INSIDE
                     continue
                 reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
-                return (yield from _ended(posed, here, reason, {**figures, "programmes": count}))
+                return (yield from _ended(posed, here, reason, {**figures, "programmes": count + more + 1}))
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
     reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
               "value")
-    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS}))
+    return (yield from _ended(posed, here, reason, {**figures, "programmes": STEPS + more + 1}))
 
 
 def _shortened(posed: Posed, here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:

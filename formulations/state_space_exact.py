@@ -260,10 +260,13 @@ def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, we
         weighting = "scale"  # one output has nothing to be weighed against
     elif weighting == "auto":
         weighting = "determinant" if criterion == "prediction" else "variance"
-    if weighting == "determinant":
+    full = weighting == "determinant"
+    if full:
         weighted = [_weighted(error, name, x, weighting, iterations) for name, x in starts.items()]
         found = [one for _, one in weighted]
         values = np.array([error.value(one.x) for one in found])
+        sizes = np.array([own.level(one.x, full) for own, one in weighted])
+        smallest = sizes <= sizes.min() + AGREE * error.unknowns.l
     else:
         found = best_of(error, starts.items(), iterations)
         values = np.array([one.value for one in found])
@@ -271,11 +274,10 @@ def _searched(error: StateError, starts: Mapping[str, Array], criterion: str, we
         order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
         weighted = [_weighted(error, found[i].start, found[i].x, weighting, iterations, found[i].steps)
                     for i in order[:FINALISTS]]
-    full = weighting == "determinant"
+        smallest = values <= (1 + AGREE) * values.min() + 1e-14 * error.energy
     ends = [(own.level(one.x, full) if weighting != "scale" else one.value, own, one) for own, one in weighted]
     _, final, best = min(ends, key=lambda end: (end[2].border, end[0]))
-    reach = (1 + AGREE) * values.min() + 1e-14 * error.energy
-    agreed = [one.start for one, value in zip(found, values) if value <= reach]
+    agreed = [one.start for one, same in zip(found, smallest) if same]
     figures = {"starts": f"{len(agreed)} of {len(found)} starts arrive at the smallest error ({', '.join(agreed)})",
                "starts that agree": len(agreed), "errors of the starts": np.sort(values)[::-1]}
     return final, best, figures
@@ -286,7 +288,7 @@ def _weighted(error: StateError, start: str, x: Array, weighting: str, iteration
     """Descend, the errors weighted by their own (co)variance until it stays; steps taken before are counted."""
     if weighting == "scale":
         one = descend(error, x, iterations=iterations, start=start)
-        return error, one
+        return error, replace(one, steps=steps + one.steps)
     for _ in range(ROUNDS):
         new = error.reweighted(x, full=weighting == "determinant")
         change = np.linalg.norm(new.weight - error.weight) / np.linalg.norm(new.weight)

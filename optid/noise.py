@@ -20,7 +20,14 @@ from numpy.typing import ArrayLike
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.errors import StructureError
-from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
+from optid.models.innovation_gain import (
+    covariance_of,
+    information,
+    innovations_covariance,
+    log_determinant,
+    refined,
+    whitened,
+)
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
 from optid.stretches import between_gaps, runs_of
@@ -43,15 +50,13 @@ RATIOS = (1e-2, 1.0, 1e2)
 TRIED = 2
 """Starts that are refined, the best of all."""
 
-BLOCK, BLOCKS, PER_ENTRY = 1024, 6, 50
+BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 """Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
 in."""
 
-ELSEWHERE = 0.01
-"""Difference of two log-likelihoods beyond which their gains are not the same optimum."""
-
-NEAR = 1e-8
-"""Damping of the first step from the optimum of a part."""
+NEARLY, ELSEWHERE = 0.1, 1.0
+"""Gain of the log-likelihood to be expected that is of no account in a part of a record, and the difference beyond
+which two gains are not the same optimum of it."""
 
 
 class Noise(NamedTuple):
@@ -165,12 +170,15 @@ def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Arra
     The optimum of the part lies a few standard errors of the whole away, which two or three steps overcome.
     """
     part = _part(rest, C.size)
-    found = [refined(A, C, gain, part) for gain in _starts(A, C, part)[:TRIED]]
-    found.sort(key=lambda pair: log_determinant(pair[1]))
+    starts = _starts(A, C, part)[:TRIED]
     if part is not rest:
-        same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
-        optima = [found[0], *(other for other in found[1:] if log_determinant(other[1]) > same)]
-        found = [refined(A, C, gain, rest, NEAR) for gain, _ in optima]
+        found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
+        found.sort(key=lambda pair: log_determinant(pair[1]))
+        same, total = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part)), sum(map(len, rest))
+        optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
+        found = [refined(A, C, gain, rest, total * information(A, C, gain, part)) for gain in optima]
+    else:
+        found = [refined(A, C, gain, rest) for gain in starts]
     return min(found, key=lambda pair: log_determinant(pair[1]))
 
 

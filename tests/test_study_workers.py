@@ -2,9 +2,11 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 import psutil
@@ -15,7 +17,7 @@ from study_trouble import behave, cell
 
 from optid.errors import StudyError
 from optid.studies.execution import workers
-from optid.studies.execution.workers import execute
+from optid.studies.execution.workers import Pool, execute
 from optid.studies.storage.rows import NAMES
 
 
@@ -38,6 +40,7 @@ def test_workers_are_reused():
 FAILURES = {
     "segfault": ("crashed", "signal SIGSEGV, at File .* in string_at"),
     "abort": ("crashed", "signal SIGABRT"),
+    "orphan": ("crashed", "signal SIGABRT"),
     "leave": ("crashed", "exit code 3"),
     "complain": ("crashed", "exit code 134, terminate called after throwing an instance of 'std::bad_alloc'"),
     "raise": ("error", "KeyError: 'no such thing'"),
@@ -55,6 +58,32 @@ def test_a_worker_that_fails_is_a_row_and_the_next_cell_runs():
         assert rows[k]["outcome"] == outcome and re.search(words, rows[k]["reason"] or ""), rows[k]["reason"]
         if outcome == "error":  # nothing is wrong with the worker
             assert rows[k - 1]["unknowns"] == rows[k + 1]["unknowns"]
+
+
+def test_a_worker_that_dies_between_cells_is_no_fault_of_the_next_cell():
+    pool = Pool(behave, 1)
+    try:
+        (first,) = pool.run(deque([cell(0)]))
+        os.kill(first["unknowns"], signal.SIGKILL)
+        wait_for(lambda: gone(first["unknowns"]))
+        (second,) = pool.run(deque([cell(1)]))
+    finally:
+        pool.close()
+    assert second["outcome"] == "done" and second["unknowns"] != first["unknowns"]
+
+
+@pytest.mark.parametrize("then, words", [("abort", "the worker died: signal SIGABRT"), ("raise", "no such thing"),
+                                         ("stuck", "the limit is 1 s"), ("hog", "the limit is 500 MB")])
+def test_a_row_that_was_kept_stands_whatever_comes_after_it(then, words):
+    rows = by_key([cell(0, "keep_row", then=then, time_limit=1.0 if then == "stuck" else 60.0, memory_limit=500.0),
+                   cell(1, "abort")], workers=1)
+    assert (rows[0]["outcome"], rows[0]["objective"]) == ("done", 5.0)
+    assert rows[0]["reason"].startswith("no warm solve: ") and words in rows[0]["reason"]
+    assert rows[1]["outcome"] == "crashed"
+
+
+def test_a_row_that_is_made_replaces_the_one_that_was_kept():
+    assert by_key([cell(0, "keep_row", then="fine")])[0]["objective"] is None
 
 
 @pytest.mark.parametrize("do", ["loop", "stuck"])

@@ -1,7 +1,9 @@
 """The gain of an innovation form from what the known signals leave of the outputs: ``r = C x + e, x+ = A x + K e``.
 
 The determinant of the covariance of the innovations is minimised over K, with the initial state of every experiment
-eliminated (maximum likelihood of Gaussian noise).
+eliminated (maximum likelihood of Gaussian noise). From the optimum of a part of a long record, whose information is nearly that of
+the whole, a step costs two runs through the record: forth for the innovations and back for the slope of the likelihood
+(Fisher scoring).
 """
 
 from collections.abc import Sequence
@@ -16,11 +18,15 @@ from optid.models.roots import spectral_radius
 STEPS = 50
 """Steps at most."""
 
+FIRM = 0.01
+"""Damping at least, relative to the diagonal of the information, where a step gained little of what it promised."""
+
 ARRIVED = 1e-4
-"""Gain of the log-likelihood still to be expected at which a search ends; half a unit is one standard error."""
+"""Gain of the log-likelihood of no account; half a unit is one standard error of a parameter."""
 
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], damping: float = 1e-4) -> tuple[Array, Array]:
+def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array | None = None,
+            arrived: float = ARRIVED) -> tuple[Array, Array]:
     """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
 
     A step that makes the predictor unstable is replaced by the stable gain of the same spectrum.
@@ -30,29 +36,45 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], damping: flo
         C: (l, n).
         gain: (n, l) start.
         rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
-        damping: of the first step, relative to the diagonal of the normal equations.
+        known: (n l, n l) the information about the gain (column by column) to be used at every step, near an optimum.
+        arrived: gain of the log-likelihood still to be expected at which the search ends.
 
     Returns:
         The gain and the covariance (l, l) of its innovations.
     """
-    best, before = innovations_covariance(A, C, gain, rest), 0.0
+    errors = whitened(A, C, gain, rest)
+    best, damping, before = covariance_of(errors), 1e-4, 0.0
+    half = sum(np.count_nonzero(~np.isnan(r)) for r in rest) / (2 * len(C))
     for _ in range(STEPS):
-        normal, right = _equations(A, C, gain, rest, best)
-        promised, descends = np.inf, False
-        while not descends and promised > ARRIVED:
+        if known is None:
+            normal, right = _equations(A, C, gain, rest, best)
+        else:
+            normal, right = known, _slope(A, C, gain, errors)
+        promised, gained = np.inf, 0.0
+        while not gained > 0 and promised > arrived:
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
             promised = 0.5 * float(right @ step)
             trial = _stable(A, C, gain + step.reshape(gain.shape[::-1]).T, best)
-            covariance = innovations_covariance(A, C, trial, rest)
-            descends = log_determinant(covariance) < log_determinant(best)
-            damping *= 0.1 if descends else 10.0
-        if not descends:
+            errors = whitened(A, C, trial, rest, best)
+            covariance = covariance_of(errors)
+            gained = half * (log_determinant(best) - log_determinant(covariance))
+            if gained > 0.75 * promised:
+                damping *= 0.1
+            elif not gained > 0.25 * promised:
+                damping = max(10 * damping, FIRM)
+        if not gained > 0:
             break
         gain, best = trial, covariance
-        if promised * (promised / before if before else 1.0) < ARRIVED:  # steps shrink at a rate or faster
+        if promised * (promised / before if before else 1.0) < arrived:  # steps shrink at a rate or faster
             break
         before = promised
     return gain, best
+
+
+def information(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
+    """Mean information (n l, n l) of a sample about the gain (column by column), initial states unknown."""
+    normal, _ = _equations(A, C, gain, rest, innovations_covariance(A, C, gain, rest))
+    return normal / sum(map(len, rest))
 
 
 def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
@@ -60,16 +82,23 @@ def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array
     return covariance_of(whitened(A, C, gain, rest))
 
 
-def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> list[Array]:
-    """Innovations (N, l) of every experiment under a gain, with the initial state that fits best."""
+def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
+    """Innovations (N, l) of every experiment under a gain, with the initial state that fits best, see `_initial`."""
     from optid.models.innovation_kernels import innovate
 
     F = A - gain @ C
-    return [innovate(F, C, gain, r, x0) for r, x0 in zip(rest, _initial(F, C, gain, rest))]
+    return [innovate(F, C, gain, r, x0) for r, x0 in zip(rest, _initial(F, C, gain, rest, covariance))]
 
 
 def covariance_of(signals: Sequence[Array]) -> Array:
     """Mean of s(k) s(k)' over the samples that are present, pair by pair of outputs, (l, l)."""
+    sums, pairs = _products(signals)
+    found = sums / np.maximum(pairs, 1.0)
+    return (found + found.T) / 2
+
+
+def _products(signals: Sequence[Array]) -> tuple[Array, Array]:
+    """Sum of s(k) s(k)' over the samples at which both outputs are present, and the number of them, (l, l) each."""
     count = signals[0].shape[1]
     sums, pairs = np.zeros((count, count)), np.zeros((count, count))
     for s in signals:
@@ -80,8 +109,7 @@ def covariance_of(signals: Sequence[Array]) -> Array:
             products, present = filled.T @ filled, here.T @ here
         sums += products
         pairs += present
-    found = sums / np.maximum(pairs, 1.0)
-    return (found + found.T) / 2
+    return sums, pairs
 
 
 def log_determinant(covariance: Array) -> float:
@@ -101,24 +129,43 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
         return np.zeros_like(gain)
 
 
-def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array]) -> list[Array]:
-    """Initial states (n,) that minimise the squared innovations, which are affine in them."""
+def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
+    """Initial states (n,) that minimise the squared innovations, which are affine in them.
+
+    The innovations are in units of a covariance (l, l); without one every output counts by the size of its residuals.
+    """
     from optid.models.innovation_kernels import innovation_moments
 
-    weight = np.diag(1 / np.sqrt(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny)))
-    found = []
+    if covariance is None:
+        covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
+    weight = _whitening(covariance)
+    settled, found = _settling(F), []
     for r in rest:
-        settled = r[: _settling(F, len(r))]
-        normal, right = innovation_moments(F, C, gain, settled, np.zeros(len(F)), weight)
-        part = normal[gain.size :, gain.size :]
-        found.append(_solved(part, right[gain.size :]))
+        normal, right = innovation_moments(F, C, gain, r[:settled], np.zeros(len(F)), weight)
+        found.append(_solved(normal[gain.size :, gain.size :], right[gain.size :]))
     return found
 
 
-def _settling(F: Array, count: int) -> int:
-    """Samples after which the initial state is forgotten."""
+def _whitening(covariance: Array) -> Array:
+    """Matrix (l, l) that turns innovations of a covariance into white ones."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.ascontiguousarray((vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T)
+
+
+def _settling(F: Array) -> int | None:
+    """Samples after which the initial state is forgotten; None for never."""
     radius = spectral_radius(F)
-    return count if radius > 0.99 else min(count, len(F) + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1))))
+    return None if radius >= 1 else len(F) + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
+
+
+def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
+    """Slope (n l,) of the log-likelihood by the gain (column by column) at its innovations."""
+    from optid.models.innovation_kernels import innovation_slope
+
+    sums, pairs = _products(errors)
+    root, F = _whitening(sums / np.maximum(pairs, 1.0)), A - gain @ C
+    weight = root.T @ root * np.mean(np.diag(pairs)) / np.maximum(pairs, 1.0)
+    return np.sum([innovation_slope(F, C, gain, e, weight) for e in errors], axis=0).T.ravel()
 
 
 def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
@@ -128,9 +175,7 @@ def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covarianc
     """
     from optid.models.innovation_kernels import innovation_moments
 
-    values, vectors = np.linalg.eigh(covariance)
-    weight = (vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T
-    F, size = A - gain @ C, gain.size
+    weight, F, size = _whitening(covariance), A - gain @ C, gain.size
     normal, right = np.zeros((size, size)), np.zeros(size)
     for r, x0 in zip(rest, _initial(F, C, gain, rest)):
         information, pull = innovation_moments(F, C, gain, r, x0, weight)

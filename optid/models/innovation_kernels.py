@@ -5,6 +5,9 @@ from numba import njit
 
 from optid.bases.basis import Array
 
+FORMED = 32
+"""Samples whose derivatives are multiplied at once."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def innovate(F: Array, C: Array, gain: Array, r: Array, x0: Array) -> Array:
@@ -38,6 +41,41 @@ def innovate(F: Array, C: Array, gain: Array, r: Array, x0: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def innovation_slope(F: Array, C: Array, gain: Array, e: Array, weight: Array) -> Array:
+    """Return the derivative (n, l) of half the sum of e' weight e by the gain, with its sign turned, in one run back.
+
+    Args:
+        F: (n, n) A - K C.
+        C: (l, n).
+        gain: (n, l) K.
+        e: (N, l) innovations under the gain, NaN = missing.
+        weight: (l, l), symmetric.
+    """
+    n, l = gain.shape  # noqa: E741
+    slope, adjoint, earlier = np.zeros((n, l)), np.zeros(n), np.empty(n)
+    for k in range(e.shape[0] - 1, -1, -1):
+        earlier[:] = 0.0
+        for j in range(n):
+            for i in range(n):
+                earlier[i] += F[j, i] * adjoint[j]
+        for o in range(l):
+            pull = 0.0
+            if np.isnan(e[k, o]):  # the state was not corrected
+                for j in range(n):
+                    pull += gain[j, o] * adjoint[j]
+            else:
+                for c in range(l):
+                    if not np.isnan(e[k, c]):
+                        pull += weight[o, c] * e[k, c]
+                for j in range(n):
+                    slope[j, o] += adjoint[j] * e[k, o]
+            for i in range(n):
+                earlier[i] += C[o, i] * pull
+        adjoint, earlier = earlier, adjoint
+    return slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def innovation_moments(F: Array, C: Array, gain: Array, r: Array, x0: Array, weight: Array) -> tuple[Array, Array]:
     """Return the sums of J'J and J'e over a record, J the derivative of -e by the gain (column by column) and x0.
 
@@ -55,55 +93,49 @@ def innovation_moments(F: Array, C: Array, gain: Array, r: Array, x0: Array, wei
     turn, turned = np.zeros((n, q)), np.zeros((n, q))
     for i in range(n):
         turn[i, n * l + i] = 1.0
-    normal, right = np.zeros((q, q)), np.zeros(q)
-    e, taken, white = np.zeros(l), np.zeros(l), np.zeros(l)
-    seen, rows = np.zeros((l, q)), np.zeros((l, q))
+    sums, products = np.zeros((q + 1, q + 1)), np.empty((q + 1, q + 1))
+    rows, filled = np.zeros((FORMED * l, q + 1)), 0  # [J | e] of some samples
+    e, taken, seen = np.zeros(l), np.zeros(l), np.zeros((l, q))
     missing = np.zeros(l, dtype=np.bool_)
     for k in range(r.shape[0]):
         for o in range(l):
             predicted = 0.0
+            seen[o] = 0.0
             for j in range(n):
                 predicted += C[o, j] * x[j]
+                for p in range(q):
+                    seen[o, p] += C[o, j] * turn[j, p]
             missing[o] = np.isnan(r[k, o])
             taken[o] = predicted if missing[o] else r[k, o]
             e[o] = taken[o] - predicted
-            for p in range(q):
-                seen[o, p] = 0.0
-                for j in range(n):
-                    seen[o, p] += C[o, j] * turn[j, p]
-        for o in range(l):
-            white[o] = 0.0
-            for c in range(l):
-                white[o] += weight[o, c] * e[c]
-            for p in range(q):
-                rows[o, p] = 0.0
-                for c in range(l):
-                    if not missing[c]:
-                        rows[o, p] += weight[o, c] * seen[c, p]
-        for o in range(l):
-            for p in range(q):
-                right[p] += rows[o, p] * white[o]
-                for s in range(p + 1):
-                    normal[p, s] += rows[o, p] * rows[o, s]
         # d x+ = A dx + K de + dK e with de = -C dx where the residual is there
         for i in range(n):
             later[i] = 0.0
+            turned[i] = 0.0
             for j in range(n):
                 later[i] += F[i, j] * x[j]
-            for o in range(l):
-                later[i] += gain[i, o] * taken[o]
-            for p in range(q):
-                turned[i, p] = 0.0
-                for j in range(n):
+                for p in range(q):
                     turned[i, p] += F[i, j] * turn[j, p]
             for o in range(l):
+                later[i] += gain[i, o] * taken[o]
                 turned[i, o * n + i] += e[o]
                 if missing[o]:
                     for p in range(q):
                         turned[i, p] += gain[i, o] * seen[o, p]
+        for o in range(l):
+            row = rows[filled]
+            row[:] = 0.0
+            for c in range(l):
+                if not missing[c]:
+                    row[q] += weight[o, c] * e[c]
+                    for p in range(q):
+                        row[p] += weight[o, c] * seen[c, p]
+            filled += 1
+        if filled == len(rows) or k == r.shape[0] - 1:
+            rows[filled:] = 0.0
+            np.dot(rows.T, rows, products)
+            sums += products
+            filled = 0
         x, later = later, x
         turn, turned = turned, turn
-    for p in range(q):
-        for s in range(p):
-            normal[s, p] = normal[p, s]
-    return normal, right
+    return sums[:q, :q].copy(), sums[:q, q].copy()

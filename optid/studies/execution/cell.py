@@ -4,6 +4,7 @@ Nothing that a fit does is an exception here. What even a row cannot survive (an
 for whoever runs the worker: `lost_row` makes the row of a cell that could not make its own.
 """
 
+import json
 import time
 import warnings
 from collections import OrderedDict
@@ -21,6 +22,7 @@ from optid.solution import Solution, Times
 from optid.solving import NOT_FINITE, solve
 from optid.studies.execution.environment import machine
 from optid.studies.execution.memory import Peak
+from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash
 from optid.studies.sources.records import Record, load
 from optid.studies.storage.rows import (
@@ -39,6 +41,9 @@ from optid.studies.versions import determining
 KEPT = 3
 """Records that a worker keeps, so that cells of one data set load it once."""
 
+SHORTEST = 0.01
+"""Seconds of a time limit that a solver always has: some take none at all for no limit."""
+
 REHEARSED = 0.25
 """Share of the time limit up to which the first cell of its kind in a process is run twice."""
 
@@ -52,40 +57,53 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     The first cell of a formulation and solver in a process is run twice when it is quick, and the second run counts:
     importing a solver and loading compiled kernels are not in the times.
 
-    The solver's own clock is set to the time limit, and it runs in this process: whoever calls this stops a process
-    that does not keep its limits.
+    The solver's own clock is set to what loading the record left of the time limit, and it runs in this process:
+    whoever calls this stops a process that does not keep its limits.
 
     Args:
         cell: what to run.
     """
-    row = _run(cell)
+    clock = time.perf_counter()
+    row = _run(cell, clock)
     kind = (cell.formulation_name, cell.solver_name, cell.warm)
-    if kind not in _rehearsed and row["outcome"] == DONE and row["total_s"] < REHEARSED * cell.time_limit:
-        row = _run(cell)
-    _rehearsed.add(kind)
+    if kind not in _rehearsed and row["outcome"] == DONE:
+        _rehearsed.add(kind)  # what ended before its solver has imported nothing
+        if row["total_s"] < REHEARSED * cell.time_limit:
+            row = _run(cell, clock)
     return row
 
 
-def _run(cell: Cell) -> dict[str, Any]:
+def _run(cell: Cell, given: float) -> dict[str, Any]:
+    """Run a cell that this process was given at a moment of `time.perf_counter`."""
     started, clock = datetime.now(UTC), time.perf_counter()
-    if cell.refusal:
-        return lost_row(cell, REFUSED, cell.refusal, started=started)
-    peak = Peak()
+    peak, fitted, limit = Peak(), None, cell.time_limit
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what weakens an answer is in the figures of the row
-            found = _ran(cell)
+            record, seconds = _loaded(cell), time.perf_counter() - clock
+            limit = max(cell.time_limit - (time.perf_counter() - given), SHORTEST)
+            found, fitted = _cold(cell, record, limit)
+            found["load_s"] = seconds
     except (SolverRefused, SolverMissing) as refusal:
         found = {"outcome": REFUSED, "reason": str(refusal)}
     except MemoryError as error:
         found = {"outcome": MEMORY_LIMIT, "reason": f"MemoryError: {error}"}
     except (Exception, SystemExit) as error:
         found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
-    largest = peak.mb()
-    if largest > cell.memory_limit:  # it went unseen by who watches the process: what is above the limit is no answer
-        found = {"outcome": MEMORY_LIMIT, "reason": f"held {largest:.0f} MB; the limit is {cell.memory_limit:g} MB"}
-    return complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": largest,
-                     "base_mb": peak.start, "total_s": time.perf_counter() - clock})
+    if (largest := peak.mb()) > cell.memory_limit:  # unseen by who watches: what is above the limit is no answer
+        found, fitted = {"outcome": MEMORY_LIMIT, "reason": _held(cell, largest)}, None
+    row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": largest, "base_mb": peak.start,
+                    "total_s": time.perf_counter() - clock})
+    if fitted is None:
+        return row
+    row = _warm(cell, fitted, row, limit, given)
+    if (largest := peak.mb()) > cell.memory_limit:
+        row = without_warm(row, _held(cell, largest))
+    return row | {"peak_mb": largest, "total_s": time.perf_counter() - clock}
+
+
+def _held(cell: Cell, mb: float) -> str:
+    return f"held {mb:.0f} MB; the limit is {cell.memory_limit:g} MB"
 
 
 def prepare() -> None:
@@ -117,6 +135,17 @@ def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None 
                      "started": (started or datetime.now(UTC)).isoformat()})
 
 
+def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
+    """Return the row of a cold solve that stands alone.
+
+    Args:
+        row: of the cold solve.
+        reason: what became of the second solve.
+    """
+    words = "; ".join(filter(None, [row["reason"], f"no warm solve: {reason}"]))
+    return {**row, **dict.fromkeys(("warm_s", "warm_status", "warm_iterations")), "reason": words}
+
+
 def known(cell: Cell) -> dict[str, Any]:
     """Return the columns of a cell that are known before it runs."""
     labels = (cell.study, cell.data, cell.formulation, cell.solver, cell.samples, cell.noise, cell.seed, cell.accuracy,
@@ -136,24 +165,23 @@ def known(cell: Cell) -> dict[str, Any]:
     }
 
 
-def _ran(cell: Cell) -> dict[str, Any]:
-    clock = time.perf_counter()
-    record = _loaded(cell)
+def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit | None]:
+    """What a fit comes to, and the fit where it is to be solved once more; ``limit``: seconds for each programme."""
     data = record.data
     held = 0 if record.holdout is None else _length(record.holdout)
-    row: dict[str, Any] = {"load_s": time.perf_counter() - clock, "n_samples": _length(data) + held,
-                           "n_estimation": _length(data), "n_inputs": data.m, "n_outputs": data.l}
-    fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy,
-                 time_limit=cell.time_limit, isolate=False, constraints=cell.constraints,
-                 solver_options=dict(cell.solver_options), raises=False, **cell.options)
+    row: dict[str, Any] = {"n_samples": _length(data) + held, "n_estimation": _length(data), "n_inputs": data.m,
+                           "n_outputs": data.l}
+    fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
+                 isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
+                 **cell.options)
     row |= _verdict(fitted) | _times(fitted)
-    if cell.warm and not fitted.procedure and len(fitted.steps) == 1 and fitted.solution.has_point:
-        row |= _warm(cell, fitted)
     remarks = [row["reason"]]
     if fitted.model is not None:
         row |= _figures(fitted.model, record, remarks)
     row["reason"] = "; ".join(filter(None, remarks)) or None
-    return row | _finiteness(fitted, row)
+    row |= _finiteness(fitted, row)
+    plain = not fitted.procedure and len(fitted.steps) == 1 and fitted.solution.has_point
+    return row, fitted if cell.warm and plain and row["outcome"] == DONE else None
 
 
 def _loaded(cell: Cell) -> Record:
@@ -207,13 +235,32 @@ def _compiled(phases: list[Times]) -> dict[str, Any]:
     return {"compile_s": sum(told) if told else None, "solve_s": sum(t.solve for t in phases) - sum(told)}
 
 
-def _warm(cell: Cell, fitted: Fit) -> dict[str, Any]:
-    """Solve once more from the solution; the programme and what was compiled of it are at hand."""
+def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: float) -> dict[str, Any]:
+    """Solve once more from the solution; the programme and what was compiled of it are at hand.
+
+    The row of the cold solve stands whatever becomes of this: where it kills the process, the parent has that row.
+
+    Args:
+        cell: which.
+        fitted: by the cold solve.
+        row: of the cold solve.
+        limit: seconds that the cold solve had; with another number some back ends would compile again.
+        given: when this process was given the cell.
+    """
+    left = cell.time_limit - (time.perf_counter() - given)
+    if left < fitted.solution.times.solve:
+        return without_warm(row, f"{max(left, 0.0):.1f} s of the time limit were left, less than the cold one took")
+    keep(row)
     program = replace(fitted.program, start=dict(fitted.solution.values))
-    again: Solution = solve(program, cell.solver_name, accuracy=cell.accuracy, time_limit=cell.time_limit,
-                            isolate=False, prove=False, **cell.solver_options)
-    return {"warm_s": again.times.solve, "warm_status": str(again.status),
-            "warm_iterations": again.iterations if again.iterations >= 0 else None}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            again: Solution = solve(program, cell.solver_name, accuracy=cell.accuracy, time_limit=limit, isolate=False,
+                                    prove=False, **cell.solver_options)
+    except (Exception, SystemExit) as error:
+        return without_warm(row, f"{type(error).__name__}: {error}")
+    return complete({**row, "warm_s": again.times.solve, "warm_status": str(again.status),
+                     "warm_iterations": again.iterations if again.iterations >= 0 else None})
 
 
 def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str, Any]:
@@ -260,16 +307,17 @@ def _parameters(model: Any) -> Mapping[str, Any]:
 
 
 def _finiteness(fitted: Fit, row: Mapping[str, Any]) -> dict[str, Any]:
-    """The outcome of a fit whose point, objective or model holds numbers that are not finite; else nothing."""
-    solution = fitted.solution
-    if any(step.reason.endswith(NOT_FINITE) for _, step in fitted.steps):
-        return {"outcome": NON_FINITE}
-    wrong = []
+    """The outcome of a fit whose point, objective or model holds numbers that are not finite; else nothing.
+
+    A procedure that has a model although a step on its way was not finite is judged by that model.
+    """
+    solution, wrong = fitted.solution, []
     if solution.has_point and not np.isfinite(solution.objective):
         wrong.append(f"the objective is {solution.objective}")
     if np.isinf(row.get("one_step_fit") or 0.0):
         wrong.append("the predictions of the model are not finite")
-    if fitted.model is not None and "null" in (row.get("parameters") or ""):
+    if not all(np.all(np.isfinite(np.array(v, dtype=float))) for v in json.loads(row.get("parameters") or "{}").values()):
         wrong.append("the model has parameters that are not finite")
+    lost = fitted.model is None and any(step.reason.endswith(NOT_FINITE) for _, step in fitted.steps)
     return {"outcome": NON_FINITE, "reached": False, "proved": False,
-            "reason": "; ".join(filter(None, [*wrong, row["reason"]]))} if wrong else {}
+            "reason": "; ".join(filter(None, [*wrong, row["reason"]]))} if wrong or lost else {}

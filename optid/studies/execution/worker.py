@@ -1,6 +1,7 @@
 """What a worker process does: receive cells one after another and send back what the function returns.
 
-It ends when its parent does, whatever it is doing.
+On Linux it ends when its parent does (the thread that started it), whatever it is doing; elsewhere when it next looks
+for a cell.
 """
 
 import ctypes
@@ -9,12 +10,14 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
-READY, ROW, RAISED = "ready", "row", "raised"
+READY, KEEP, ROW, RAISED = "ready", "keep", "row", "raised"
 """First word of every message to the parent."""
+
+_parent: Connection | None = None
 
 
 def main(descriptor: int, parent: int) -> None:
@@ -25,6 +28,7 @@ def main(descriptor: int, parent: int) -> None:
             None), then cells.
         parent: its process id.
     """
+    global _parent
     faulthandler.enable()  # a segmentation fault then says where
     _die_with(parent)
     connection = Connection(descriptor)
@@ -32,12 +36,23 @@ def main(descriptor: int, parent: int) -> None:
     if prepare is not None:
         prepare()
     connection.send((READY, os.getpid()))
+    _parent = connection
     while True:
         try:
             cell = connection.recv_bytes()
         except EOFError:
             return
         connection.send(_answer(function, cell))
+
+
+def keep(row: Mapping[str, Any]) -> None:
+    """Let the parent keep the row of the cell under way, which stands where the rest of that cell comes to no end.
+
+    Args:
+        row: whole. Outside of a worker nothing is done.
+    """
+    if _parent is not None:
+        _parent.send((KEEP, dict(row)))
 
 
 def _answer(function: Callable[[Any], Any], packed: bytes) -> tuple[str, Any]:

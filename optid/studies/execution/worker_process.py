@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 
 from optid.isolated import death
-from optid.studies.execution.cell import lost_row
+from optid.studies.execution.cell import lost_row, without_warm
 from optid.studies.execution.memory import MB
 from optid.studies.grid import Cell
 
@@ -41,6 +41,7 @@ class WorkerProcess:
         ready: whether it has imported everything.
         fresh_mb: its resident memory then.
         cell: what it has in hand, or None.
+        kept: row of the cell in hand that stands where the rest of the cell comes to no end.
         peak_mb: largest memory seen since it was given the cell.
     """
 
@@ -57,8 +58,10 @@ class WorkerProcess:
         self.connection = Connection(ours.detach())
         self.ready, self.fresh_mb = False, 0.0
         self.cell: Cell | None = None
+        self.kept: dict[str, Any] | None = None
         self._begin(None)
-        self._send(function)
+        with suppress(OSError):  # it died; the end of the connection tells
+            self.connection.send_bytes(function)
 
     @property
     def pid(self) -> int:
@@ -70,15 +73,25 @@ class WorkerProcess:
         """Time since it was started, or given the cell in hand."""
         return time.monotonic() - self._clock
 
-    def give(self, cell: Cell) -> None:
-        """Hand it a cell.
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone; a child of it may still hold the other end of the connection."""
+        return self._process.poll() is not None
+
+    def give(self, cell: Cell) -> bool:
+        """Hand it a cell and say whether it took it: a worker that has died does not.
 
         Raises:
             Exception: whatever the cell raises when it is pickled; the worker stays idle then.
         """
         packed = pickle.dumps(cell)
         self._begin(cell)
-        self._send(packed)
+        with suppress(OSError):
+            if not self.ended:
+                self.connection.send_bytes(packed)
+                return True
+        self.cell = None
+        return False
 
     def take(self) -> None:
         """Take the cell out of its hands; its row is there."""
@@ -99,9 +112,11 @@ class WorkerProcess:
             self._words.truncate(0)
 
     def lost(self, outcome: str, reason: str) -> dict[str, Any]:
-        """Return the row of the cell in hand, which it will not make."""
+        """Return the row of the cell in hand, which it will not make: the one that was kept, where there is one."""
         if self.cell is None:
             raise ValueError("this worker has no cell in hand")
+        if self.kept is not None:
+            return without_warm(self.kept, reason)
         return lost_row(self.cell, outcome, reason, started=self._started, total_s=self.seconds,
                         peak_mb=self.peak_mb or None)
 
@@ -132,13 +147,9 @@ class WorkerProcess:
                 child.kill()
 
     def _begin(self, cell: Cell | None) -> None:
-        self.cell, self.peak_mb = cell, 0.0
+        self.cell, self.kept, self.peak_mb = cell, None, 0.0
         self._started, self._clock = datetime.now(UTC), time.monotonic()
         self._words.truncate(0)
-
-    def _send(self, packed: bytes) -> None:
-        with suppress(OSError):  # it died; the end of the connection tells
-            self.connection.send_bytes(packed)
 
     def _last_words(self) -> str:
         """What it wrote last to its standard error: where Python says it crashed, or the last line."""

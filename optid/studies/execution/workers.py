@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from optid.errors import StudyError
 from optid.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell
-from optid.studies.execution.worker import RAISED, READY
+from optid.studies.execution.worker import KEEP, RAISED, READY
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 
@@ -135,7 +135,10 @@ class Pool:
             while todo and worker.cell is None:
                 cell = todo.popleft()
                 try:
-                    worker.give(cell)
+                    if not worker.give(cell):  # it died while it was idle, which says nothing of this cell
+                        self._dismiss(worker)
+                        todo.appendleft(cell)
+                        break
                 except Exception as error:
                     rows.append(lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}"))
         free = len(self._among(lambda w: w.cell is None))
@@ -152,14 +155,15 @@ class Pool:
         if word == READY:
             worker.ready, worker.fresh_mb, self._stillborn = True, worker.resident_mb(), 0
             return []
+        if word == KEEP:
+            worker.kept = content
+            return []
         row = worker.lost(ERROR, content) if word == RAISED else _checked(worker, content)
         worker.take()
         return [row]
 
     def _died(self, worker: "WorkerProcess", error: Exception) -> list[Row]:
         lost = worker.cell is not None
-        peak = worker.resident_mb()
-        worker.peak_mb = max(worker.peak_mb, peak)
         ended = self._dismiss(worker, DYING)
         if not worker.ready:
             self._count_stillborn(f"{ended} ({error})" if str(error) else ended)
@@ -171,8 +175,13 @@ class Pool:
             raise StudyError(f"{STILLBORN} workers, one after another, ended before they could work: {ended}")
 
     def _limited(self) -> list[Row]:
-        """Kill the workers whose cell has used up its time or memory."""
+        """Kill the workers whose cell has used up its time or memory, and find those that died unheard.
+
+        The connection of a worker that died does not end while a child of it lives.
+        """
         rows = []
+        for worker in self._among(lambda w: w.ended and not w.connection.poll()):
+            rows += self._died(worker, EOFError())
         family = time.monotonic() - self._family_at > FAMILY
         if family:
             self._family_at = time.monotonic()

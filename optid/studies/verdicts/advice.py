@@ -43,20 +43,17 @@ def choice_of_solver(section: Section) -> Statement:
     """Say which solver to use on the problems of a section, or why that cannot be told."""
     choice, n = section.choice, len(section.found.data)
     if not n:
-        agreed = f"{section.infeasible:,} problems are infeasible, and the solvers agree."
-        text = agreed if section.infeasible else "There is no run of a solver."
+        text = no_solution(section) if section.infeasible else "There is no run of a solver."
         return Statement(FAIR, "Nothing to compare", text, "solver")
+    if not section.standings and section.found.measure == "warm":
+        text = "No run has a warm time to compare: it needs a study with warm = true, and a procedure of several "
+        return Statement(FAIR, "Cannot tell", text + "programmes never has one.", "solver")
     if not section.standings:
         text = f"Every solver ({listed(section.idle)}) refuses every problem, or was not run."
         return Statement(FAIR, "Nothing was run", text, "solver")
-    if choice.kind == NOBODY and section.found.solved.any():
-        solved = int(section.found.solved.any(axis=1).sum())
-        text = f"{solved:,} of {n:,} problems were solved, but no run has the time to compare; warm times need a study "
-        text += "with warm = true."
-        return Statement(FAIR, "Cannot tell", text, "solver")
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
-        text = f"No solver reached the accuracy on any of {n:,} problems ({common})."
+        text = f"No solver reached the accuracy on any of {n:,} problem{'' if n == 1 else 's'} ({common})."
         return Statement(BAD, "No solver can be recommended", text, "solver")
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
@@ -74,6 +71,13 @@ def choice_of_solver(section: Section) -> Statement:
     text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (choice.first,))}"
     word = f"Solves most: {choice.first}" if lead.refused > RARE * n else f"Use {choice.first}"
     return Statement(_tone(lead, n), word, text.rstrip(), "solver")
+
+
+def no_solution(section: Section) -> str:
+    """Say how many problems have no solution, and who says so."""
+    k, (said, asked) = section.infeasible, section.deniers
+    return (f"{k:,} problem{' has' if k == 1 else 's have'} no solution: {said} of {asked} solvers say so, and none found "
+            "one. It counts neither for nor against them.")  # fmt: skip
 
 
 def _refusals(lead: Standing) -> str:

@@ -8,17 +8,34 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
-from optid.solution import GRADIENT, tolerance
-from optid.studies.storage.rows import BY_NAME, DONE, NON_FINITE, REFUSED, SUCCESS
+from optid.solution import GRADIENT, Status, tolerance
+from optid.studies.storage.rows import (
+    BY_NAME,
+    CRASHED,
+    DONE,
+    ERROR,
+    MEMORY_LIMIT,
+    NON_FINITE,
+    REFUSED,
+    SUCCESS,
+    TIME_LIMIT,
+)
 
 SOLVED, NOT_RUN = "solved", "not run"
-FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", "infeasible"
-LESS_ACCURATE, WORSE_MINIMUM = "less accurate", "worse minimum"
+FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Status.INFEASIBLE)
+LESS_ACCURATE, WORSE_MINIMUM, OTHER_ACCURACY = "less accurate", "worse minimum", "other accuracy"
+WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
 LABELS, LONGEST_LABEL = ("data", "formulation", "solver"), 80
 REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}
 """Measures of time and the columns they are the sum of."""
+
+VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)
+"""States whose verified accuracy was reached, whatever is known of the time."""
+
+UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))
+"""States of runs that ended before the solver had an answer."""
 
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
@@ -27,9 +44,17 @@ MEANINGS = {
     LESS_ACCURATE: "verified to a looser accuracy of its own, not to the one compared at",
     WORSE_MINIMUM: "a verified minimum above the best one that another solver verified; of a procedure the minimum of "
                    "its last programme, which depends on the steps before it",
+    OTHER_ACCURACY: "asked for another accuracy than the one compared at, and the same solver has runs that suit it",
+    WARM_FAILED: "the cold solve was verified, the warm one, whose time is compared, was not",
+    UNTIMED: "solved, but without the time that is compared: not solved warm, or a procedure, which never is",
     NOT_RUN: "no run in the database",
+    INFEASIBLE: "the solver says that no point satisfies the constraints; that claim comes without a point to verify",
+    str(Status.UNBOUNDED): "the solver says that the objective has no lower bound",
+    str(Status.LIMIT): "the solver stopped at a limit of its own, of iterations or time",
+    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, by too little to call the claim a lie",
+    str(Status.FAILED): "no point that could be judged, or one far from what was claimed",
 }
-"""What the words of the failure table mean beyond the outcomes and statuses of a row."""
+"""What the words of the failure table mean beyond the outcomes of a row."""
 
 
 def columns(rows: Any) -> dict[str, np.ndarray]:
@@ -119,14 +144,15 @@ class Results:
         solvers: labels, S of them, in alphabetical order.
         state: `SOLVED` or the word for why not, (P, S).
         reason: sentence of the first run that did not solve it, (P, S).
-        false: whether a claim was false, of any repetition, or contradicted, (P, S).
+        false: whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S).
         time: median over the repetitions in seconds, (P, S); ``nan`` unless solved.
         objective: (P, S), of the runs whose verified accuracy was reached, local minima included; ``nan`` otherwise.
         size: yardstick of differences of objectives, (P,).
         residual: worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point.
         limit: time limit in seconds, (P,).
         row: number of the row that speaks for the entry, (P, S); -1 where there is none.
-        tolerance: residual up to which a run counts.
+        accuracy: requested relative accuracy that is compared at.
+        measure: of time: "solve", "fit" or "warm".
     """
 
     study: np.ndarray
@@ -146,7 +172,13 @@ class Results:
     residual: np.ndarray
     limit: np.ndarray
     row: np.ndarray
-    tolerance: float
+    accuracy: float
+    measure: str
+
+    @property
+    def tolerance(self) -> float:
+        """Residual up to which a run counts."""
+        return tolerance(self.accuracy)
 
     @property
     def solved(self) -> np.ndarray:
@@ -190,52 +222,74 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
 
     Returns:
         The table. An entry is solved where every repetition ran to its end, was verified, has residuals within the
-        tolerance of the common accuracy and an objective within `VALUE` of the best verified one.
+        tolerance of the common accuracy, the time that is compared, and an objective within `VALUE` of the best verified
+        one. Of runs at several requested accuracies those count that suit the common one best.
 
     Raises:
         DataError: unknown measure of time.
     """
     if time not in TIMES:
         raise DataError(f"time is one of {', '.join(TIMES)}, not {time!r}")
-    limit = tolerance(usual_accuracy(table) if accuracy is None else accuracy)
-    residual = worst_residual(table)
-    states = _row_states(table, residual, limit)
-    seconds = seconds_of(table, time)
-    if time == "warm":  # the second solve counts by its own verified status
-        seconds = np.where(np.isin(table["warm_status"], SUCCESS), seconds, np.nan)
-    labels = (table[c] for c in ("study", "data", "formulation"))
-    keys = list(zip(*labels, *(_words(table[c]) for c in ("samples", "noise", "seed"))))
-    problems = {key: p for p, key in enumerate(dict.fromkeys(keys))}
-    solvers = {name: s for s, name in enumerate(sorted(set(table["solver"])))}
+    accuracy = usual_accuracy(table) if accuracy is None else accuracy
+    residual, seconds = worst_residual(table), seconds_of(table, time)
+    states = _row_states(table, accuracy, time)
+    problem, solver, solvers = _places(table)
     entries: dict[tuple[int, int], list[int]] = {}
-    members: list[list[int]] = [[] for _ in problems]
-    for i, (key, name) in enumerate(zip(keys, table["solver"])):
-        entries.setdefault((problems[key], solvers[name]), []).append(i)
-        members[problems[key]].append(i)
+    members: list[list[int]] = [[] for _ in range(int(problem.max(initial=-1)) + 1)]
+    for i in range(len(problem)):
+        members[problem[i]].append(i)
+        if states[i] != OTHER_ACCURACY:
+            entries.setdefault((problem[i], solver[i]), []).append(i)
     first = np.array([m[0] for m in members], dtype=int)
-    shape = (len(problems), len(solvers))
+    shape = (len(members), len(solvers))
     state, reason = np.full(shape, NOT_RUN, dtype=object), np.full(shape, "", dtype=object)
     false = np.zeros(shape, dtype=bool)
+    np.logical_or.at(false, (problem, solver), table["false_claim"])
     row, numbers = np.full(shape, -1), {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
     for (p, s), runs in entries.items():
         runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
-        bad = next((i for i in runs if states[i] != SOLVED), None)
+        bad = next((i for i in runs if states[i] not in VERIFIED), next((i for i in runs if states[i] != SOLVED), None))
         speaks = runs[0] if bad is None else bad
         row[p, s], state[p, s] = speaks, states[speaks]
         reason[p, s] = "" if bad is None else table["reason"][speaks]
-        false[p, s] = table["false_claim"][runs].any()
         numbers["residual"][p, s] = np.max(residual[runs])
         if bad is None:
             numbers["time"][p, s] = np.median(seconds[runs])
+        if np.isin(states[runs], VERIFIED).all():
             numbers["objective"][p, s] = np.max(table["objective"][runs])
     found = Results(
         *(table[name][first] for name in ("study", "data", "formulation", "samples", "noise", "seed")),
         n=np.array([_largest(table["n_samples"][m], table["samples"][m]) for m in members]),
         size=np.array([_largest(table["scale"][m]) for m in members]),
         limit=np.array([_largest(table["time_limit"][m]) for m in members]),
-        solvers=tuple(solvers), state=state, reason=reason, false=false, row=row, tolerance=limit, **numbers,
+        solvers=solvers, state=state, reason=reason, false=false, row=row, accuracy=accuracy, measure=time, **numbers,
     )  # fmt: skip
-    return _against_the_best(found, limit)
+    return _against_the_best(found)
+
+
+def _places(table: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Number of the problem and of the solver of every row, and the solvers in alphabetical order."""
+    labels = (table[c] for c in ("study", "data", "formulation"))
+    keys = list(zip(*labels, *(_words(table[c]) for c in ("samples", "noise", "seed"))))
+    problems = {key: p for p, key in enumerate(dict.fromkeys(keys))}
+    solvers = {name: s for s, name in enumerate(sorted(set(table["solver"])))}
+    return (np.array([problems[key] for key in keys], dtype=int),
+            np.array([solvers[name] for name in table["solver"]], dtype=int), tuple(solvers))  # fmt: skip
+
+
+def _other_accuracy(table: Mapping[str, np.ndarray], accuracy: float) -> np.ndarray:
+    """Which runs asked for an accuracy that another run of the same solver on the same problem suits better, (rows,).
+
+    What suits best is the loosest that is not looser than the common one; where all are looser, the strictest.
+    """
+    asked = table["accuracy"]
+    steps = np.log(np.where(np.isfinite(asked) & (asked > 0), asked, accuracy) / accuracy)
+    distance = np.where(steps <= 0, -steps, steps + 1e6)
+    problem, solver, solvers = _places(table)
+    entry = problem * len(solvers) + solver
+    nearest = np.full(int(entry.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(nearest, entry, distance)
+    return distance > nearest[entry]
 
 
 def _words(values: np.ndarray) -> list[str]:
@@ -264,32 +318,37 @@ def seconds_of(table: Mapping[str, np.ndarray], time: str) -> np.ndarray:
     return np.where(total > 0, total, np.where(total == 0, 1e-6, np.nan))  # a clock that stood still: a microsecond
 
 
-def _row_states(table: Mapping[str, np.ndarray], residual: np.ndarray, limit: float) -> np.ndarray:
+def _row_states(table: Mapping[str, np.ndarray], accuracy: float, time: str) -> np.ndarray:
     """`SOLVED` or why not, for every row by itself."""
+    warm_failed = (time == "warm") & (table["warm_status"] != "") & ~np.isin(table["warm_status"], SUCCESS)
     verified = np.isin(table["status_verified"], SUCCESS)
     unknown = np.where(table["status_verified"] == "", "failed", table["status_verified"])
     choices = [
+        (_other_accuracy(table, accuracy), OTHER_ACCURACY),
         (table["outcome"] != DONE, np.where(table["outcome"] == "", "error", table["outcome"])),
         (table["false_claim"], FALSE_CLAIM),
         (~verified, unknown),
         (~np.isfinite(table["objective"]), NON_FINITE),
-        (residual > limit, LESS_ACCURATE),
+        (worst_residual(table) > tolerance(accuracy), LESS_ACCURATE),
+        (warm_failed, WARM_FAILED),
+        (~np.isfinite(seconds_of(table, time)), UNTIMED),
     ]
-    states = np.full(len(residual), SOLVED, dtype=object)
+    states = np.full(len(verified), SOLVED, dtype=object)
     for condition, word in reversed(choices):
         states = np.where(condition, word, states)
     return states.astype(object)
 
 
-def _against_the_best(found: Results, limit: float) -> Results:
+def _against_the_best(found: Results) -> Results:
     """Take out minima above the best one, and claims of infeasibility that a verified point contradicts."""
-    solved = found.solved
-    best = np.min(np.where(solved, found.objective, np.inf), axis=1, initial=np.inf)
+    verified = np.isfinite(found.objective)
+    best = np.min(np.where(verified, found.objective, np.inf), axis=1, initial=np.inf)
     best = np.where(np.isfinite(best), best, 0.0)
     size = np.maximum(np.maximum(np.abs(best), 1e-2 * np.nan_to_num(found.size)), np.finfo(float).tiny)
     with np.errstate(invalid="ignore", over="ignore"):
-        worse = solved & ((found.objective - best[:, None]) / size[:, None] > max(VALUE, limit))
-    denied = np.isin(found.state, (INFEASIBLE, "unbounded")) & np.any(solved, axis=1, keepdims=True)
+        far = (found.objective - best[:, None]) / size[:, None] > max(VALUE, found.tolerance)
+    worse = found.solved & far
+    denied = np.isin(found.state, (INFEASIBLE, str(Status.UNBOUNDED))) & np.any(verified, axis=1, keepdims=True)
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     values |= {"state": state, "false": found.false | denied, "time": np.where(worse, np.nan, found.time), "size": size}
@@ -303,17 +362,23 @@ def states_of_rows(table: Mapping[str, np.ndarray], found: Results) -> np.ndarra
         table: the rows.
         found: what `tabulate` made of them.
     """
-    states = _row_states(table, worst_residual(table), found.tolerance)
+    states = _row_states(table, found.accuracy, found.measure)
     for word in (WORSE_MINIMUM, CONTRADICTED):
         states[found.row[found.state == word]] = word
     return states
 
 
 def agreed_infeasible(found: Results) -> np.ndarray:
-    """Return the problems that nobody solved and some solver was verified to call infeasible, (P,)."""
-    return ~found.solved.any(axis=1) & (found.state == INFEASIBLE).any(axis=1)
+    """Return the problems without a solution by common consent, (P,).
+
+    At least two solvers say so, and so does every other one that came to an answer. One claim is not enough: it comes
+    without a point, so nothing about it can be verified.
+    """
+    says = found.state == INFEASIBLE
+    answered = applicable(found) & ~np.isin(found.state, UNANSWERED)
+    return (says.sum(axis=1) >= 2) & (says | ~answered).all(axis=1)
 
 
 def applicable(found: Results) -> np.ndarray:
-    """Return the entries where the solver was run at all: neither refused nor left out, (P, S)."""
-    return (found.state != REFUSED) & (found.state != NOT_RUN)
+    """Return the entries where the solver was run at all: not refused, left out, or without a time, (P, S)."""
+    return ~np.isin(found.state, (REFUSED, NOT_RUN, UNTIMED))

@@ -8,7 +8,7 @@ from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.averages import Paired, paired_ratio, shifted_geometric_mean
 from optid.studies.verdicts.choice import Choice, choose
 from optid.studies.verdicts.growth import Growth, time_growth
-from optid.studies.verdicts.outcomes import SOLVED, Results, agreed_infeasible, applicable
+from optid.studies.verdicts.outcomes import INFEASIBLE, SOLVED, Results, agreed_infeasible, applicable
 from optid.studies.verdicts.profiles import Profile, performance_profiles, time_ratios
 from optid.studies.verdicts.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
@@ -63,6 +63,7 @@ class Section:
         name: label of the formulation, or "" for all problems.
         found: its problems and solvers; problems without a solution, by common consent, are taken out.
         infeasible: how many were taken out.
+        deniers: solvers that say of some of them that they have no solution, and solvers that were run on some.
         standings: one per solver that was run, best first.
         idle: solvers that were run on none of these problems.
         choice: who comes first.
@@ -73,6 +74,7 @@ class Section:
     name: str
     found: Results
     infeasible: int
+    deniers: tuple[int, int]
     standings: tuple[Standing, ...]
     idle: tuple[str, ...]
     choice: Choice
@@ -95,12 +97,16 @@ def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Sect
     gone: np.ndarray = agreed_infeasible(found)
     run: np.ndarray = np.any(applicable(found), axis=0)
     idle = tuple(s for s, there in zip(found.solvers, run) if not there)
-    kept = found.where(~gone, run)
+    found = found.where(np.ones(len(gone), dtype=bool), run)
+    kept = found.where(~gone)
     choice = choose(kept.time, kept.solvers, MINOR, paired_ratio, none=1.0)
-    standings = [_standing(kept, s, choice) for s in range(len(kept.solvers))]
+    says = (found.state == INFEASIBLE) & gone[:, None]
+    counted = applicable(found) & ~says  # who crashed on a problem without a solution has failed on it all the same
+    standings = _standings(found, counted, choice)
     profiles = dict(zip(kept.solvers, performance_profiles(kept.time)))
     standings.sort(key=lambda s: _order(s, choice))
-    return Section(name, kept, int(gone.sum()), tuple(standings), idle, choice, _ranking(kept, level), profiles)
+    deniers = (int(says.any(axis=0).sum()), int(applicable(found)[gone].any(axis=0).sum()))
+    return Section(name, kept, int(gone.sum()), deniers, tuple(standings), idle, choice, _ranking(kept, level), profiles)
 
 
 def _order(standing: Standing, choice: Choice) -> tuple:
@@ -111,34 +117,43 @@ def _order(standing: Standing, choice: Choice) -> tuple:
             standing.penalised if np.isfinite(standing.penalised) else np.inf, standing.solver)  # fmt: skip
 
 
-def _standing(found: Results, s: int, choice: Choice) -> Standing:
-    state, times = found.state[:, s], found.time[:, s]
-    ran, solved = applicable(found)[:, s], state == SOLVED
-    slowest = np.nanmax(found.time, axis=1, initial=0.0) if found.time.size else 0.0
+def _standings(found: Results, counted: np.ndarray, choice: Choice) -> list[Standing]:
+    """Standings in the order of the solvers.
+
+    Args:
+        found: problems and solvers.
+        counted: the entries that count for or against the solver, (P, S).
+        choice: who comes first.
+    """
+    times, fastest = found.time, time_ratios(found.time) == 1.0
+    slowest = np.nanmax(times, axis=1, initial=0.0) if times.size else 0.0
     limits = np.where(np.isfinite(found.limit), np.fmax(found.limit, slowest), np.inf)
-    words, counts = np.unique(state[ran & ~solved].astype(str), return_counts=True)
-    order = np.argsort(-counts, kind="stable")
-    against = None
-    if choice.first and found.solvers[s] != choice.first:
-        against = paired_ratio(times, found.time[:, found.solvers.index(choice.first)])
-    known = found.residual[solved, s]
-    known = known[np.isfinite(known)]
     labels = zip(found.formulation, found.study, found.data, found.noise)
     groups = np.array(["\0".join((*words, f"{noise:.12g}")) for *words, noise in labels], dtype=object)
-    return Standing(
-        found.solvers[s],
-        int(ran.sum()),
-        int(solved.sum()),
-        int((state == REFUSED).sum()),
-        int(found.false[:, s].sum()),
-        int((time_ratios(found.time)[:, s] == 1.0).sum()),
-        shifted_geometric_mean(times[solved]),
-        shifted_geometric_mean(np.where(solved, times, limits)[ran]),
-        against,
-        float(np.median(known)) if known.size else float("nan"),
-        time_growth(times, found.n, groups),
-        {str(words[i]): int(counts[i]) for i in order},
-    )
+    made = []
+    for s, solver in enumerate(found.solvers):
+        state, ran, solved = found.state[:, s], counted[:, s], found.solved[:, s]
+        words, counts = np.unique(state[ran & ~solved].astype(str), return_counts=True)
+        known = found.residual[solved, s]
+        known = known[np.isfinite(known)]
+        against = None
+        if choice.first and solver != choice.first:
+            against = paired_ratio(times[:, s], times[:, found.solvers.index(choice.first)])
+        made.append(Standing(
+            solver,
+            int(ran.sum()),
+            int(solved.sum()),
+            int((state == REFUSED).sum()),
+            int(found.false[:, s].sum()),
+            int(fastest[:, s].sum()),
+            shifted_geometric_mean(times[solved, s]),
+            shifted_geometric_mean(np.where(solved, times[:, s], limits)[ran]),
+            against,
+            float(np.median(known)) if known.size else float("nan"),
+            time_growth(times[:, s], found.n, groups),
+            {str(words[i]): int(counts[i]) for i in np.argsort(-counts, kind="stable")},
+        ))  # fmt: skip
+    return made
 
 
 def _ranking(found: Results, level: float) -> Ranking:

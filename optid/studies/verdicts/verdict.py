@@ -9,9 +9,27 @@ from typing import Any
 import numpy as np
 
 from optid.studies.storage.rows import REFUSED
-from optid.studies.verdicts.advice import Statement, carries_over, choice_of_formulation, choice_of_solver, headline
+from optid.studies.verdicts.advice import (
+    Statement,
+    carries_over,
+    choice_of_formulation,
+    choice_of_solver,
+    headline,
+    no_solution,
+)
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
-from optid.studies.verdicts.outcomes import CONTRADICTED, VALUE, Results, columns, tabulate, usual_accuracy
+from optid.studies.verdicts.outcomes import (
+    CONTRADICTED,
+    OTHER_ACCURACY,
+    SOLVED,
+    VALUE,
+    Results,
+    applicable,
+    columns,
+    states_of_rows,
+    tabulate,
+    usual_accuracy,
+)
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import Section, compare_solvers
 
@@ -139,11 +157,9 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
         said = [models]
         if found.solved.any() and len(overall.standings) > 1 and (len(sections) == 1 or head == solvers):
             said.append(carries_over(overall.ranking))
-    said += [_never(overall), _refuted(found, table), _no_truth(quality)]
+    said += [_never(overall), _refuted(found, table), _no_truth(quality), _other_accuracies(found, table)]
     if overall.infeasible:
-        noun = "problem has" if overall.infeasible == 1 else "problems have"
-        text = f"{overall.infeasible:,} {noun} no solution: solvers say so, and none found one. That does not count."
-        said.append(Statement("fair", "Infeasible problems", text, "solver"))
+        said.append(Statement("fair", "Infeasible problems", no_solution(overall), "solver"))
     return [statement for statement in said if statement is not None]
 
 
@@ -164,11 +180,22 @@ def _no_truth(quality: Quality) -> Statement | None:
     return Statement("fair", "Truth unknown", text, "formulation")
 
 
+def _other_accuracies(found: Results, table: Mapping[str, np.ndarray]) -> Statement | None:
+    """Say how many runs asked for another accuracy."""
+    other = states_of_rows(table, found) == OTHER_ACCURACY
+    if not other.any():
+        return None
+    asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
+    text = (f"{int(other.sum()):,} runs asked for {asked} and do not count beside those that suit {found.accuracy:.0e}; "
+            "--accuracy compares at another one.")  # fmt: skip
+    return Statement("fair", "Several accuracies", text, "solver")
+
+
 def _refuted(found: Results, table: Mapping[str, np.ndarray]) -> Statement | None:
     """Warn where a proved lower bound lies above an objective that another run verified: then a proof is wrong."""
     if not found.row.size:
         return None
-    rows = np.where(found.solved | np.isfinite(found.objective), found.row, -1)
+    rows = np.where(np.isfinite(found.objective), found.row, -1)
     proved = (rows >= 0) & table["proved"][rows] & np.isfinite(table["bound"][rows])
     bounds = np.max(np.where(proved, table["bound"][rows], -np.inf), axis=1)
     best = np.min(np.where(np.isfinite(found.objective), found.objective, np.inf), axis=1)
@@ -177,7 +204,8 @@ def _refuted(found: Results, table: Mapping[str, np.ndarray]) -> Statement | Non
     if not wrong.any():
         return None
     p = int(np.flatnonzero(wrong)[0])
-    text = f"On {int(wrong.sum()):,} problems a proved lower bound lies above an objective that another run verified, "
+    count = int(wrong.sum())
+    text = f"On {count:,} problem{'' if count == 1 else 's'} a proved lower bound lies above an objective that another run verified, "
     text += f"first on {found.data[p]}, {found.formulation[p]}. One of the two is wrong: please report it."
     return Statement("bad", "A proof is contradicted", text, "claims")
 
@@ -197,7 +225,8 @@ def _false_claims(table: Mapping[str, np.ndarray], found: Results) -> tuple[Fals
 
 def _failures(found: Results) -> tuple[Failure, ...]:
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for p, s in zip(*np.nonzero((found.state != "solved") & (found.state != "not run"))):
+    failed = (applicable(found) | (found.state == REFUSED)) & (found.state != SOLVED)
+    for p, s in zip(*np.nonzero(failed)):
         reason = str(found.reason[p, s])
         groups.setdefault((found.solvers[s], str(found.state[p, s]), _shape(reason)), []).append(reason)
     failures = [
