@@ -42,7 +42,7 @@ C45 = np.array([.763, .599, .954, .628, .882, .936, .661, .583, .775, 1.0, .940,
 C45M = np.array([.768, .591, .971, .661, .888, .931, .668, .583, .838, 1.0, .962, .666, .981, .978])
 
 
-def run(solver, problem=0, data="tank", seconds=1.0, *, formulation="exact", objective=1.0, **more):
+def run(solver, problem=0, data="tank", seconds=1.0, *, formulation="exact", objective: float | None = 1.0, **more):
     """One row: solved unless said otherwise."""
     return {"study": "s", "data": data, "formulation": formulation, "solver": solver, "seed": problem, "samples": 1000,
             "noise": 0.1, "n_samples": 1000, "accuracy": 1e-8, "outcome": "done", "status_claimed": "optimal",
@@ -120,6 +120,39 @@ def test_an_answer_to_a_looser_accuracy_of_its_own_is_held_to_the_common_one():
     assert list(tabulate(columns(rows), accuracy=1e-3).state[:, 1]) == ["solved", "solved", "not run"]
 
 
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_of_several_requested_accuracies_one_counts_for_every_entry(seed):
+    """Which one, counted by hand; the others change neither time nor state."""
+    rng = np.random.default_rng(seed)
+    common = float(rng.choice([1e-3, 1e-6, 1e-8]))
+    rows = []
+    for solver in "abc":
+        asked = rng.choice([1e-2, 1e-3, 1e-5, 1e-6, 1e-8, 1e-10], size=rng.integers(1, 5), replace=False)
+        strict = [value for value in asked if value <= common]
+        suits = max(strict) if strict else min(asked)
+        for value in asked:
+            fate = {} if rng.random() < 0.7 else {"outcome": "crashed", "status_verified": None, "objective": None}
+            rows.append(run(solver, seconds=float(np.exp(rng.normal())), accuracy=value, suits=value == suits, **fate))
+    table = columns(rows)
+    found = tabulate(table, accuracy=common)
+    alone = tabulate(columns([row for row in rows if row["suits"]]), accuracy=common)
+    np.testing.assert_array_equal(found.time, alone.time)
+    np.testing.assert_array_equal(found.state, alone.state)
+    other = states_of_rows(table, found) == "other accuracy"
+    assert list(~other) == [row["suits"] for row in rows]
+
+
+def test_a_study_of_several_accuracies_compares_at_one_and_says_so():
+    rows = [run("a", p, seconds=s, accuracy=a, violation=v) for p in range(8)
+            for s, a, v in ((0.1, 1e-8, 1e-9), (0.01, 1e-3, 1e-4))]  # fmt: skip
+    rows += [run("b", p, seconds=0.3, accuracy=a) for p in range(8) for a in (1e-8, 1e-3)]
+    strict, loose = conclude(rows), conclude(rows, accuracy=1e-3)
+    assert strict.recommended == loose.recommended == ("a",)
+    assert [v.overall.standing("a").time for v in (strict, loose)] == pytest.approx([0.1, 0.01])
+    assert any("16 runs asked for 1e-03" in s.text for s in strict.statements)
+
+
 def test_of_repetitions_every_one_must_count_and_the_median_time_does():
     times = (3.0, 1.0, 2.0)
     rows = [run("a", seconds=t, repetition=r) for r, t in enumerate(times)]
@@ -143,7 +176,13 @@ def test_a_warm_time_counts_only_where_the_warm_solve_was_verified():
     assert conclude(rows).recommended == ("b",)
     verdict = conclude(rows, time="warm")
     assert np.isfinite(verdict.found.time).sum(axis=0).tolist() == [7, 9] and verdict.overall.choice.first == "b"
+    a = verdict.overall.standing("a")
+    assert (a.solved, a.problems, a.failures) == (7, 9, {"warm solve failed": 2})
+    assert a.penalised == pytest.approx(np.exp(np.mean(np.log(np.array([0.1] * 7 + [60.0] * 2) + 0.01))) - 0.01)
     cold = conclude(table_of(times_of(1.0, 2.0)), time="warm")
+    assert "warm = true" not in str(verdict)
+    procedures = [run("a", p, formulation="steps", seconds=1.0) for p in range(9)]
+    assert conclude(rows + procedures, time="warm").overall.standing("a").problems == 9  # a procedure is no failure
     assert cold.headline.word == "Cannot tell" and "warm = true" in cold.headline.text and not cold.recommended
 
 
@@ -152,7 +191,35 @@ def test_problems_that_all_agree_to_be_infeasible_are_taken_out_and_said():
     rows += [run(s, 9, status_verified="infeasible", objective=None) for s in "ab"]
     verdict = conclude(rows)
     assert verdict.overall.infeasible == 1 and len(verdict.overall.found.data) == 8
-    assert not verdict.false_claims and "1 problem has no solution" in str(verdict)
+    assert not verdict.false_claims and "1 problem has no solution: 2 of 2 solvers say so" in str(verdict)
+
+
+def infeasible(solver, problem):
+    return run(solver, problem, status_verified="infeasible", objective=None, reason="said so")
+
+
+def dead(solver, problem, outcome):
+    return run(solver, problem, outcome=outcome, status_verified=None, objective=None, reason=outcome)
+
+
+def test_one_claim_of_infeasibility_is_not_enough():
+    rows = [row for p in range(10) for row in (infeasible("a", p), dead("b", p, "crashed"), dead("c", p, "time limit"))]
+    verdict = conclude(rows)
+    assert verdict.overall.infeasible == 0 and verdict.headline.tone == "bad"
+    assert {s.solver: s.failures for s in verdict.overall.standings} == {
+        "a": {"infeasible": 10}, "b": {"crashed": 10}, "c": {"time limit": 10}}  # fmt: skip
+    doubted = [infeasible("a", 0), infeasible("b", 0), run("c", 0, status_verified="failed")]
+    assert conclude(doubted).overall.infeasible == 0  # one that came to an answer does not say so
+
+
+def test_who_crashes_on_a_problem_without_a_solution_has_failed_on_it_all_the_same():
+    rows = [run(s, p) for s in "abc" for p in range(8)]
+    rows += [infeasible("a", 8), infeasible("b", 8), dead("c", 8, "crashed")]
+    verdict = conclude(rows)
+    assert verdict.overall.infeasible == 1 and "2 of 3 solvers say so" in str(verdict)
+    a, c = verdict.overall.standing("a"), verdict.overall.standing("c")
+    assert (a.problems, a.solved, a.failures) == (8, 8, {})
+    assert (c.problems, c.solved, c.failures) == (9, 8, {"crashed": 1}) and c.penalised > a.penalised
 
 
 # ---- profiles and averages

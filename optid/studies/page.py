@@ -15,7 +15,7 @@ from optid.showing.page import template, versions
 from optid.showing.wording import Table, number, seconds
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
-from optid.studies.verdicts.advice import Statement, choice_of_solver, evidence, model_evidence
+from optid.studies.verdicts.advice import Statement, choice_of_solver, evidence, model_evidence, plural
 from optid.studies.verdicts.choice import CANNOT_TELL
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.verdicts.quality import FIGURES, Quality
@@ -113,7 +113,7 @@ def _lead(verdict: Verdict) -> str:
     runs, found = len(verdict.table["solver"]), verdict.found
     parts = [(runs, "run"), (len(found.data), "problem"), (len(found.solvers), "solver"),
              (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]  # fmt: skip
-    return " · ".join(f"{count:,} {noun}{'' if count == 1 else 's'}" for count, noun in parts)
+    return " · ".join(plural(count, noun) for count, noun in parts)
 
 
 def _cards(verdict: Verdict) -> list[dict[str, str]]:

@@ -31,12 +31,16 @@ class Statement:
     about: str
 
 
+def plural(n: int, noun: str) -> str:
+    """Write "1 problem", "3 problems"."""
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
 def of(n: int, total: int, noun: str = "problem") -> str:
     """Write "3 of 4 problems"; "all 4 problems" where nothing is missing."""
-    plural = noun if total == 1 else noun + "s"
     if n == total:
-        return f"the only {noun}" if total == 1 else f"all {total:,} {plural}"
-    return f"{n:,} of {total:,} {plural}"
+        return f"the only {noun}" if total == 1 else f"all {plural(total, noun)}"
+    return f"{n:,} of {plural(total, noun)}"
 
 
 def choice_of_solver(section: Section) -> Statement:
@@ -53,7 +57,7 @@ def choice_of_solver(section: Section) -> Statement:
         return Statement(FAIR, "Nothing was run", text, "solver")
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
-        text = f"No solver reached the accuracy on any of {n:,} problem{'' if n == 1 else 's'} ({common})."
+        text = f"No solver reached the accuracy on any of {plural(n, 'problem')} ({common})."
         return Statement(BAD, "No solver can be recommended", text, "solver")
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
@@ -76,8 +80,9 @@ def choice_of_solver(section: Section) -> Statement:
 def no_solution(section: Section) -> str:
     """Say how many problems have no solution, and who says so."""
     k, (said, asked) = section.infeasible, section.deniers
-    return (f"{k:,} problem{' has' if k == 1 else 's have'} no solution: {said} of {asked} solvers say so, and none found "
-            "one. It counts neither for nor against them.")  # fmt: skip
+    have = f"{plural(k, 'problem')} {'has' if k == 1 else 'have'}"
+    return (f"{have} no solution: {said} of {asked} solvers say so, and none found one. That "
+            "counts neither for nor against them.")  # fmt: skip
 
 
 def _refusals(lead: Standing) -> str:

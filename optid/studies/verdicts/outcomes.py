@@ -222,8 +222,8 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
 
     Returns:
         The table. An entry is solved where every repetition ran to its end, was verified, has residuals within the
-        tolerance of the common accuracy, the time that is compared, and an objective within `VALUE` of the best verified
-        one. Of runs at several requested accuracies those count that suit the common one best.
+        tolerance of the common accuracy, the time that is compared, and an objective within `VALUE` of the best
+        verified one. Of runs at several requested accuracies those count that suit the common one best.
 
     Raises:
         DataError: unknown measure of time.

@@ -8,7 +8,7 @@ from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.averages import Paired, paired_ratio, shifted_geometric_mean
 from optid.studies.verdicts.choice import Choice, choose
 from optid.studies.verdicts.growth import Growth, time_growth
-from optid.studies.verdicts.outcomes import INFEASIBLE, SOLVED, Results, agreed_infeasible, applicable
+from optid.studies.verdicts.outcomes import INFEASIBLE, Results, agreed_infeasible, applicable
 from optid.studies.verdicts.profiles import Profile, performance_profiles, time_ratios
 from optid.studies.verdicts.ranks import Ranking, rank_over_data_sets, ranks_of_problems, scores_by_data_set
 
@@ -106,7 +106,8 @@ def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Sect
     profiles = dict(zip(kept.solvers, performance_profiles(kept.time)))
     standings.sort(key=lambda s: _order(s, choice))
     deniers = (int(says.any(axis=0).sum()), int(applicable(found)[gone].any(axis=0).sum()))
-    return Section(name, kept, int(gone.sum()), deniers, tuple(standings), idle, choice, _ranking(kept, level), profiles)
+    ranking = _ranking(kept, level)
+    return Section(name, kept, int(gone.sum()), deniers, tuple(standings), idle, choice, ranking, profiles)
 
 
 def _order(standing: Standing, choice: Choice) -> tuple:

@@ -16,6 +16,7 @@ from optid.studies.verdicts.advice import (
     choice_of_solver,
     headline,
     no_solution,
+    plural,
 )
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
 from optid.studies.verdicts.outcomes import (
@@ -167,7 +168,7 @@ def _never(overall: Section) -> Statement | None:
     never = [s.solver for s in overall.standings if not s.solved]
     if not never or len(never) == len(overall.standings):
         return None
-    tried = "; ".join(f"{s.solver}: {s.problems:,} problem{'' if s.problems == 1 else 's'}, "
+    tried = "; ".join(f"{s.solver}: {plural(s.problems, 'problem')}, "
                       + ", ".join(f"{word} {count:,}" for word, count in s.failures.items())
                       for s in overall.standings if not s.solved)  # fmt: skip
     return Statement("bad", "Never reached the accuracy", f"{tried}.", "solver")
@@ -186,8 +187,8 @@ def _other_accuracies(found: Results, table: Mapping[str, np.ndarray]) -> Statem
     if not other.any():
         return None
     asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
-    text = (f"{int(other.sum()):,} runs asked for {asked} and do not count beside those that suit {found.accuracy:.0e}; "
-            "--accuracy compares at another one.")  # fmt: skip
+    text = (f"{plural(int(other.sum()), 'run')} asked for {asked}: they do not count beside those that suit "
+            f"{found.accuracy:.0e}; --accuracy compares at another one.")  # fmt: skip
     return Statement("fair", "Several accuracies", text, "solver")
 
 
@@ -204,8 +205,8 @@ def _refuted(found: Results, table: Mapping[str, np.ndarray]) -> Statement | Non
     if not wrong.any():
         return None
     p = int(np.flatnonzero(wrong)[0])
-    count = int(wrong.sum())
-    text = f"On {count:,} problem{'' if count == 1 else 's'} a proved lower bound lies above an objective that another run verified, "
+    text = f"On {plural(int(wrong.sum()), 'problem')} a proved lower bound lies above an objective that another run "
+    text += "verified, "
     text += f"first on {found.data[p]}, {found.formulation[p]}. One of the two is wrong: please report it."
     return Statement("bad", "A proof is contradicted", text, "claims")
 
