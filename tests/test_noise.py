@@ -8,10 +8,19 @@ from scipy.signal import csd
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import _equations, _initial, covariance_of, innovations_covariance
+from optid.models.innovation_gain import (
+    _equations,
+    _initial,
+    _slope,
+    covariance_of,
+    innovations_covariance,
+    log_determinant,
+    refined,
+)
+from optid.models.innovation_kernels import innovate
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
-from optid.noise import colour, estimate_noise, noise_spectrum, residuals, with_noise
+from optid.noise import _most_likely, _part, colour, estimate_noise, noise_spectrum, residuals, with_noise
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])
@@ -195,3 +204,48 @@ def test_missing_inputs_cut_the_record():
     lost = np.flatnonzero(np.isnan(rest[0][:, 0]))
     assert lost.tolist() == [700, *range(2500, 2505)]
     assert np.isnan(rest[1][:2]).all() and not np.isnan(rest[1][2:]).any()
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_the_slope_of_the_likelihood_by_finite_differences(missing):
+    model = truth(7)
+    rest, gain = residuals(bare(model), record(model, (3000, 1500), missing=missing)), 0.5 * model.K
+    states = _initial(A - gain @ C, C, gain, rest)
+    count = np.mean(np.sum(~np.isnan(np.vstack(rest)), axis=0))
+
+    def errors(flat):  # the initial states stand still
+        K = flat.reshape(2, 3).T
+        return [innovate(A - K @ C, C, K, r, x0) for r, x0 in zip(rest, states)]
+
+    slope = approx_fprime(gain.T.ravel(), lambda flat: count / 2 * log_determinant(covariance_of(errors(flat))), 1e-7)
+    assert _slope(A, C, gain, errors(gain.T.ravel())) == pytest.approx(-slope, rel=1e-4, abs=1e-2)
+
+
+@pytest.mark.parametrize("lengths", [(40000,), (9000, 700, 12000)])
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+@pytest.mark.parametrize("kind", ["stationary", "grows", "coloured"])
+def test_the_search_in_a_part_first_ends_where_the_search_in_all_does(lengths, missing, kind):
+    model, rng = truth(11), np.random.default_rng(3)
+    rest = residuals(bare(model), record(model, lengths, missing=missing))
+    if kind == "grows":  # the information of a part is not that of the whole
+        rest = [r * np.linspace(0.2, 2, len(r))[:, None] for r in rest]
+    if kind == "coloured":  # no gain whitens
+        rest = [r + 0.3 * np.roll(r, 5, axis=0) + 0.05 * rng.normal(size=r.shape) for r in rest]
+    part = _part(rest, C.size)
+    assert 3000 < sum(map(len, part)) < 0.5 * sum(lengths)
+    assert all(any(np.shares_memory(p, r) for r in rest) for p in part)
+    searched = _most_likely(A, C, rest)
+    whole = [refined(A, C, gain, rest) for gain in (model.K, np.zeros((3, 2)))]
+    best = min(log_determinant(innovations_covariance(A, C, gain, rest)) for gain, _ in whole)
+    found = log_determinant(innovations_covariance(A, C, searched[0], rest))
+    assert sum(lengths) / 2 * (found - best) < 0.01
+    assert np.max(np.abs(np.linalg.eigvals(A - searched[0] @ C))) < 1
+
+
+def test_a_part_that_shows_too_little_is_not_searched():
+    rng = np.random.default_rng(0)
+    quiet = 0.1 * rng.normal(size=(40000, 2))
+    late = np.where(np.arange(40000)[:, None] < [0, 38000], np.nan, quiet)  # few samples have both outputs
+    assert _part([late], 6)[0] is late and _part([quiet[:5000]], 6)[0].shape == (5000, 2)
+    silent = quiet * [1.0, 0.0]
+    assert _part([silent], 6)[0] is silent

@@ -1,9 +1,9 @@
 """The gain of an innovation form from what the known signals leave of the outputs: ``r = C x + e, x+ = A x + K e``.
 
 The determinant of the covariance of the innovations is minimised over K, with the initial state of every experiment
-eliminated (maximum likelihood of Gaussian noise). From the optimum of a part of a long record, whose information is nearly that of
-the whole, a step costs two runs through the record: forth for the innovations and back for the slope of the likelihood
-(Fisher scoring).
+eliminated (maximum likelihood of Gaussian noise). Near an optimum with known information, such as that of a part of a
+long record, a step costs two runs through the record: forth for the innovations and back for the slope of the
+likelihood (Fisher scoring).
 """
 
 from collections.abc import Sequence
@@ -65,7 +65,8 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
         if not gained > 0:
             break
         gain, best = trial, covariance
-        if promised * (promised / before if before else 1.0) < arrived:  # steps shrink at a rate or faster
+        rate = promised / before if before and damping < FIRM else 1.0  # undamped steps shrink at a rate, or faster
+        if promised * rate < arrived:
             break
         before = promised
     return gain, best
