@@ -9,6 +9,9 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.errors import StudyError
 from optid.examples import example
+from optid.studies.definition.description import Study
+from optid.studies.execution.cell import lost_row
+from optid.studies.grid import cells
 from optid.studies.storage.database import read_rows
 from optid.studies.storage.rows import complete
 from optid.studies.verdicts.comparison import compare
@@ -113,6 +116,60 @@ def test_data_that_changed_are_refused_until_accepted(folder):
     after = read_rows("rigs.duckdb")
     assert len(after["key"]) == 6 and len(set(after["key"]) & set(before["key"])) == 4
     assert run("study", "run", "rigs.toml").exit_code == 0  # and is now what the database knows
+
+
+def test_a_dry_run_counts_what_the_run_would_run(folder):
+    from optid.studies.storage.journal import Journal, locked
+
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 2\nmemory_limit = 1.0"))
+    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
+    rows, before = read_rows("rigs.duckdb"), Path("rigs.duckdb").read_bytes()
+    assert set(rows["outcome"]) == {"memory limit"} and rows["key"].size == 6
+
+    def left(*words):
+        found = run("study", "run", "rigs.toml", "--dry-run", *words)
+        assert found.exit_code == 0, found.stderr
+        return int(found.stdout.split(" cells, ")[1].split()[0])
+
+    assert (left(), left("--retry", "crashed"), left("--retry", "memory limit")) == (0, 0, 6)
+    write_rig(folder / "rig.csv", seed=1)
+    refused = run("study", "run", "rigs.toml", "--dry-run")
+    assert refused.exit_code == 2 and "--accept-changed-data" in refused.stderr
+    assert left("--accept-changed-data") == 2
+    write_rig(folder / "rig.csv")
+
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
+    assert left() == 6
+    text = Path("rigs.toml").read_text()
+    cell = next(c for c in cells(Study.from_text(text, folder)) if c.seed == 1)
+    Journal(folder / "rigs.duckdb").add(lost_row(cell, "crashed", "for the test"))
+    kept = Path("rigs.duckdb.journal").read_bytes()
+    assert left() == 5 and Path("rigs.duckdb.journal").read_bytes() == kept
+    assert Path("rigs.duckdb").read_bytes() == before  # nothing was run, and nothing was written
+    with locked(folder / "rigs.duckdb"):
+        assert "another run is writing to" in run("study", "run", "rigs.toml", "--dry-run").stderr
+    told = run("study", "run", "rigs.toml", "--dry-run", "--db", "rig.csv").stderr
+    assert "rig.csv cannot be opened" in told and "/rig.csv cannot" not in told
+
+
+def test_what_is_taken_out_of_a_study_leaves_its_reports_which_say_so(folder):
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto", "gauss_newton"]'))
+    first = run("study", "run", "rigs.toml", "-w", 1)
+    assert first.exit_code == 0 and "superseded" not in first.stdout
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
+    told = run("study", "run", "rigs.toml", "-w", 1), run("study", "report", "rigs.duckdb")
+    for found in told:
+        assert "gauss_newton" not in found.stdout
+        assert "6 rows of former entries" in found.stdout and "kept in rigs.duckdb (table superseded)" in found.stdout
+
+
+def test_the_database_is_called_as_the_study_file(folder):
+    """Whatever stands before the last full stop of its name."""
+    for name in ("v1.2", "v1.3"):
+        Path(f"{name}.toml").write_text(STUDY.format(solvers='["gauss_newton"]').split("[[data]]\nfile")[0]
+                                        + STUDY[STUDY.index("[[formulation]]"):].split("[[formulation]]\nform")[0])
+        assert run("study", "run", f"{name}.toml", "-w", 1).exit_code == 0
+        assert Path(f"{name}.duckdb").is_file()
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):

@@ -75,12 +75,12 @@ def run(
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
     described = example_study() if file is None else Study.from_toml(file)
-    db = db or Path(file.stem if file is not None else "example").with_suffix(".duckdb")
+    db = db or Path(f"{file.stem if file is not None else 'example'}.duckdb")
     check_folders(db, export)
     if export is not None:
         database.check_target(export)
     if dry_run:
-        _plan(described, db)
+        _plan(described, db, accept_changed_data=accept_changed_data, retry=retry or ())
         return
     with follow_progress(db) as follow:
         running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
@@ -111,6 +111,7 @@ def report(
     check_folders(page)
     verdict = conclude(db, accuracy=accuracy, time=clock)
     say(str(verdict))
+    _former(db)
     if page is not None:
         write_page(verdict, page, command=command_line())
         say(f"report written to {page}")
@@ -203,16 +204,41 @@ def _short(text: str) -> str:
     return escape(text if len(text) <= 28 else text[:27] + "…")
 
 
-def _plan(described: Any, db: Path) -> None:
-    """Print the size of a study and what is left of it."""
-    from optid.studies import grid
-    from optid.studies.storage import database
+class _Planned(Exception):
+    """A run that has counted its cells, and shall go no further."""
 
-    cells = grid.cells(described)
-    grid_left = grid.left(cells, database.finished(db))
-    refused = sum(1 for cell in cells if cell.refusal)
+
+def _plan(described: Any, db: Path, **settings: Any) -> None:
+    """Print the size of a study and what is left of it: what a run says that works on a copy of the database."""
+    import shutil
+    from tempfile import TemporaryDirectory
+
+    from optid.errors import DatabaseError
+    from optid.studies import grid
+    from optid.studies.execution import running
+    from optid.studies.storage.journal import locked
+
+    counts = [0, 0]
+
+    def stop(done: int, total: int, _: Any) -> None:
+        counts[:] = done, total
+        raise _Planned
+
+    source = db.resolve()
+    with locked(source), TemporaryDirectory() as folder:
+        copy = Path(folder).resolve() / source.name
+        for ending in ("", ".wal", ".journal"):
+            if (there := source.with_name(source.name + ending)).is_file():
+                shutil.copyfile(there, copy.with_name(copy.name + ending))
+        try:
+            running.run(described, copy, execute=lambda _: iter(()), progress=stop, **settings)
+        except _Planned:
+            pass
+        except DatabaseError as error:
+            raise DatabaseError(str(error).replace(str(copy), str(db))) from None
+    refused = sum(1 for cell in grid.cells(described) if cell.refusal)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
-        f"{len(described.solvers)} solvers; {len(cells):,} cells, {len(grid_left):,} of them to run"
+        f"{len(described.solvers)} solvers; {counts[1]:,} cells, {counts[1] - counts[0]:,} of them to run"
         + (f", {refused:,} with a solver that is not installed" if refused else ""))
 
 
@@ -235,7 +261,18 @@ def _summary(db: Path, name: str) -> None:
     output().print(table)
     headline = conclude(rows).headline
     say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
+    _former(db, name)
     say(Text(f"optid study report {db} -o {db.stem}.html", "dim"))
+
+
+def _former(db: Path, name: str | None = None) -> None:
+    """Say how many rows are in the database that no report has."""
+    from optid.studies.storage.database import former
+
+    if count := former(db, name):
+        rows, stay = ("row", "is") if count == 1 else ("rows", "are")
+        say(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run again, "
+                 f"{stay} kept in {db} (table superseded) and in no report", "dim"))
 
 
 def _others(mine: dict[str, Any]) -> str:
