@@ -1,6 +1,8 @@
 """One cell: whatever the fit does is a row."""
 
 import json
+import time
+from collections import OrderedDict
 from dataclasses import replace
 
 import numpy as np
@@ -81,6 +83,64 @@ def test_warm_is_a_second_solve_from_the_solution():
     assert run_cell(one("ipopt"))["warm_s"] is None
 
 
+def test_the_solver_has_the_time_that_loading_left_and_the_second_solve_the_same(solver, monkeypatch):
+    """The same: another number would have some back ends compile once more."""
+    limits = []
+
+    def run(program, settings):
+        limits.append(settings.time_limit)
+        return back_ends()["ipopt"].run(program, settings)
+
+    monkeypatch.setattr(cells, "_records", OrderedDict())
+    monkeypatch.setattr(cells, "load", lambda cell, real=cells.load: time.sleep(0.3) or real(cell))
+    monkeypatch.setattr(cells, "REHEARSED", 0.0)
+    row = run_cell(one(solver(run), warm=True, time_limit=50.0))
+    assert row["outcome"] == "done" and row["warm_s"] > 0.0
+    assert limits[0] == limits[1] <= 49.7
+
+
+def test_a_second_solve_for_which_too_little_time_is_left_is_left_out(solver):
+    calls = []
+
+    def run(program, settings):
+        calls.append(settings.time_limit)
+        time.sleep(0.6)
+        return back_ends()["ipopt"].run(program, settings)
+
+    row = run_cell(one(solver(run), warm=True, time_limit=1.0))
+    assert row["outcome"] == "done" and row["reached"] and row["warm_s"] is None and len(calls) == 1
+    assert "no warm solve: 0." in row["reason"] and "s of the time limit were left" in row["reason"]
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("no"), MemoryError("no"), SystemExit("no")])
+def test_an_error_in_the_second_solve_leaves_the_row_of_the_first(monkeypatch, error):
+    kept = []
+
+    def broken(*arguments, **settings):
+        assert kept  # the parent has it, whatever becomes of this process
+        raise error
+
+    monkeypatch.setattr(cells, "keep", kept.append)
+    monkeypatch.setattr(cells, "solve", broken)
+    row = run_cell(one("ipopt", warm=True))
+    assert row["outcome"] == "done" and row["reached"] and row["warm_status"] is None
+    assert row["reason"] == f"no warm solve: {type(error).__name__}: no"
+    changed = {"reason", "total_s", "peak_mb"}
+    assert {k: v for k, v in row.items() if k not in changed} == {k: v for k, v in kept[-1].items() if k not in changed}
+
+
+def test_memory_that_only_the_second_solve_takes_leaves_the_row_of_the_first(monkeypatch):
+    def hungry(*arguments, real=cells.solve, **settings):
+        np.ones(60_000_000)
+        return real(*arguments, **settings)
+
+    run_cell(one("ipopt", warm=True))
+    monkeypatch.setattr(cells, "solve", hungry)
+    row = run_cell(one("ipopt", warm=True, memory_limit=Peak().start + 300.0))
+    assert row["outcome"] == "done" and row["reached"] and row["warm_s"] is None
+    assert "no warm solve: held" in row["reason"]
+
+
 def test_a_procedure_has_its_steps_and_their_times():
     row = run_cell(one("auto", "subspace.nuclear", options={"nx": 2}, warm=True))
     assert row["outcome"] == "done" and row["n_programs"] > 1 and row["warm_s"] is None
@@ -119,9 +179,13 @@ def test_the_first_quick_cell_of_its_kind_is_run_twice(monkeypatch):
     calls = []
     monkeypatch.setattr(cells, "fit", lambda *a, real=cells.fit, **k: calls.append(k["solver"]) or real(*a, **k))
     monkeypatch.setattr(cells, "_rehearsed", set())
-    for solver in ("gauss_newton", "gauss_newton", "ipopt", "clarabel"):  # the last refuses
+    for solver in ("gauss_newton", "gauss_newton", "ipopt", "clarabel", "clarabel"):  # the last refuses
         run_cell(one(solver))
-    assert calls == ["gauss_newton"] * 3 + ["ipopt"] * 2 + ["clarabel"]
+    assert calls == ["gauss_newton"] * 3 + ["ipopt"] * 2 + ["clarabel"] * 2
+    calls.clear()
+    run_cell(replace(one("fatrop"), options={**OPTIONS, "na": -1}))  # it ends before the solver is imported
+    run_cell(one("fatrop"))
+    assert calls == ["fatrop"] * 3
     monkeypatch.setattr(cells, "_rehearsed", set())
     monkeypatch.setattr(cells, "REHEARSED", 0.0)
     calls.clear()
@@ -161,7 +225,6 @@ def test_nothing_held_out():
 
 @pytest.mark.parametrize("cell, outcome, words", [
     (lambda: one("clarabel"), "refused", "not convex in constraint"),
-    (lambda: replace(one(), refusal="gurobi is not installed"), "refused", "not installed"),
     (lambda: replace(one(), solver_name="gurobi"), "refused", "pip install gurobipy"),
     (lambda: replace(one(), options={**OPTIONS, "na": -1}), "error", "StructureError.*na"),
     (lambda: replace(one(), options={**OPTIONS, "nab": 1}), "error", "takes no argument 'nab'"),
@@ -201,6 +264,41 @@ def test_a_solver_that_returns_nan_is_an_outcome(solver):
     row = run_cell(one(name))
     assert (row["outcome"], row["status_verified"], row["false_claim"]) == ("non-finite", "failed", True)
     assert "non-finite" in row["reason"] and row["objective"] is None and row["one_step_fit"] is None
+
+
+def test_a_channel_whose_name_holds_null_is_finite():
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 200)
+    y = np.convolve(u, [0.0, 0.5, 0.3])[:200] + 0.01 * rng.standard_normal(200)
+    entry = DataEntry("rig", record=Data(u, y, inputs=["null_pressure"]))
+    row = run_cell(one("clarabel", "arx", entry=entry, options={"na": 1, "nb": 2}))
+    assert "null_pressure" in row["parameters"]
+    assert row["outcome"] == "done" and row["reached"]
+
+
+@pytest.mark.parametrize("value", [np.nan, [1.0, np.inf]])
+def test_a_model_whose_parameters_are_not_finite_is_an_outcome(monkeypatch, value):
+    monkeypatch.setattr(cells, "_parameters", lambda model: {"a1": 0.5, "mu[u]": value})
+    row = run_cell(one())
+    assert row["outcome"] == "non-finite" and not row["reached"] and not row["proved"]
+    assert "parameters that are not finite" in row["reason"]
+
+
+def test_a_step_that_was_not_finite_is_no_outcome_of_a_procedure_that_went_on(solver, monkeypatch):
+    """The procedure takes a shorter step then; that the claim was false stays in the row."""
+    steps = []
+
+    def run(program, settings):
+        steps.append(program.name)
+        if len(steps) == 1:
+            nothing = {name: np.full(v.shape, np.nan) for name, v in program.variables.items()}
+            return Answer(Status.OPTIMAL, "solved!", nothing)
+        return back_ends()["clarabel"].run(program, settings)
+
+    monkeypatch.setattr(cells, "REHEARSED", 0.0)
+    row = run_cell(one(solver(run, ("QP", "SOCP", "conic")), "oe.exact", options={"na": 2, "nb": 2},
+                       constraints=("stable",)))
+    assert len(steps) > 1 and row["outcome"] == "done" and row["reached"] and row["false_claim"]
 
 
 @pytest.mark.parametrize("factor", [1e100, 1e200])

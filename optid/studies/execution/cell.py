@@ -316,7 +316,8 @@ def _finiteness(fitted: Fit, row: Mapping[str, Any]) -> dict[str, Any]:
         wrong.append(f"the objective is {solution.objective}")
     if np.isinf(row.get("one_step_fit") or 0.0):
         wrong.append("the predictions of the model are not finite")
-    if not all(np.all(np.isfinite(np.array(v, dtype=float))) for v in json.loads(row.get("parameters") or "{}").values()):
+    parameters = json.loads(row.get("parameters") or "{}")
+    if not all(np.all(np.isfinite(np.array(value, dtype=float))) for value in parameters.values()):
         wrong.append("the model has parameters that are not finite")
     lost = fitted.model is None and any(step.reason.endswith(NOT_FINITE) for _, step in fitted.steps)
     return {"outcome": NON_FINITE, "reached": False, "proved": False,
