@@ -195,10 +195,10 @@ def _responses(inner: Array, c: Array, e: Array, target: Array, first: int) -> I
     from optid.subspace.kernels import adjoint_responses
 
     l, n = c.shape  # noqa: E741
-    transposed, state = np.ascontiguousarray(inner.T), np.zeros((l, n, l))
+    state = np.zeros((n, l, l))
     for start in range(0, len(e), CHUNK):
         signals = np.ascontiguousarray(e[start : start + CHUNK])
-        out = np.empty((len(signals), l, n * l))
-        adjoint_responses(transposed, c, signals, state, out)
+        out = np.empty((len(signals), n, l, l))
+        adjoint_responses(inner, c, signals, state, out)
         left_out = max(first - start, 0)
-        yield out[left_out:], target[start + left_out : start + CHUNK]
+        yield out[left_out:].swapaxes(1, 2).reshape(-1, l, n * l), target[start + left_out : start + CHUNK]

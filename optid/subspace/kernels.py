@@ -34,34 +34,35 @@ def window_products(flat: Array, count: int, d: int, out: Array) -> None:
                 out[i, k] += flat[t * d + i] * flat[t * d + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def adjoint_responses(transposed: Array, outputs: Array, signals: Array, state: Array, out: Array) -> None:
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def adjoint_responses(inner: Array, outputs: Array, signals: Array, state: Array, out: Array) -> None:
     """Write the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
 
     The regressor of output o is the matrix X_o(k) (n, d) with X_o(k + 1) = F^T X_o(k) + C_o^T s(k)^T.
 
     Args:
-        transposed: (n, n) F^T.
+        inner: (n, n) F.
         outputs: (l, n) C.
         signals: (T, d) s.
-        state: (l, n, d) X at the first sample; left at the sample after the last.
-        out: (T, l, n d), states outermost, written.
+        state: (n, l, d) X at the first sample, for every output; left at the sample after the last.
+        out: (T, n, l, d) X, written.
     """
-    l, n, d = state.shape  # noqa: E741
-    following = np.empty((n, d))
+    n, l, d = state.shape  # noqa: E741
+    width = l * d
+    x, rows = state.reshape(n, width), out.reshape(out.shape[0], n * width)
     for t in range(signals.shape[0]):
-        for o in range(l):
-            for i in range(n):
+        row = rows[t]
+        for i in range(n):
+            for j in range(width):
+                row[i * width + j] = x[i, j]
+            for o in range(l):
                 for j in range(d):
-                    out[t, o, i * d + j] = state[o, i, j]
+                    x[i, o * d + j] = outputs[o, i] * signals[t, j]
+        for h in range(n):
             for i in range(n):
-                for j in range(d):
-                    following[i, j] = outputs[o, i] * signals[t, j]
-                for h in range(n):
-                    weight = transposed[i, h]
-                    for j in range(d):
-                        following[i, j] += weight * state[o, h, j]
-            state[o] = following
+                weight = inner[h, i]
+                for j in range(width):
+                    x[i, j] += weight * row[h * width + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -11,6 +11,7 @@ of samples has its own initial state; those of all but the first run of an exper
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,16 @@ from numpy.typing import NDArray
 from optid.bases.basis import Array
 from optid.errors import RankError
 from optid.rank_one import RankOne
-from optid.regressors.factors import add_to_root, conditioning
+from optid.regressors.factors import add_to_root, conditioning, root_of_gram
 from optid.stretches import runs_of
 from optid.subspace.expansion import Expansion
+from optid.subspace.hankel import CONDITION_LIMIT
 
 CHUNK = 4096
 """Samples whose regressors are formed at once."""
+
+MANY = 10
+"""Rows per column from which their Gram matrix is formed first."""
 
 HELD = 1 << 22
 """Numbers held at once at most: models with many functions and states take shorter chunks."""
@@ -231,32 +236,40 @@ class _Regressors:
             self.needed[x.m + x.l :] = True
 
     def compress(self, run: Array) -> tuple[Array, int, float]:
-        """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy."""
+        """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy.
+
+        Many rows enter by their Gram matrix, unless its condition would cost digits.
+        """
+        size = self.form.n + self.common + self.extra + 1
+        given = (self.form.weights * run[:, self.y])[~np.isnan(run[:, self.y])]
+        root = np.zeros((size, size))
+        if given.size > MANY * size:
+            root = root_of_gram(np.sum([rows.T @ rows for rows in self._weighted(run)], axis=0), size - 1)
+        if not conditioning(root) <= CONDITION_LIMIT:
+            root = reduce(add_to_root, self._weighted(run), np.zeros((size, size)))
+        return root, given.size, float(given @ given)
+
+    def _weighted(self, run: Array) -> Iterator[Array]:
+        """Yield the weighted rows of a run with their target, some samples of one output at a time."""
         from optid.subspace.kernels import adjoint_responses
 
         form, x = self.form, self.form.expansion
         n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
         width = p + q * (2 if self.extra else 1) + 1 + (l if self.injected else 0)
-        state = np.zeros((l, n, width))
-        free = form.c[:, :, None].copy()  # (F^T)^k C_o^T, the effect of x0
-        transposed = np.ascontiguousarray((form.a - form.gain @ form.c).T)
-        size = n + self.common + self.extra + 1
-        root, used, energy = np.zeros((size, size)), 0, 0.0
+        state = np.zeros((n, l, width))
+        free = form.c.T[:, :, None].copy()  # (F^T)^k C_o^T, the effect of x0
+        inner = np.ascontiguousarray(form.a - form.gain @ form.c)
         for start in range(0, len(run), self.chunk):
             raw = run[start : start + self.chunk]
             y = raw[:, self.y]
             signals, count = self._signals(raw), len(raw)
-            out, initial = np.empty((count, l, n * width)), np.empty((count, l, n))
-            adjoint_responses(transposed, form.c, signals, state, out)
-            adjoint_responses(transposed, np.zeros_like(form.c), np.zeros((count, 1)), free, initial)
-            out = out.reshape(count, l, n, width)
-            present = ~np.isnan(y)
-            energy += float(np.nansum((form.weights * y) ** 2))
+            out, initial = np.empty((count, n, l, width)), np.empty((count, n, l, 1))
+            adjoint_responses(inner, form.c, signals, state, out)
+            adjoint_responses(inner, np.zeros_like(form.c), np.zeros((count, 1)), free, initial)
             for o in range(l):
-                rows = self._rows(o, signals, initial[:, o], out[:, o], y[:, o])[present[:, o]]
-                used += len(rows)
-                root = add_to_root(root, form.weights[o] * rows)
-        return root, used, energy
+                present = ~np.isnan(y[:, o])
+                rows = self._rows(o, signals, initial[:, :, o, 0], out[:, :, o], y[:, o])
+                yield form.weights[o] * (rows if present.all() else rows[present])
 
     def _signals(self, raw: Array) -> Array:
         """Return [eta | (zeta simulated |) zeta | 1 (| y)]."""
