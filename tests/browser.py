@@ -14,10 +14,17 @@ from typing import Any
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NO_BROWSER = "no chromium, chromium-browser or google-chrome on PATH"
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-         "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
-         "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe")
+         "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage")
+DRIVEN = ("--allow-pre-commit-input", "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe")
 KEYS = {"Enter": (13, "\r"), "Tab": (9, ""), "Escape": (27, ""), "ArrowLeft": (37, ""), "ArrowRight": (39, ""),
         "ArrowUp": (38, ""), "ArrowDown": (40, ""), " ": (32, " ")}
+
+
+def look(page: Path, folder: Path, *options: str) -> subprocess.CompletedProcess:
+    """Let a browser open a file and end: what it prints, and on stderr what its console says."""
+    assert CHROMIUM is not None, NO_BROWSER
+    words = [CHROMIUM, *QUIET, "--enable-logging=stderr", "--v=0", f"--user-data-dir={folder}", *options]
+    return subprocess.run([*words, page.as_uri()], capture_output=True, text=True, timeout=600, check=True)
 
 
 class BrowserError(RuntimeError):
@@ -27,22 +34,25 @@ class BrowserError(RuntimeError):
 class Browser:
     """One page of one browser; use it in a ``with`` statement."""
 
-    def __init__(self, profile: Path, patience: float = 60.0) -> None:
+    def __init__(self, profile: Path, patience: float = 180.0) -> None:
         assert CHROMIUM is not None, NO_BROWSER
         self.patience, self.events, self.buffer, self.number = patience, [], b"", 0
         read, self.to = os.pipe()
         self.back, write = os.pipe()
-        line = shlex.join([CHROMIUM, *QUIET, f"--user-data-dir={profile}", "about:blank"])
+        line = shlex.join([CHROMIUM, *QUIET, *DRIVEN, f"--user-data-dir={profile}", "about:blank"])
         self.process = subprocess.Popen(["bash", "-c", f"exec {line} 3<&{read} 4>&{write}"], pass_fds=(read, write),
                                         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         os.close(read)
         os.close(write)
         self.session = None
-        targets = self.send("Target.getTargets")["targetInfos"]
-        page = next(t["targetId"] for t in targets if t["type"] == "page")
-        self.session = self.send("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
-        for domain in ("Page", "Runtime", "Network", "Log"):
-            self.send(f"{domain}.enable")
+        try:
+            page = self._first_page()
+            self.session = self.send("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+            for domain in ("Page", "Runtime", "Network", "Log"):
+                self.send(f"{domain}.enable")
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> "Browser":
         return self
@@ -57,6 +67,16 @@ class Browser:
             self.process.wait()
         os.close(self.to)
         os.close(self.back)
+
+    def _first_page(self) -> str:
+        """Wait for the page that the browser opens by itself, and return its name."""
+        end = time.monotonic() + self.patience
+        while time.monotonic() < end:
+            for target in self.send("Target.getTargets")["targetInfos"]:
+                if target["type"] == "page":
+                    return target["targetId"]
+            time.sleep(0.02)
+        raise BrowserError("the browser opens no page")
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Send a command and return its result."""
@@ -93,16 +113,25 @@ class Browser:
             raise BrowserError(details.get("exception", {}).get("description", details["text"]))
         return result["result"].get("value")
 
-    def wait(self, condition: str, patience: float = 30.0) -> None:
+    def wait(self, condition: str, patience: float = 60.0) -> None:
         """Wait until an expression is true."""
         end = time.monotonic() + patience
-        while not self.run(f"!!({condition})"):
+        while not self._holds(condition):
             if time.monotonic() > end:
                 raise BrowserError(f"not true after {patience:g} s: {condition}")
             time.sleep(0.02)
 
+    def _holds(self, condition: str) -> bool:
+        try:
+            return self.run(f"!!({condition})")
+        except BrowserError as error:
+            if "context" in str(error):  # the page that was asked has just been replaced by the one that comes
+                return False
+            raise
+
     def open(self, path: Path, ready: str = "document.documentElement?.dataset.ready") -> float:
         """Open a file, wait until it is ready, and return the seconds from the command on."""
+        self.run("delete document.documentElement?.dataset.ready")  # what the page before said of itself
         self.events.clear()
         clock = time.perf_counter()
         self.send("Page.navigate", url=Path(path).absolute().as_uri())

@@ -381,7 +381,7 @@ def test_debug_shows_where_it_happened(tmp_path):
 
 def program(*words: object) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-m", "optid", *map(str, words)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", "optid", *map(str, words)], capture_output=True, text=True, timeout=600
     )
 
 

@@ -1,12 +1,11 @@
 """Several models on one page, prediction horizons, and what validation says of models with feedback."""
 
 import re
-import shutil
-import subprocess
 import warnings
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, NO_BROWSER, look
 from systems import by_hand, inputs, mimo, siso
 from typer.testing import CliRunner
 
@@ -19,8 +18,6 @@ from optid.models import HammersteinARX, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.validation import compare_models, fit_by_horizon, fit_percent, validate
 from optid.validation.correlations import between_outputs
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 @pytest.fixture(autouse=True)
@@ -163,15 +160,10 @@ def test_the_page_is_complete_and_makes_no_request(tmp_path):
     assert f"{hostile.fits['5 steps'][0, 1]:.2f} %" in source
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome on PATH")
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_a_browser_renders_the_comparison_without_a_complaint(tmp_path):
     path = report.write_comparison(compare_models([siso(), worse(siso())], record(siso())), tmp_path / "page.html")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom"]
-    options += [f"--user-data-dir={tmp_path}", "--host-resolver-rules=MAP * ~NOTFOUND"]
-    result = subprocess.run(
-        [str(CHROMIUM), *options, path.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+    result = look(path, tmp_path / "profile", "--dump-dom", "--host-resolver-rules=MAP * ~NOTFOUND")
     assert "CONSOLE" not in result.stderr and result.stdout.count("<svg ") == 3
 
 

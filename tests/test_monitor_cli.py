@@ -5,10 +5,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
+import psutil
 import pytest
+from processes import wait_for
 from test_monitor import plant, stream
 
 from optid.errors import DataError
@@ -141,23 +142,28 @@ def test_thresholds_of_something_else_and_impossible_requests_are_refused(folder
 def test_a_file_is_followed_until_the_monitor_is_stopped(folder, tmp_path):
     rows = (folder / "stream.csv").read_text().splitlines(keepends=True)
     grown, state = tmp_path / "grown.csv", tmp_path / "state.npz"
-    grown.write_text("".join(rows[:100]) + rows[100][:7])  # a line that is not complete
+    size = grown.write_text("".join(rows[:100]) + rows[100][:7])  # a line that is not complete
     process = subprocess.Popen(
         [sys.executable, "-m", "optid", "monitor", "model.json", *QUICK, "--thresholds", "thresholds.json", "--follow",
          str(grown), "--state", str(state)], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )
     try:
-        time.sleep(1.0)
+        wait_for(lambda: (str(grown), size) in places(process.pid), 600)  # the half line has been read
         with grown.open("a") as file:
             file.write(rows[100][7:] + "".join(rows[101:]))
         lines = [process.stdout.readline() for _ in range(2)]
         assert ": alarm: " in lines[0] and lines[1]
         process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=600)
         assert process.returncode == 0 and errors == ""
     finally:
         process.kill()
     assert state.exists()
+
+
+def places(pid):
+    """Files that a process reads, and how far it has come."""
+    return [(one.path, one.position) for one in psutil.Process(pid).open_files()]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes")

@@ -1,30 +1,14 @@
 import re
-import shutil
-import subprocess
 import warnings
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, NO_BROWSER, look
 from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_two
 
 import optid
 from optid import report
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-QUIET = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--enable-logging=stderr",
-    "--v=0",
-]
 
 
 class Page(HTMLParser):
@@ -166,29 +150,19 @@ def test_a_fit_without_a_model_is_refused():
         report.render(fit)
 
 
-def browser(path: Path, folder: Path, *options: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [str(CHROMIUM), *QUIET, f"--user-data-dir={folder}", *options, path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome on PATH")
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 @pytest.mark.parametrize("name", ["thruster", "mimo"])
 def test_a_browser_renders_the_page_without_a_complaint(pages, name, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(pages[name], encoding="utf-8")
-    result = browser(path, tmp_path / "profile", "--dump-dom", "--host-resolver-rules=MAP * ~NOTFOUND")
+    result = look(path, tmp_path / "profile", "--dump-dom", "--host-resolver-rules=MAP * ~NOTFOUND")
     assert "CONSOLE" not in result.stderr and "ERR_" not in result.stderr
     rendered, written = Page(result.stdout), Page(pages[name])
     assert " ".join(rendered.text.split()) == " ".join(written.text.split())
     assert result.stdout.count("<path") == pages[name].count("<path")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome on PATH")
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_light_and_dark_differ_and_a_phone_needs_no_sideways_scrolling(pages, tmp_path):
     import matplotlib.image
 
@@ -197,7 +171,7 @@ def test_light_and_dark_differ_and_a_phone_needs_no_sideways_scrolling(pages, tm
     brightness = {}
     for scheme, value in (("light", 1), ("dark", 0)):
         shot = tmp_path / f"{scheme}.png"
-        browser(
+        look(
             path,
             tmp_path / scheme,
             f"--screenshot={shot}",
@@ -214,7 +188,7 @@ def test_light_and_dark_differ_and_a_phone_needs_no_sideways_scrolling(pages, tm
         "document.title = d.scrollWidth + ' of ' + d.clientWidth}, 50)\"></iframe>",
         encoding="utf-8",
     )
-    result = browser(
+    result = look(
         probe, tmp_path / "phone", "--dump-dom", "--virtual-time-budget=3000", "--allow-file-access-from-files"
     )
     width, room = map(int, re.search(r"<title>(\d+) of (\d+)</title>", result.stdout).groups())
