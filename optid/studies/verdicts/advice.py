@@ -12,6 +12,7 @@ from optid.studies.verdicts.standings import Section, Standing
 GOOD, FAIR, BAD = "good", "fair", "bad"
 RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
 LONGEST = 90  # characters of a headline
+NO_SOLVER = "No solver can be recommended"
 
 
 @dataclass(frozen=True)
@@ -58,23 +59,25 @@ def choice_of_solver(section: Section) -> Statement:
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
         text = f"No solver reached the accuracy on any of {plural(n, 'problem')} ({common})."
-        return Statement(BAD, "No solver can be recommended", text, "solver")
+        return Statement(BAD, NO_SOLVER, text, "solver")
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
     lead = section.standing(choice.first)
-    solved = f"{lead.solver} reached the accuracy on {of(lead.solved, n)}{_median(lead)}"
+    solved = f"{lead.solver} reached the accuracy on {of(lead.solved, n)}{_average(lead)}"
     if choice.kind == ONLY_ONE:
         return Statement(_tone(lead, n), "Only one solver", f"{solved}. There is nothing to compare it with.", "solver")
     if choice.kind == CANNOT_TELL:
         return Statement(FAIR, "Cannot tell yet", f"The comparison {choice.missing}. So far {solved}.", "solver")
     if choice.kind == TIE:
         names = (choice.first, *choice.tied)
-        each = "; ".join(f"{name} {_against(section, name)}" for name in choice.tied[:3])
+        each = "; ".join(f"{name} {_count(section, name)}{_against(section, name)}" for name in choice.tied[:3])
         text = f"{solved}. No difference in time beyond chance or 10 %: {each}.{_claims(section, names)}"
-        return Statement(_tone(lead, n), f"A tie: {listed(names)}", text, "solver")
-    text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (choice.first,))}"
-    word = f"Solves most: {choice.first}" if lead.refused > RARE * n else f"Use {choice.first}"
-    return Statement(_tone(lead, n), word, text.rstrip(), "solver")
+        word = f"A tie: {listed(names)}"
+    else:
+        text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (lead.solver,))}"
+        most = lead.refused > RARE * n and lead.solved == max(choice.solved.values())
+        word = f"Solves most: {lead.solver}" if most else f"Use {lead.solver}"
+    return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text.rstrip(), "solver")
 
 
 def no_solution(section: Section) -> str:
@@ -97,15 +100,23 @@ def evidence(section: Section) -> str:
     if choice.kind == TIE:
         pairs = [f"{name} {_times(choice.against[name])}" for name in choice.tied[:2]]
         return "no difference beyond chance or 10 %: " + ", ".join(pairs)
+    after = _next(section)
+    if after is None:
+        return "nobody else solved any"
+    fewer = "" if after.solved == section.standing(choice.first).solved else f" solved {after.solved:,},"
+    ratio = choice.against.get(after.solver)
+    return f"next: {after.solver}{fewer} {_times(ratio)}" if ratio is not None and ratio.enough else (
+        f"next: {after.solver}{fewer}".rstrip(","))  # fmt: skip
+
+
+def _next(section: Section) -> Standing | None:
+    """The candidate closest to the first, or where there is none who solved most after it; None where nobody did."""
+    choice = section.choice
     rivals = [name for name in choice.candidates if name != choice.first]
     if rivals:
-        name = min(rivals, key=lambda rival: choice.against[rival].value)
-        return f"next: {name} {_times(choice.against[name])}"
-    others = [s for s in section.standings if s.solver != choice.first]
-    most = max(others, key=lambda s: s.solved)
-    ratio = choice.against.get(most.solver)
-    speed = f", {_times(ratio)}" if ratio is not None and ratio.enough else ""
-    return f"next: {most.solver} solved {most.solved:,}{speed}" if most.solved else "nobody else solved any"
+        return section.standing(min(rivals, key=lambda rival: choice.against[rival].value))
+    others = [s for s in section.standings if s.solver != choice.first and s.solved]
+    return max(others, key=lambda s: s.solved, default=None)
 
 
 def model_evidence(quality: Quality, name: str) -> str:
@@ -140,7 +151,7 @@ def _tone(lead: Standing, n: int) -> str:
     return FAIR if lead.solved >= 0.5 * n else BAD
 
 
-def _median(standing: Standing) -> str:
+def _average(standing: Standing) -> str:
     return f", in {seconds(standing.time)} on average" if standing.time == standing.time else ""
 
 
@@ -164,20 +175,29 @@ def _against(section: Section, name: str) -> str:
     return f"takes {times_as(pair.value)} (95 %: {pair.low:.3g} to {pair.high:.3g}, {pair.n:,} problems)"
 
 
+def _count(section: Section, name: str) -> str:
+    """Say how many problems a candidate solved where it is not as many as the first."""
+    solved = section.choice.solved
+    if solved[name] == solved[section.choice.first]:
+        return ""
+    return f"solved {solved[name]:,}, no difference beyond chance or 1 %, and "
+
+
 def _runner_up(section: Section) -> str:
     """Compare with the next candidate, or with the one that solved most after the first."""
-    choice = section.choice
-    rivals = [name for name in choice.candidates if name != choice.first]
-    if rivals:
-        name = min(rivals, key=lambda rival: choice.against[rival].value)
-        return f"The next as reliable, {name}, {_against(section, name)}."
-    others = [s for s in section.standings if s.solver != choice.first]
-    if not any(s.solved for s in others):
-        return f"Nobody else solved any: {listed([s.solver for s in others])}."
-    most = max(others, key=lambda s: s.solved)
-    pair = choice.against.get(most.solver)
-    speed = f", in {_times(pair)} where both work" if pair is not None and pair.enough else ""
-    return f"The next, {most.solver}, solved only {most.solved:,}{speed}."
+    choice, after = section.choice, _next(section)
+    if after is None:
+        return f"Nobody else solved any: {listed([s.solver for s in section.standings if s.solver != choice.first])}."
+    name = after.solver
+    if name not in choice.candidates:
+        pair = choice.against.get(name)
+        speed = f", in {_times(pair)} where both work" if pair is not None and pair.enough else ""
+        return f"The next, {name}, solved only {after.solved:,}{speed}."
+    fewer, most = _count(section, name), max(choice.candidates, key=lambda one: choice.solved[one])
+    text = f"The next{'' if fewer else ' as reliable'}, {name}, {fewer}{_against(section, name)}."
+    if choice.solved[most] > max(choice.solved[choice.first], choice.solved[name]):
+        text += f" {most} {_count(section, most)}{_against(section, most)}."
+    return text
 
 
 def _quicker(section: Section) -> str:
@@ -222,9 +242,9 @@ def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     same = [name for name in ranking.names[1:] if not ranking.differ(best, name)]
     text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} ({evidence})"
     if len(same) == len(ranking.names) - 1:
-        text += f"; the ranks differ as a whole, but no other {noun} is behind it for certain."
+        text += f"; the ranks differ as a whole, but no other {noun} is behind it beyond chance."
         return Statement(FAIR, "Other data: a tie", text, "data sets")
-    text += f"; {listed(same)} cannot be told apart from it." if same else "; every other ranks behind it for certain."
+    text += f"; {listed(same)} cannot be told apart from it." if same else "; all others are behind beyond chance."
     word = f"Other data: {listed([best, *same])} {'lead' if same else 'leads'}"
     return Statement(GOOD, word, text, "data sets")
 
@@ -289,13 +309,15 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
     beaten = any(s.choice.kind == FIRST and s.choice.first not in (choice.first, *choice.tied) for s in sections)
     if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n and not beaten:
         return choice_of_solver(overall)
-    decided = [section for section in sections if section.choice.kind in (FIRST, TIE, ONLY_ONE)]
+    decided = [section for section in sections if section.recommended or section.choice.kind == ONLY_ONE]
     if not decided:
         return choice_of_solver(overall)
     firsts = list(dict.fromkeys(section.choice.first for section in decided))
     if len(firsts) == 1 and len(decided) == len(sections):
-        text = f"{firsts[0]} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}."
-        return Statement(GOOD, f"Use {firsts[0]}", text, "solver")
+        lead = overall.standing(firsts[0])
+        text = f"{lead.solver} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}, and "
+        text += f"reached the accuracy on {of(lead.solved, n)}."
+        return Statement(_tone(lead, n), f"Use {lead.solver}", text, "solver")
     named = {first: [section.name for section in decided if section.choice.first == first] for first in firsts}
     best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
     most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
@@ -304,7 +326,8 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
         text = f"No solver does everything: {text}"
     if len(decided) < len(sections):
         text += f" For {len(sections) - len(decided)} of {len(sections)} formulations it cannot be told."
-    tone = GOOD if len(decided) == len(sections) else FAIR
+    tones = [_tone(section.standing(section.choice.first), len(section.found.data)) for section in decided]
+    tone = max(tones if len(decided) == len(sections) else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
     if len(best) <= LONGEST:
         return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
     return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")

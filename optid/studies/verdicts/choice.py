@@ -4,12 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import binom
 
 from optid.studies.verdicts.averages import MINIMUM_PAIRS, Paired
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
 VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2
 RELIABLE = 0.01  # share of the problems by which the number solved may stay behind the most reliable
+LEVEL = 0.05  # of the test whether it stays behind by more than chance
 
 
 @dataclass(frozen=True)
@@ -17,11 +19,13 @@ class Choice:
     """The outcome of a comparison.
 
     Attributes:
-        kind: "first" (one is ahead), "tie" (those named are known to be close), "cannot tell" (too few data; `missing`
-            says which), "only one" (nothing to compare with), "nobody" (not one problem solved).
-        first: who is ahead, of a tie the one with the best mean; "" where there is nobody.
+        kind: "first" (one is ahead), "tie" (those named are known to be close), "cannot tell" (too few data, or an
+            order that depends on the problems; `missing` says which), "only one" (nothing to compare with), "nobody"
+            (not one problem solved).
+        first: who is ahead, of a tie the one that solved most, then the one with the best mean; "" where there is
+            nobody.
         tied: the others that cannot be told apart from it.
-        candidates: who solved as many problems as the most reliable, up to the slack.
+        candidates: who solved as many problems as the most reliable, up to the slack and chance.
         against: {name: it against the first, on the problems that both solved}.
         solved: {name: problems solved}.
         problems: their number.
@@ -53,22 +57,30 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         slack: share of the problems by which the number solved may stay behind the most reliable.
 
     Returns:
-        The choice. Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of
-        their comparison excludes equality and the difference is of practical meaning; they tie where that interval is
-        narrow, and cannot be told where it is not.
+        The choice. Somebody is no candidate where the number solved is behind that of the most reliable by more than
+        the slack and beyond chance (exact one-sided sign test on the problems that one of the two solved, at `LEVEL`).
+        Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of their
+        comparison excludes equality and the difference is of practical meaning; they tie where that interval is narrow,
+        and cannot be told where it is not. The first is one that no other candidate is ahead of.
     """  # fmt: skip
-    counts = np.isfinite(costs).sum(axis=0)
+    known = np.isfinite(costs)
+    counts = known.sum(axis=0)
     solved, problems = {name: int(c) for name, c in zip(names, counts)}, len(costs)
     if not counts.any():
         return Choice(NOBODY, solved=solved, problems=problems, missing="needs a solver that reaches the accuracy")
-    reliable = np.flatnonzero((counts > 0) & (counts >= counts.max() - int(slack * problems)))
+    allowed = int(slack * problems)
+    reliable = _reliable(known, allowed)
     candidates = tuple(names[s] for s in reliable)
-    common = np.isfinite(costs[:, reliable]).all(axis=1)
-    if not common.any():
-        missing = f"needs a {noun} that {listed(candidates)} all solve"
+    unbeaten = [s for s in reliable if s not in _beaten(costs, reliable, minor, compare, none)]
+    if not unbeaten:
+        missing = f"goes in a circle: each of {listed(candidates)} is behind another one on the {noun}s that both solve"
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
-    means = [_mean(costs[common, s], compare) for s in reliable]
-    lead = int(reliable[int(np.argmin(means))])
+    leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
+    common = known[:, leaders].all(axis=1)
+    if not common.any():
+        missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve"
+        return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
+    lead = min(leaders, key=lambda s: _mean(costs[common, s], compare))
     against = {names[s]: compare(costs[:, s], costs[:, lead]) for s in np.flatnonzero(counts) if s != lead}
     tied = tuple(name for name in candidates if name in against and not _apart(against[name], minor, none))
     kind, missing = (TIE if tied else FIRST), ""
@@ -89,6 +101,32 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     return Choice(kind, names[lead], tied, candidates, against, solved, problems, missing)
 
 
+def _reliable(known: np.ndarray, allowed: int) -> list[int]:
+    """Who solved something, and no fewer than the most reliable by more than what is allowed and chance explains."""
+    counts = known.sum(axis=0)
+    best = known[:, int(np.argmax(counts))]
+
+    def behind(s: int) -> bool:
+        lost, won = int((best & ~known[:, s]).sum()), int((known[:, s] & ~best).sum())
+        return lost - won > allowed and float(binom.sf(lost - 1, lost + won, 0.5)) < LEVEL
+
+    return [int(s) for s in np.flatnonzero(counts) if not behind(s)]
+
+
+def _beaten(costs: np.ndarray, reliable: list[int], minor: float,
+            compare: Callable[[np.ndarray, np.ndarray], Paired], none: float) -> set[int]:  # fmt: skip
+    """Who is behind another one, for sure and by more than a trifle."""
+    beaten = set()
+    for k, one in enumerate(reliable):
+        for other in reliable[k + 1 :]:
+            pair = compare(costs[:, one], costs[:, other])
+            if _apart(pair, minor, none):
+                beaten.add(one)
+            elif _ahead(pair, minor, none):
+                beaten.add(other)
+    return beaten
+
+
 def _mean(column: np.ndarray, compare: Callable[[np.ndarray, np.ndarray], Paired]) -> float:
     """The column against ones: a mean in the scale of the comparison."""
     return compare(column, np.ones_like(column)).value
@@ -98,6 +136,12 @@ def _apart(pair: Paired, minor: float, none: float) -> bool:
     """Whether the other one is worse, for sure and by more than a trifle."""
     threshold = none * (1 + minor) if none else minor
     return pair.enough and pair.low > none and pair.value > threshold
+
+
+def _ahead(pair: Paired, minor: float, none: float) -> bool:
+    """Whether the other one is better, for sure and by more than a trifle."""
+    threshold = none / (1 + minor) if none else -minor
+    return pair.enough and pair.high < none and pair.value < threshold
 
 
 def _vague(pair: Paired, minor: float, none: float) -> bool:

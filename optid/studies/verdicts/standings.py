@@ -6,7 +6,7 @@ import numpy as np
 
 from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.averages import Paired, paired_ratio, shifted_geometric_mean
-from optid.studies.verdicts.choice import Choice, choose
+from optid.studies.verdicts.choice import FIRST, TIE, Choice, choose
 from optid.studies.verdicts.growth import Growth, time_growth
 from optid.studies.verdicts.outcomes import INFEASIBLE, Results, agreed_infeasible, applicable
 from optid.studies.verdicts.profiles import Profile, performance_profiles, time_ratios
@@ -80,6 +80,14 @@ class Section:
     choice: Choice
     ranking: Ranking
     profiles: dict[str, Profile]
+
+    @property
+    def recommended(self) -> tuple[str, ...]:
+        """Who comes first or ties for it; empty where that cannot be told, or where it fails more often than not."""
+        choice = self.choice
+        if choice.kind not in (FIRST, TIE) or self.standing(choice.first).share < 0.5:
+            return ()
+        return (choice.first, *choice.tied)
 
     def standing(self, solver: str) -> Standing:
         """Return the standing of one solver."""

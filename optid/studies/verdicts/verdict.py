@@ -104,9 +104,8 @@ class Verdict:
 
     @property
     def recommended(self) -> tuple[str, ...]:
-        """Solvers that come first or tie for it on all problems; empty where that cannot be told."""
-        choice = self.overall.choice
-        return (choice.first, *choice.tied) if choice.kind in ("first", "tie") else ()
+        """Solvers that come first or tie for it on all problems; empty where nobody can be recommended."""
+        return self.overall.recommended
 
     def __str__(self) -> str:
         """The verdict as text."""
