@@ -30,6 +30,10 @@ TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve
          "base_mb", "started"}
 
 
+SMALL = Study("trouble", (DataEntry("none", system="dead_zone"),),
+              (FormulationEntry("f", "arx", options={"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
+
+
 def by_key(found, todo):
     """Rows by number of the cell; every cell has exactly one."""
     rows = {int(row["key"], 16): row for row in found}
@@ -96,8 +100,6 @@ def test_a_study_writes_every_cell_once_and_resumes_on_a_cluster(client, monkeyp
     """A Dask worker is killed, the run is stopped as by Ctrl-C, and the second run, here, does the rest."""
     todo = [cell(k, seconds=0.05) for k in range(40)]
     monkeypatch.setattr(running, "cells", lambda study: list(todo))
-    study = Study("trouble", (DataEntry("none", system="dead_zone"),),
-                  (FormulationEntry("f", "arx", options={"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
     ran, pids, db = [], client.run(os.getpid), tmp_path / "study.duckdb"
 
     def follow(done, total, row):
@@ -114,10 +116,10 @@ def test_a_study_writes_every_cell_once_and_resumes_on_a_cluster(client, monkeyp
         return workers.execute(cells, behave, workers=1)
 
     with pytest.raises(KeyboardInterrupt):
-        running.run(study, db, progress=follow, execute=on_cluster)
+        running.run(SMALL, db, progress=follow, execute=on_cluster)
     kept = finished(db)
     assert len(kept) >= 19
-    running.run(study, db, execute=here)
+    running.run(SMALL, db, execute=here)
     rows = read_rows(db)
     assert len(ran) == 40 - len(kept) and sorted(rows["key"]) == sorted(one.key for one in todo)
 
@@ -262,6 +264,23 @@ def test_a_cell_that_cannot_be_pickled_is_a_row(client):
     rows = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
     assert rows[0]["outcome"] == "error" and "cannot be sent to a worker" in rows[0]["reason"]
     assert rows[1]["outcome"] == "done"
+
+
+def test_a_client_that_is_closed_ends_the_study_and_loses_no_cell_to_a_row(two_processes, tmp_path, monkeypatch):
+    """What was not run has no row: the next run has it to do."""
+    todo = [cell(k) for k in range(40)]
+    monkeypatch.setattr(running, "cells", lambda study: list(todo))
+    lost = distributed.Client(two_processes, set_as_default=False)
+
+    def progress(done, total, row):
+        if done == 1 and row:
+            lost.close()
+
+    with pytest.raises(ClusterError, match="Rows so far are kept|the scheduler went away"):
+        running.run(SMALL, tmp_path / "study.duckdb", progress=progress,
+                    execute=lambda cells: cluster.execute(cells, behave, scheduler=lost))
+    rows = read_rows(tmp_path / "study.duckdb")
+    assert set(rows["outcome"]) == {"done"} and len(rows["key"]) < 40
 
 
 def test_a_scheduler_that_goes_away_is_an_error_in_words():

@@ -104,9 +104,11 @@ class _Flight:
             while todo and len(self._cells) < AHEAD * max(self._threads, 1):
                 cell = todo.popleft()
                 try:
-                    self._send(cell)
+                    packed = pickle.dumps(cell)
                 except Exception as error:
                     yield lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}")
+                else:
+                    self._send(cell, packed)
             with suppress(Empty):
                 if row := self._taken(self._landed.get(timeout=TICK)):
                     yield row
@@ -119,13 +121,16 @@ class _Flight:
                 self._client.cancel(list(self._cells), force=True)
                 self._client.run(cluster_worker.end, self._name, on_error="ignore")
 
-    def _send(self, cell: Cell, contents: Sequence[bytes] | None = None) -> None:
-        packed = pickle.dumps(cell)
+    def _send(self, cell: Cell, packed: bytes, contents: Sequence[bytes] | None = None) -> None:
         self._count += 1
-        with warnings.catch_warnings():  # Dask finds data files large
-            warnings.simplefilter("ignore", UserWarning)
-            future = self._client.submit(cluster_worker.run, self._name, self._function, packed, contents,
-                                         key=f"{self._name}-{self._count}", pure=False)
+        try:
+            with warnings.catch_warnings():  # Dask finds data files large
+                warnings.simplefilter("ignore", UserWarning)
+                future = self._client.submit(cluster_worker.run, self._name, self._function, packed, contents,
+                                             key=f"{self._name}-{self._count}", pure=False)
+        except Exception as error:  # nothing of this cell: the connection to the scheduler has gone
+            raise ClusterError(f"the scheduler takes no more cells ({type(error).__name__}: {error}). Rows so far are "
+                               "kept; start it and run the study again.") from error
         self._cells[future] = cell
         future.add_done_callback(self._landed.put)
 
@@ -143,7 +148,7 @@ class _Flight:
             self._turns[cell.key, cell.repetition] += 1
             turns = self._turns[cell.key, cell.repetition]
             if turns < TURNS:
-                self._send(cell)
+                self._send(cell, pickle.dumps(cell))
                 return None
             count = turns * (error.allowed_failures + 1)
             return lost_row(cell, CRASHED, f"{count} Dask worker{'s' * (count > 1)} died while they had it")
@@ -182,9 +187,9 @@ class _Flight:
             contents = [Path(name).read_bytes() for name in entry.files]
             if content_hash(entry, Path()) != cell.data_hash:
                 return lost_row(cell, ERROR, f"{names} changed while the study ran")
-            self._send(cell, contents)
         except OSError as error:
             return lost_row(cell, ERROR, f"a worker does not have {names}, and it cannot be sent there: {error}")
+        self._send(cell, pickle.dumps(cell), contents)
         return None
 
     def _look(self) -> None:
