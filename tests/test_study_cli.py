@@ -149,7 +149,7 @@ def test_a_dry_run_counts_what_the_run_would_run(folder):
     with locked(folder / "rigs.duckdb"):
         assert "another run is writing to" in run("study", "run", "rigs.toml", "--dry-run").stderr
     told = run("study", "run", "rigs.toml", "--dry-run", "--db", "rig.csv").stderr
-    assert "rig.csv cannot be opened" in told and "/rig.csv cannot" not in told
+    assert told.startswith("error: rig.csv ")
 
 
 def test_what_is_taken_out_of_a_study_leaves_its_reports_which_say_so(folder):
