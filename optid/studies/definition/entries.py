@@ -11,6 +11,7 @@ from optid.bases import parse
 from optid.data import Data
 from optid.errors import OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
+from optid.solving import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.positions import Path
 from optid.studies.definition.problems import Problems, one_or_several, shown
@@ -26,6 +27,8 @@ _TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm",
 _DATA = ("name", "file", "system", "samples", "noise", *READING)
 _FORMULATION = ("name", "formulation", "constraints", "data")
 _SOLVER = ("name", "solver", "accuracy", "options")
+_SETTINGS = tuple(p.name for p in inspect.signature(solve).parameters.values() if p.kind is not p.VAR_KEYWORD)
+"""What solving has arguments for: among the options of a solver, these would override what its rows say."""
 
 _KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
     (bool, "bool", "true or false"),
@@ -253,6 +256,12 @@ def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> Sol
     if not isinstance(options, Mapping):
         problems.add((*path, "options"), f"options is a table, {{ key = value }}; {shown(options)} is not")
         options = {}
+    for key in options:
+        if key in _SETTINGS:
+            where = f"write {key} = ... beside solver" if key == "accuracy" else "it is a key of the study" \
+                if key in _TOP else "the study sets it for every solver"
+            problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}",
+                         value=False)
     accuracy = _accuracies((*path, "accuracy"), raw["accuracy"], problems) if "accuracy" in raw else ()
     return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
 
