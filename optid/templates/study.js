@@ -37,7 +37,7 @@ function shareBar(one) {
 
 function drawStandings() {
   const growth = (one) => one.growth.slope === null ? "-" : element("span", {}, `N^${one.growth.slope.toFixed(2)}`,
-    one.growth.low === null ? null : element("span", { class: "faint" }, ` (${one.growth.low.toFixed(2)} to ${one.growth.high.toFixed(2)})`));
+    element("span", { class: "faint" }, ` (${one.growth.low.toFixed(2)} to ${one.growth.high.toFixed(2)})`));
   const columns = [
     { name: "solver", title: "solver", head: true, value: (s) => s.solver, node: (s) => element("span", {}, swatch(s.solver), " ", s.solver,
       section.first === s.solver && section.kind === "first" ? element("span", { class: "mark", title: "first choice" }, " ★") : section.kind === "tie" && (section.first === s.solver || section.tied.includes(s.solver)) ? element("span", { class: "faint", title: "tied for the first place" }, " tied") : null) },
@@ -127,7 +127,7 @@ function ranksFigure() {
 function growthFigure() {
   const known = section.standings.filter((s) => s.growth.n.length > 1);
   const series = known.map((s) => ({ ...styled(s.solver), kind: "line", xs: s.growth.n, ys: s.growth.t }));
-  const words = (g) => g.missing ? `cannot tell: ${g.missing}` : g.low === null ? significant(g.slope, 3) : `${significant(g.slope, 3)} (${significant(g.low, 3)} to ${significant(g.high, 3)})`;
+  const words = (g) => g.missing ? `cannot tell: ${g.missing}` : `${significant(g.slope, 3)} (${significant(g.low, 3)} to ${significant(g.high, 3)})`;
   const none = section.standings.length ? section.standings[0].growth.missing : "";
   figure("growth", "Time against record length", series.length ? "Geometric mean time of what was solved; the slope is the exponent of N in the table of the solvers." : `Cannot be told: it ${none || "needs a run"}.`, series.length ? {
     x: { title: "samples N", log: true, format: (v) => v.toLocaleString("en") }, y: { title: "time", log: true, format: duration }, series,

@@ -41,30 +41,28 @@ class Paired:
         return self.n >= MINIMUM_PAIRS
 
 
-def paired_difference(values: np.ndarray, reference: np.ndarray, level: float = 0.95) -> Paired:
-    """Return the mean of ``values - reference`` with its interval from Student's distribution.
+def paired_difference(values: np.ndarray, reference: np.ndarray) -> Paired:
+    """Return the mean of ``values - reference`` with its 95 % interval from Student's distribution.
 
     Args:
         values: (P,), ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
-        level: of the interval.
     """
     d = (values - reference)[np.isfinite(values) & np.isfinite(reference)]
     mean = float(np.mean(d)) if d.size else float("nan")
     if d.size < 2:
         return Paired(mean, float("-inf"), float("inf"), int(d.size))
-    half = float(student.ppf(0.5 + level / 2, d.size - 1) * np.std(d, ddof=1) / np.sqrt(d.size))
+    half = float(student.ppf(0.975, d.size - 1) * np.std(d, ddof=1) / np.sqrt(d.size))
     return Paired(mean, mean - half, mean + half, int(d.size))
 
 
-def paired_ratio(times: np.ndarray, reference: np.ndarray, level: float = 0.95) -> Paired:
-    """Return the geometric mean of ``times / reference`` with its interval.
+def paired_ratio(times: np.ndarray, reference: np.ndarray) -> Paired:
+    """Return the geometric mean of ``times / reference`` with its 95 % interval.
 
     Args:
         times: (P,) positive, ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
-        level: of the interval.
     """
-    logs = paired_difference(np.log(times), np.log(reference), level)
+    logs = paired_difference(np.log(times), np.log(reference))
     value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
     return Paired(value, low, high, logs.n)

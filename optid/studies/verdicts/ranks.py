@@ -8,6 +8,7 @@ it holds elsewhere.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaln
 from scipy.stats import f as fisher
 from scipy.stats import rankdata, studentized_range
 
@@ -55,17 +56,6 @@ class Ranking:
         a, b = (self.ranks[self.names.index(name)] for name in (one, other))
         return bool(abs(a - b) > self.difference)
 
-    @property
-    def groups(self) -> list[tuple[str, ...]]:
-        """Largest runs of neighbouring solvers that cannot be told apart, two or more in each."""
-        found: list[tuple[str, ...]] = []
-        for i in range(len(self.names)):
-            j = max(j for j in range(i, len(self.names)) if j == i or not self.differ(self.names[i], self.names[j]))
-            run = self.names[i : j + 1]
-            if len(run) > 1 and not (found and set(run) <= set(found[-1])):
-                found.append(run)
-        return found
-
 
 def ranks_of_problems(times: np.ndarray) -> np.ndarray:
     """Return the ranks within every problem, (P, S): 1 the fastest, equal times and all failures tied."""
@@ -99,8 +89,9 @@ def friedman(scores: np.ndarray) -> tuple[float, float]:
         return 0.0, 1.0
     statistic = (k - 1) * float(np.sum((ranks.sum(axis=0) - n * (k + 1) / 2) ** 2)) / spread
     rest = n * (k - 1) - statistic
-    if rest <= 1e-12 * n * k:  # every data set gives the same order
-        return statistic, float(np.exp((1 - n) * np.sum(np.log(np.arange(1, k + 1)))))
+    if rest <= 1e-12 * n * k:  # every data set gives the same order, one of k! over the factorials of its ties
+        ties = np.unique(ranks[0], return_counts=True)[1]
+        return statistic, float(np.exp((1 - n) * (gammaln(k + 1) - np.sum(gammaln(ties + 1)))))
     return statistic, float(fisher.sf((n - 1) * statistic / rest, k - 1, (k - 1) * (n - 1)))
 
 
@@ -110,15 +101,15 @@ def critical_difference(k: int, n: int, level: float = 0.05) -> float:
 
 
 def signed_ranks(differences: np.ndarray) -> float:
-    """Return the exact two-sided probability of Wilcoxon's signed-rank statistic, ties and infinities included.
+    """Return the exact two-sided probability of Wilcoxon's signed-rank statistic, ties included.
 
     Args:
-        differences: (N,) paired; zeros are left out; infinite ones (one of the two failed) are the largest, tied.
+        differences: (N,) paired; zeros are left out.
 
     Returns:
         The probability over all assignments of signs; 1 where no difference is left.
     """
-    d = differences[~np.isnan(differences) & (differences != 0)]
+    d = differences[differences != 0]
     if not d.size:
         return 1.0
     doubled = np.rint(2 * rankdata(np.abs(d))).astype(int)  # ties give halves
