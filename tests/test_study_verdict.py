@@ -18,6 +18,7 @@ from optid.solution import Residuals, Status
 from optid.studies.verdicts.agreement import agreement_matrix, model_distance
 from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
+from optid.studies.verdicts.comparison import compare
 from optid.studies.verdicts.growth import time_growth
 from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate
 from optid.studies.verdicts.profiles import performance_profiles, time_ratios
@@ -755,7 +756,25 @@ def test_a_formulation_that_is_solved_less_often_is_compared_where_it_is_solved(
         if row["formulation"] == "exact" and row["seed"] < 11:
             row |= {"status_verified": "limit"}
     assert conclude(rows).quality.choice.candidates == ("linear",)
-    assert "no other was solved on half as many" in str(conclude(rows))
+    assert "no other has a simulation fit on half as many records" in str(conclude(rows))
+
+
+def test_models_are_compared_by_what_most_formulations_have_on_most_records():
+    rows = [run("a", p, formulation=f, parameter_error=(1 + p) * e, simulation_fit=90.0 if (f, p) == ("g", 0) else None)
+            for p in range(8) for f, e in (("f", 0.01), ("g", 0.05))]  # fmt: skip
+    quality = conclude(rows).quality
+    assert (quality.measure, quality.choice.kind, quality.choice.first) == ("parameter_error", FIRST, "f")
+    both = [{**row, "simulation_fit": 80.0 + 5 * (row["formulation"] == "g")} for row in rows]
+    assert conclude(both).quality.measure == "simulation_fit"
+
+
+def test_the_level_is_that_of_every_ranking():
+    rows = [run("a", data=f"set {d}", formulation=f, simulation_fit=80.0 - loss)
+            for d in range(7) for f, loss in (("x", 0), ("y", 3))]  # fmt: skip
+    for level in (0.05, 1e-6):
+        verdict = conclude(rows, level=level)
+        assert verdict.quality.ranking.level == verdict.overall.ranking.level == level
+        assert verdict.quality.ranking.differ("x", "y") == (level == 0.05)
 
 
 def test_formulations_rank_over_the_data_sets_they_were_all_tried_on():
@@ -954,6 +973,18 @@ def test_a_database_is_read(tmp_path):
 def test_what_is_no_table_of_runs_is_refused(given_rows, message):
     with pytest.raises(DataError, match=message):
         conclude(given_rows)
+
+
+def test_numbers_of_one_thing_are_singular():
+    rows = [run("a", 0, status_verified="failed"), run("b", 0, status_verified="failed")]
+    assert "on the only problem (failed 2)" in conclude(rows).headline.text
+    rows = [run("a", bound=1.0), run("b", objective=0.9)]
+    assert any(s.text.startswith("On 1 problem a proved") for s in conclude(rows).statements)
+
+
+def test_a_comparison_of_no_rows_is_refused():
+    with pytest.raises(DataError, match="no rows to compare"):
+        compare([])
 
 
 @pytest.mark.parametrize("nothing", [[], {}])

@@ -58,7 +58,8 @@ def choice_of_solver(section: Section) -> Statement:
         return Statement(FAIR, "Nothing was run", text, "solver")
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
-        text = f"No solver reached the accuracy on any of {plural(n, 'problem')} ({common})."
+        where = "the only problem" if n == 1 else f"any of {n:,} problems"
+        text = f"No solver reached the accuracy on {where} ({common})."
         return Statement(BAD, NO_SOLVER, text, "solver")
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
@@ -270,7 +271,7 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
         return Statement(GOOD, f"Equal models: {listed((choice.first, *choice.tied))}", text, "formulation")
     rivals = [name for name in choice.candidates if name != choice.first]
     if not rivals:
-        text = f"{lead}; no other was solved on half as many records."
+        text = f"{lead}; no other has a {quality.measure.replace('_', ' ')} on half as many records."
         return Statement(FAIR, "Models: cannot tell", text, "formulation")
     name = min(rivals, key=lambda rival: choice.against[rival].value)
     text = f"{lead}; the next, {name}, {_behind(quality, choice.against[name])}."

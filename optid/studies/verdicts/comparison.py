@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.errors import DataError
 from optid.showing.wording import seconds
 from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.choice import listed
@@ -113,7 +114,12 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
 
     Args:
         rows: of a study with one record, one formulation and one accuracy.
+
+    Raises:
+        DataError: there are no rows, or these are none of a study.
     """
+    if not rows:
+        raise DataError("there are no rows to compare: the study has no run")
     table = columns(rows)
     found = tabulate(table)
     accuracy = float(table["accuracy"][0])

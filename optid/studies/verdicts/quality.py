@@ -38,8 +38,8 @@ class Quality:
         records: their number.
         solved: {formulation: records on which some solver reached the accuracy}.
         figures: {column: {formulation: figure}}; fits below `WORST` count as that.
-        measure: column of the comparison: the simulation fit on the hold-out samples, or where no model has one the
-            parameter error.
+        measure: column of the comparison: the simulation fit on the hold-out samples, or the parameter error where more
+            formulations have that on most of the records they solved.
         choice: by this measure, in points of fit or as a ratio of errors.
         ranking: by the same over data sets.
         truth: whether the truth is known for some model.
@@ -59,12 +59,13 @@ FITS = ("simulation_fit", "one_step_fit")
 FIGURES = ("simulation_fit", "one_step_fit", "parameter_error", "nonlinearity_error")
 
 
-def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Quality:
+def compare_formulations(found: Results, table: Mapping[str, np.ndarray], level: float = 0.05) -> Quality:
     """Compare the models of the formulations record by record.
 
     Args:
         found: problems and solvers.
         table: the rows they come from.
+        level: significance level of the test over data sets.
     """
     names = tuple(sorted(set(found.formulation)))
     case = found.case
@@ -82,8 +83,9 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
     }
     data = np.array([""] * records, dtype=object)
     data[case] = [f"{s}\0{d}" for s, d in zip(found.study, found.data)]
-    by_error = not np.isfinite(values["simulation_fit"]).any() and np.isfinite(values["parameter_error"]).any()
-    if by_error:
+    usual = {c: ((2 * np.isfinite(v).sum(axis=0) > (row >= 0).sum(axis=0)).sum(), np.isfinite(v).sum())
+             for c, v in values.items()}  # fmt: skip
+    if usual["parameter_error"] > usual["simulation_fit"]:
         measure, losses = "parameter_error", np.maximum(values["parameter_error"], SMALLEST)
         choice = choose(losses, names, MINOR, paired_ratio, none=1.0, slack=SLACK, noun="record")
     else:
@@ -91,13 +93,14 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray]) -> Qua
         choice = choose(losses, names, MINOR, paired_difference, slack=SLACK, noun="record")
     solved = {name: int((row[:, f] >= 0).sum()) for f, name in enumerate(names)}
     truth = bool(np.isfinite(values["parameter_error"]).any())
-    return Quality(names, records, solved, figures, measure, choice, _ranking(found, losses, data, names), truth)
+    return Quality(names, records, solved, figures, measure, choice,
+                   _ranking(found, case, losses, data, names, level), truth)  # fmt: skip
 
 
-def _ranking(found: Results, losses: np.ndarray, data: np.ndarray, names: tuple[str, ...]) -> Ranking:
+def _ranking(found: Results, case: np.ndarray, losses: np.ndarray, data: np.ndarray, names: tuple[str, ...],
+             level: float) -> Ranking:  # fmt: skip
     """Rank the formulations that were tried on every data set; where one was not solved it is last."""
     tried = np.zeros(losses.shape, dtype=bool)
-    case = found.case
     for p, formulation in enumerate(found.formulation):
         tried[case[p], names.index(formulation)] |= bool(np.any(found.state[p] != NOT_RUN))
     labels = list(dict.fromkeys(data))
@@ -105,7 +108,7 @@ def _ranking(found: Results, losses: np.ndarray, data: np.ndarray, names: tuple[
     kept = tuple(name for name, there in zip(names, everywhere) if there)
     out = tuple(name for name, there in zip(names, everywhere) if not there)
     scores = scores_by_data_set(ranks_of_problems(losses[:, everywhere]), data)
-    return rank_over_data_sets(scores, kept, out, noun="formulation")
+    return rank_over_data_sets(scores, kept, out, level, "formulation")
 
 
 def _mean(values: np.ndarray) -> float:

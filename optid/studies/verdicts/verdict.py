@@ -138,7 +138,7 @@ def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", l
     overall = compare_solvers(found, "", level)
     formulations = sorted(set(found.formulation))
     sections = tuple(compare_solvers(found.where(found.formulation == f), f, level) for f in formulations)
-    quality = compare_formulations(found, table)
+    quality = compare_formulations(found, table, level)
     head = headline(overall, list(sections), quality)
     return Verdict(
         table, found, at, time, overall, sections, quality, agreement_matrix(found, table), _false_claims(table, found),
