@@ -1,4 +1,4 @@
-"""Acceptance of the subspace methods with nonlinear feedback (theory 8, items 4 to 7) and their rate of convergence.
+"""Subspace methods with nonlinear feedback against published results, and their rate of convergence.
 
 Prints, beside the goals,
 * item 4: noise-free Example 1: distance of eig(A) (1e-10), second over first singular value of [Bu; Du] (1e-10);

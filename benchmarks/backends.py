@@ -1,4 +1,4 @@
-"""Figure 6: back-end agreement. Every installed back end over every case of the zoo that it accepts.
+"""Back-end agreement. Every installed back end over every case of the zoo that it accepts.
 
     python benchmarks/backends.py [--cases qp] [--solvers clarabel ipopt] [--repeat 3] [--isolate]
 

@@ -2,11 +2,11 @@
 
     python benchmarks/efficiency.py [--runs 1000] [--samples 200 1000] [--workers 2]
 
-Figure 1: root mean square error of every reported parameter (a, b, mu, offset, gauge norm of b one) over
+Efficiency: root mean square error of every reported parameter (a, b, mu, offset, gauge norm of b one) over
 ``sigma sqrt(mean (J^T J)^-1)``, J the Jacobian of the one-step predictions at the truth in the tangent space of the
-rank-one manifold, averaged over the records. Figure 2: the bilinear least-squares objective of the fit against that of
+rank-one manifold, averaged over the records. Split: the bilinear least-squares objective of the fit against that of
 the plain SVD split of the over-parametrised estimate, once as Algorithm 3.1 leaves it and once with A and the offset
-re-estimated for the split f and B. Figure 3: b1 / b0 for a function that is not odd, without noise.
+re-estimated for the split f and B. Exactness: b1 / b0 for a function that is not odd, without noise.
 """
 
 import argparse

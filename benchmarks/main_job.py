@@ -1,4 +1,4 @@
-"""Speed of the main job against the naive routes, in one process and one run.
+"""Speed of a Hammerstein-ARX fit with proof against the naive routes, in one process and one run.
 
     python benchmarks/main_job.py [--samples 100000] [--nuclear 20000] [--skip-raw]
 

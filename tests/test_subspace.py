@@ -159,7 +159,7 @@ def test_coloured_noise_needs_instruments_without_outputs():
 
 
 def test_condition_stays_bounded_only_with_simulated_feedback():
-    """Acceptance item 5: condition of R11 as the record grows."""
+    """Condition of R11 as the record grows."""
     figures = {}
     for count in (2000, 32000):
         data = example1(count, 0.0, 0.5)

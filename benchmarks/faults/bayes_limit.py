@@ -1,7 +1,7 @@
-"""How many faults can any rule name rightly? The limit of figure 5, and how near the rules of optid come to it.
+"""How many faults can any rule name rightly? The limit, and how near the rules of optid come to it.
 
-The trial is that of figure 5: a window of 200 samples of the standard plant with one fault of deflection d, one of six
-places with equal probability, a jump of the state in a random direction, other faults with a random sign, the onset
+The trial is that of isolation.py: a window of 200 samples of the standard plant with one fault of deflection d, one of
+six places with equal probability, a jump of the state in a random direction, other faults with a random sign, the onset
 uniform from 60 to 139. The rule that names most of these faults rightly is that of Bayes: the place of the largest
 posterior, told all of that, deflection and range of the onsets included, which no rule of optid is told. The rate of
 any rule is the mean over the windows of the true posterior of the name it chooses; this scatters less than the share of
@@ -11,7 +11,7 @@ The limit is computed from the matrices of the plant alone: Riccati equation, pr
 written out here (the largest difference from the signatures of optid is printed). In whitened innovations the noise is
 N(0, I), so that no record has to be simulated. The rules of optid judge the same windows: the posterior by which
 `diagnose` ranks its answers, and the largest energy explained less the threshold of a false alarm of 1 %. Windows
-without an alarm of that search are left out, as in figure 5.
+without an alarm of that search are left out, as there.
 
     python benchmarks/faults/bayes_limit.py [--trials 8000] [--levels 7 10 20]
 """
@@ -131,7 +131,7 @@ def main() -> None:
         goal = GOALS.get(int(d))
         detected = len(found_by[RULES[0]]) / options.trials
         print(f"deflection {d:g}: {options.trials} windows, detected {detected:.4f}; named rightly of those"
-              + (f"   (figure 5: goal {goal})" if goal else "") + f"\n  {'':<42}{'mean posterior':<22}counted")
+              + (f"   (goal {goal})" if goal else "") + f"\n  {'':<42}{'mean posterior':<22}counted")
         for word, values in found_by.items():
             expected, right = np.array(values, dtype=float).T
             print(f"  {word:<42}{share(expected):<22}{share(right)}", flush=True)

@@ -1,4 +1,4 @@
-"""Faults behind a controller that is not known: false alarms and isolation beside open loop. Figure 35.
+"""Faults behind a controller that is not known: false alarms and isolation beside open loop.
 
 The standard plant follows references (levels held 25 samples) under a PI controller with limited inputs, which acts on
 the readings, faults included, and of which the search knows nothing: it sees inputs and outputs. The innovations of the

@@ -1,10 +1,11 @@
-"""False alarms of the search for one fault: known model (figure 1), model identified from a short record (figure 2).
+"""False alarms of the search for one fault: a known model, and one identified from a short record.
 
-Figure 1: healthy records of the standard plant, the steady Kalman filter from 100 samples before a window of 200 on,
+Known model: healthy records of the standard plant, the steady Kalman filter from 100 samples before a window of 200 on,
 thresholds of a nominal family-wise false alarm of 1 %.
 
-Figure 2: every run identifies a model from 400 samples, with the covariance of its parameters, and tests two windows of
-200 new samples, initial state unknown, at another mean level of the inputs (0.25 and -0.25, at most 0.95 away from it).
+Identified model: every run identifies a model from 400 samples, with the covariance of its parameters, and tests two
+windows of 200 new samples, initial state unknown, at another mean level of the inputs (0.25 and -0.25, at most 0.95
+away from it).
 Two kinds of models: the one of the source of the figures, a regression on 10 lags of the outputs and of cubic
 polynomials of the inputs (174 parameters); and a Hammerstein state-space model of order 4 with quintic polynomials by
 maximum likelihood, whose covariance is that of its linearisation. "Ignored": the model is taken as exact. "Counted":

@@ -1,4 +1,4 @@
-"""From the alarm to the rebuilt model: figures 24 and 25.
+"""From the alarm to the rebuilt model: how soon the name, how good the fit.
 
 A monitor watches streams of the standard plant; at sample 300 an actuator sticks, dies or weakens. Counted are the
 samples from the onset until one candidate is left and it is the right part; 15 samples later, and not before 35 samples
@@ -108,9 +108,9 @@ def main() -> None:
               f"{np.mean([row[3] for row in rows]):>15.1f}{before:>12.1f}{medians[word]:>8.1f}"
               f"{np.quantile(fits, .1):>8.1f}  {counts}", flush=True)
         print(f"{'':<20}right: {rate(sum(row[2] for row in rows), len(rows))}")
-    print(f"\nfigure 24: hard-over, onset to one right name, mean {np.mean(hard):.1f}, p95 {np.quantile(hard, .95):.0f}"
+    print(f"\nhard-over, onset to one right name, mean {np.mean(hard):.1f}, p95 {np.quantile(hard, .95):.0f}"
           f"   (goal 12, 20)"
-          f"\nfigure 25: fit after, worst case {min(medians.values()):.1f} %, median case "
+          f"\nfit after, worst case {min(medians.values()):.1f} %, median case "
           f"{np.median(list(medians.values())):.1f} %   (goal 90 %, 95 %)")
 
 

@@ -1,4 +1,4 @@
-"""Do the intervals of size and onset hold what they promise, the onset being searched? Figures 29 and 31.
+"""Do the intervals of size and onset hold what they promise, the onset being searched?
 
 On the standard plant, in windows of 200 samples with one fault at an onset drawn from 60 to 140. Additive faults of
 deflection 7, 10 and 20 take turns in five places; actuators lose 20, 30, 50 and 100 % of their effect, once seen for 60
@@ -90,7 +90,7 @@ def main() -> None:
                               int(rng.integers(2**31)), load))
         print(f"  d = {d:<20g}{count.line()}", flush=True)
         total.add(count)
-    print(f"  {'figure 29: all':<24}{total.line()}")
+    print(f"  {'all':<24}{total.line()}")
     with_losses = dictionary(model, process={"load": load}, kinds=["bias", "loss"])
     print("losses of actuators")
     totals: dict[str, Count] = defaultdict(Count)
@@ -110,7 +110,7 @@ def main() -> None:
                 print(f"  {actuator} {100 * share:.0f} % for {word}\n{'':26}{count.line()}", flush=True)
                 totals["all lost" if share == 1 else "some lost"].add(count)
     for word, count in totals.items():
-        print(f"  {'figure 31: ' + word:<24}{count.line()}")
+        print(f"  {word:<24}{count.line()}")
 
 
 if __name__ == "__main__":

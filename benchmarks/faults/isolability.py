@@ -1,4 +1,4 @@
-"""Is the forecast of isolability right? Figure 27: within .03 of a Monte Carlo study of the plant itself.
+"""Is the forecast of isolability right? It is to be within .03 of a Monte Carlo study of the plant itself.
 
 The forecast is simulated in signature space, before any data. Against it stand records of the standard plant with its
 process and measurement noise: a fault of the size that the forecast calls just isolable (and fractions and multiples of
@@ -89,7 +89,7 @@ def main() -> None:
         for run in range(options.runs)
         for u in [levels(count, rng)]
     )
-    print(f"\nfigure 27: named, forecast off by at most {worst:.3f}   (goal .03)"
+    print(f"\nnamed, forecast off by at most {worst:.3f}   (goal .03)"
           f"\n           noticed, off by at most {worst_noticed:.3f}"
           f"\nfalse alarms of {options.runs} healthy records {100 * healthy / options.runs:.2f} %   (nominal 1 %)")
 

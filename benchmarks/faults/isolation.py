@@ -1,4 +1,4 @@
-"""One fault, which one, since when, how large? Figures 4, 5, 8 and 9, on the standard plant.
+"""One fault, which one, since when, how large? On the standard plant.
 
 Windows of 200 samples hold one fault of deflection d at an onset drawn from 60 to 140; the six candidates take turns (a
 jump of the state in a random direction). The search knows neither. Printed beside the goals: detected; named rightly

@@ -1,4 +1,4 @@
-"""Set membership: row 26, proofs that a plant is not healthy, none of them false.
+"""Set membership: proofs that a plant is not healthy, none of them false.
 
 Windows of 40 samples of the standard plant. Healthy ones with Gaussian noise (bounds at two standard deviations, which
 single samples exceed) and with noise that keeps its bounds exactly; faulty ones of a given deflection, with the set of
@@ -70,7 +70,7 @@ def main() -> None:
             clock += time.process_time() - start
             false += result.impossible
             factors.append(result.factor)
-        print(f"row 26, healthy, {kind}: false proofs {false} of {options.runs} (goal 0, shown 0 of 40);\n"
+        print(f"healthy, {kind}: false proofs {false} of {options.runs} (goal 0, shown 0 of 40);\n"
               f"    largest factor {max(factors):.2f} (shown .76)", flush=True)
     print(f"CPU per healthy window with posing and judging: {1e3 * clock / (2 * options.runs):.0f} ms (shown 13)")
     wrong = 0

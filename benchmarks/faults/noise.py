@@ -1,4 +1,4 @@
-"""More noise at one place: row 18, isolation at +60 % innovation variance in windows of 200 samples.
+"""More noise at one place: isolation at +60 % innovation variance in windows of 200 samples.
 
 White noise at one of five places, so much that the energy of the whitened innovations grows by a given share. Named by
 the exact likelihood and by covariance matching (NNLS); the set of all places within three nats; the added variance.
@@ -68,7 +68,7 @@ def main() -> None:
                 matched += match.best == label
                 if match.rho[match.labels.index(label)] > 0:
                     logs["NNLS"].append(float(np.log(match.rho[match.labels.index(label)] / rho)))
-        print(f"+{increase} % innovation variance" + "   (row 18, goal: isolation >= .95)" * (increase == 60))
+        print(f"+{increase} % innovation variance" + "   (goal: isolation >= .95)" * (increase == 60))
         print(f"    detected           {rate(detected, options.runs):<36}shown {shown[0]}")
         print(f"    named, likelihood  {rate(hits, options.runs):<36}shown {shown[1]}")
         if tried:

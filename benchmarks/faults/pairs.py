@@ -1,4 +1,4 @@
-"""Two faults at once: both named rightly, and the time of the exact search. Figures 10 and 11, on the standard plant.
+"""Two faults at once: both named rightly, and the time of the exact search. On the standard plant.
 
 Windows of 200 samples hold two faults of different candidates, each of deflection d, with onsets 20 to 70 samples
 apart. The exact search goes through all pairs of candidates and onsets (186 onsets, 1,116 atoms); its time is that of

@@ -1,4 +1,4 @@
-"""Refit of what broke from few samples: figures 19 and 20, and the table of fit against samples after the fault.
+"""Refit of what broke from few samples, and the table of fit against samples after the fault.
 
 Actuator 2 of the standard plant gets a dead zone, loses 55 % of its gain and gains an offset. The record is 100 healthy
 samples and N samples after the fault; the fit is that of a noise-free simulation of 1,500 unseen samples, all outputs
@@ -192,14 +192,14 @@ def main() -> None:
     print()
     for count, goal in GOALS.items():
         if count in options.counts:
-            print(f"figure 19: {count:>3} samples {medians['what broke, QP'][count]:.1f} %   (goal {goal:g} %)")
+            print(f"{count:>3} samples {medians['what broke, QP'][count]:.1f} %   (goal {goal:g} %)")
     needed = {word: next((n for n in options.counts if row[n] >= 95), None) for word, row in medians.items()}
     own = needed["what broke, QP"]
     for word, goal in (("all, prior", 1 / 2), ("all, no prior", 1 / 4), ("from scratch", 1 / 16)):
         other = needed[word]
         shown = f"{own} / {other or f'> {options.counts[-1]}'}"
         ratio = own / (other or options.counts[-1] * 2) if own else np.nan
-        print(f"figure 20: samples for 95 %, what broke alone over {word}: {shown} = "
+        print(f"samples for 95 %, what broke alone over {word}: {shown} = "
               f"{'at most ' * (other is None)}{ratio:.3g}   (goal {goal:g})")
     gap = [max(medians["what broke, QP"][n], medians["all, prior"][n]) - medians["schedule"][n] for n in options.counts]
     print(f"schedule: at most {max(gap):.1f} points below the better of the two it chooses from")

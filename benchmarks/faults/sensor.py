@@ -1,4 +1,4 @@
-"""Virtual sensors: figure 21, and the table of errors of the lost, noise-free output.
+"""Virtual sensors: their error over the bound, and the table of errors of the lost, noise-free output.
 
 One sensor of the standard plant is lost. Root mean square errors over 20 records of 1,500 samples, each method on the
 same records: the Kalman filter on the other sensor, the simulation, the conditional mean and the subspace projection
@@ -76,7 +76,7 @@ def main() -> None:
                   f"fit {100 * (1 - error / np.sqrt(np.mean(spread))):.1f} %")
         worst_model = max(worst_model, float(np.sqrt(np.mean(squares["Kalman filter"]))) / bound)
         worst_data = max(worst_data, float(np.sqrt(np.mean(squares["conditional mean 1000"]))) / bound)
-    print(f"\nfigure 21: error over the bound, from the model {worst_model:.3f}   (goal 1.05)"
+    print(f"\nerror over the bound, from the model {worst_model:.3f}   (goal 1.05)"
           f"\n           learnt from 1000 samples {worst_data:.3f}   (goal 1.15)   {options.runs} records each")
 
 

@@ -1,4 +1,4 @@
-"""How often does the 95 % set of a diagnosis hold the fault, and how large is it? Figure 6, on the standard plant.
+"""How often does the 95 % set of a diagnosis hold the fault, and how large is it? On the standard plant.
 
 Windows of 200 samples hold one fault of deflection d at an onset drawn from 60 to 140; the six candidates (offsets of
 both actuators and both sensors, a load, a jump of the state in a random direction) take turns. `diagnose` knows neither

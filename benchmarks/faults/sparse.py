@@ -1,6 +1,6 @@
-"""Several faults by the group-sparse programme: row 12 and the tables of one and of two faults.
+"""Several faults by the group-sparse programme: its duality gap, and the tables of one and of two faults.
 
-Row 12: the relative duality gap of the own block descent, and its agreement with Clarabel on the same programmes.
+The relative duality gap of the own block descent, and its agreement with Clarabel on the same programmes.
 One fault: what the raw programme would answer (its largest group, and whether it reports a spurious second cluster),
 beside the exact search. Two faults (different candidates, onsets 20 to 70 apart): both candidates right by the raw
 programme, by a refit with the same types, by the exact search of `optid.faults.polish` near its onsets (type swap), and
@@ -61,7 +61,7 @@ def agreement(found, limits, count, load, model):
                 gaps.append(result.gap)
             assert result.certified, result.status
         differences.append(abs(values["clarabel"] / values["block_descent"] - 1))
-    print(f"row 12: largest relative gap of the own solver {max(gaps):.1e}   (goal 1e-6, shown 3-5e-8)")
+    print(f"largest relative gap of the own solver {max(gaps):.1e}   (goal 1e-6, shown 3-5e-8)")
     print(f"        largest relative difference to Clarabel {max(differences):.1e}   (goal 1e-6)   {count} programmes")
     print(f"        CPU per programme with posing and judging: own {1e3 * times['block_descent'] / count:.0f} ms, "
           f"Clarabel {1e3 * times['clarabel'] / count:.0f} ms, ratio "

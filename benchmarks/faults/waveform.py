@@ -1,7 +1,7 @@
-"""Faults of any course: rows 7 and 17, coverage and size of the consistent set, and frozen sensors.
+"""Faults of any course: coverage and size of the consistent set, and frozen sensors.
 
-Row 7: random walks of a given deflection at one of five places, in a window of the standard plant with its noise; the
-set at 99 % must hold the true place in at least 98 % at every deflection. Row 17: a sensor freezes (bit-identical, and
+Course: random walks of a given deflection at one of five places, in a window of the standard plant with its noise; the
+set at 99 % must hold the true place in at least 98 % at every deflection. Frozen: a sensor freezes (bit-identical, and
 with noise of its own on top); detected by three equal readings, or by the test itself on growing windows; named by the
 place with the least energy left so many samples later. The window of that test ends at that sample, and the course may
 begin at the sample of the alarm less ten.
@@ -25,7 +25,7 @@ SHOWN = {6: 3.98, 10: 2.29, 15: 1.34, 20: 1.15, 30: 1.01}
 
 
 def coverage(found, model, load, runs):
-    print("row 7: random walks of deflection d at one of five places (goal: coverage >= .98)")
+    print("random walks of deflection d at one of five places (goal: coverage >= .98)")
     print(f"{'d':>4}  {'coverage of the 99 % set':<36}{'shown':>12}{'mean size':>11}{'shown':>7}")
     places = found.labels[:5]
     worst = 1.0
@@ -52,7 +52,7 @@ def coverage(found, model, load, runs):
 
 
 def frozen(found, model, load, runs):
-    print("\nrow 17: frozen sensors (goals: detected within 3 samples; named 20 samples after the alarm in >= .99)")
+    print("\nfrozen sensors (goals: detected within 3 samples; named 20 samples after the alarm in >= .99)")
     limits = thresholds(found, 60, draws=20_000)
     for label, shown in (("sensor:y1", "1.5; .975 then .995"), ("sensor:y2", "2.6; .97 then 1.00")):
         for noisy in (False, True):

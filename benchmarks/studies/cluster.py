@@ -87,7 +87,7 @@ def different(here: dict[str, Any], there: dict[str, Any]) -> set[str]:
             and not (here[name] == there[name] or (here[name] != here[name] and there[name] != there[name]))}
 
 
-def compare_rows(client: Any, seeds: int, folder: Path) -> None:
+def compare_rows(client: Any, seeds: int, folder: Path) -> bool:
     study = Study(
         name="one machine against a cluster", seeds=tuple(range(seeds)), time_limit=120.0,
         data=(DataEntry("rig", system="dead_zone", samples=(200, 400), noise=(0.1,)),),
@@ -110,6 +110,7 @@ def compare_rows(client: Any, seeds: int, folder: Path) -> None:
         for name in different(here[key], there[key]):
             columns[name] = columns.get(name, 0) + 1
     print(f"columns that differ, times, memory and start aside: {columns or 'none'}   (goal: none)")
+    return not columns and set(here) == set(there) and killer.kills > 0
 
 
 def write_record(folder: Path, lengths: Sequence[int], files: int, missing: float) -> optid.Data:
@@ -131,7 +132,7 @@ def write_record(folder: Path, lengths: Sequence[int], files: int, missing: floa
     return optid.Data(u=us, y=ys, dt=0.1)
 
 
-def compare_statistics(client: Any, samples: int, folder: Path) -> None:
+def compare_statistics(client: Any, samples: int, folder: Path) -> bool:
     data = write_record(folder, (samples * 2 // 3, samples // 3), files=12, missing=0.002)
     folders = [folder / "run0", folder / "run1"]
     structure = {"na": 2, "nb": 10, "basis": "triangular:10"}
@@ -149,16 +150,18 @@ def compare_statistics(client: Any, samples: int, folder: Path) -> None:
     print(f"\nfit         {samples} samples in 2 experiments, {fits['in memory'].figures['rows']} rows used, "
           f"{fits['in memory'].figures['condition']:.1f} condition; {killer.kills} Dask worker killed")
     whole = fits["in memory"].program.compressed.statistics.gram
-    norms = np.sqrt(np.diag(whole))
+    norms, worst = np.sqrt(np.diag(whole)), 0.0
     for word, fit in fits.items():
         gram = fit.program.compressed.statistics.gram
         off = np.abs((gram - whole) / norms[:, None] / norms).max()
-        wanted = fits["in memory"].model
+        wanted, worst = fits["in memory"].model, max(worst, off)
         theta = max(np.abs(fit.model.a - wanted.a).max(), np.abs(fit.model.b[0] - wanted.b[0]).max())
         print(f"{word:22s} Gram matrix off by {off:.1e}, coefficients by {theta:.1e}, {seconds[word]:.1f} s"
               + "   (goal: 1e-12)" * (word != "in memory"))
     here, there = (fits[word].program.compressed.statistics.gram for word in ("parts here", "parts on the cluster"))
-    print(f"cluster and this machine on the same parts, every digit the same: {np.array_equal(here, there)}")
+    same = np.array_equal(here, there)
+    print(f"cluster and this machine on the same parts, every digit the same: {same}")
+    return same and worst <= 1e-12 and killer.kills > 0
 
 
 def main() -> None:
@@ -177,9 +180,10 @@ def main() -> None:
           Client(cluster, set_as_default=False) as client):
         for name in ("study", "record"):
             (Path(scratch) / name).mkdir()
-        compare_rows(client, given.seeds, Path(scratch) / "study")
+        good = compare_rows(client, given.seeds, Path(scratch) / "study")
         client.wait_for_workers(given.workers)
-        compare_statistics(client, given.samples, Path(scratch) / "record")
+        good = compare_statistics(client, given.samples, Path(scratch) / "record") and good
+    raise SystemExit(not good)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Figure 1: what a cell of a study costs beyond building and solving its problem.
+"""What a cell of a study costs beyond building and solving its problem.
 
     python benchmarks/studies/overhead.py [--cells 200] [--workers 2] [--seconds 0.2] [--cpu]
 

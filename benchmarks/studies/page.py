@@ -1,4 +1,4 @@
-"""Figure 5 of the studies: the page of a study of 10,000 rows.
+"""The page of a study of 10,000 rows.
 
     python benchmarks/studies/page.py [--rows 10000] [--repeat 3] [--keep study.html]
 

@@ -1,4 +1,4 @@
-"""Figure 3: workers killed, solvers that segfault, never end, eat memory, lie or raise: the study completes.
+"""Workers killed, solvers that segfault, never end, eat memory, lie or raise: the study completes.
 
     python benchmarks/studies/trouble.py [--seeds 6] [--kills 4]
 
@@ -157,7 +157,11 @@ def main() -> None:
     complaints = [] if code == 0 else [f"exit code {code}"]
     if len(rows["key"]) != len(solvers) * arguments.seeds:
         complaints.append(f"{len(rows['key'])} rows of {len(solvers) * arguments.seeds} cells")
+    if kills < arguments.kills:
+        complaints.append(f"only {kills} workers were killed")
     outside = np.array([text.endswith("signal SIGKILL") for text in rows["reason"]], dtype=bool)
+    if outside.sum() > kills:
+        complaints.append(f"{outside.sum()} rows were killed, {kills} from here")
     print(f"rows: {len(rows['key'])}, of which lost to the kills from outside: {outside.sum()}\n")
     print(f"{'solver':<14}{'outcomes':<34}{'verified':<22}false   a reason")
     for solver in solvers:
@@ -167,7 +171,9 @@ def main() -> None:
         print(f"{solver:<14}{listed(outcomes):<34}{listed(statuses):<22}{int(rows['false_claim'][mine].sum()):<6}"
               f"  {(reasons or [''])[0][:90]}")
         wanted = DESERVED.get(solver, "done")
-        if set(outcomes) - {wanted} or (solver in GOOD) != bool(mine.any() and rows["reached"][mine].all()):
+        if not mine.any():
+            complaints.append(f"{solver}: no row left to judge")
+        elif set(outcomes) - {wanted} or (solver in GOOD) != bool(rows["reached"][mine].all()):
             complaints.append(f"{solver}: {dict(outcomes)} instead of {wanted!r}")
         if any(not text for text in rows["reason"][(rows["solver"] == solver) & (rows["outcome"] != "done")]):
             complaints.append(f"{solver}: a row without its reason")
