@@ -165,7 +165,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     unit = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
     unit[unit == 0] = 1.0
     affine = not job.model.feedback or (job.known is not None and not np.isnan(job.known).any())
-    root, cost = _linearised(job, y, unit, x)
+    root, cost = _linearised(job, y, unit, x, whole=not affine)
     for _ in range(STEPS):
         sizes = np.linalg.norm(root[:, :n], axis=0)
         sizes[sizes == 0] = 1.0
@@ -194,13 +194,18 @@ def _descended(job: Run, y: Array, unit: Array, x: Array, step: Array, cost: flo
     return None
 
 
-def _linearised(job: Run, y: Array, unit: Array, x0: Array) -> tuple[Array, float]:
-    """Return the triangular root (n + 1, n + 1) of [derivative, error] over the samples present, and the error^2."""
+def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) -> tuple[Array, float]:
+    """Return the triangular root (n + 1, n + 1) of [derivative, error] over the samples present, and the error^2.
+
+    Where the error of the whole record is of no interest, the run ends when the initial state is forgotten.
+    """
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn = np.array(x0, dtype=float), np.eye(n)
     for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
         simulated = np.empty((last - first, outputs))
+        if not (informs or whole):
+            break
         if not informs:
             turn = np.zeros((n, 0))
         jacobian = np.empty((last - first, outputs, turn.shape[1]))

@@ -1,12 +1,17 @@
 """Channels that a multivariable fit cannot tell apart."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import reduce
 
 import numpy as np
 
 from optid.bases.basis import Array
 from optid.errors import DataError, RankError
-from optid.regressors.factors import ROUNDING, add_to_root
+from optid.regressors.factors import ROUNDING, add_to_root, conditioning, root_of_gram
+from optid.subspace.hankel import CONDITION_LIMIT
+
+CHUNK = 8192
+"""Samples whose rows are formed at once."""
 
 
 def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -23,17 +28,15 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
     """
     m = len(inputs)
     for kind, names, columns in (("input", inputs, slice(0, m)), ("output", outputs, slice(m, None))):
-        root, count = np.zeros((len(names) + 1, len(names) + 1)), 0
-        for record in records:
-            part = record[:, columns]
-            part = part[~np.isnan(part).any(axis=1)]
-            count += len(part)
-            for start in range(0, len(part), 8192):
-                rows = part[start : start + 8192]
-                root = add_to_root(root, np.concatenate([np.ones((len(rows), 1)), rows], axis=1))
+        parts = [record[:, columns] for record in records]
+        parts = [part[~np.isnan(part).any(axis=1)] if np.isnan(part.sum()) else part for part in parts]
+        count = sum(map(len, parts))
         if count <= len(names) + 1:
             raise DataError(f"only {count} samples have all {kind}s at once: {len(names)} {kind}s cannot be told apart "
                             "from so few.")
+        root = root_of_gram(np.sum([rows.T @ rows for rows in _with_constant(parts)], axis=0), len(names) + 1)
+        if not conditioning(root) <= CONDITION_LIMIT:
+            root = reduce(add_to_root, _with_constant(parts), np.zeros_like(root))
         for c, name in enumerate(names, start=1):
             if np.abs(root[c, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
                 if np.linalg.norm(root[1 : c + 1, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
@@ -44,3 +47,11 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
                 partners = [str(names[j]) for j in np.argsort(-sizes) if sizes[j] > 1e-6 * sizes.max()]
                 raise RankError(f"{kind} {name!r} is a sum of multiples of {', '.join(partners)} and a constant: their "
                                 "effects cannot be told apart. Leave one channel out.")
+
+
+def _with_constant(parts: Sequence[Array]) -> Iterator[Array]:
+    """Yield the rows [1 | channels] of some records, some at a time."""
+    for part in parts:
+        for start in range(0, len(part), CHUNK):
+            rows = part[start : start + CHUNK]
+            yield np.concatenate([np.ones((len(rows), 1)), rows], axis=1)

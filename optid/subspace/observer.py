@@ -12,6 +12,7 @@ of samples has its own initial state; those of all but the first run of an exper
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,58 +254,55 @@ class _Regressors:
         """Yield the weighted rows of a run with their target, some samples of one output at a time."""
         from optid.subspace.kernels import adjoint_responses
 
-        form, x = self.form, self.form.expansion
-        n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
-        width = p + q * (2 if self.extra else 1) + 1 + (l if self.injected else 0)
-        state = np.zeros((n, l, width))
-        free = form.c.T[:, :, None].copy()  # (F^T)^k C_o^T, the effect of x0
-        inner = np.ascontiguousarray(form.a - form.gain @ form.c)
+        form = self.form
+        inner, state = np.ascontiguousarray(form.a - form.gain @ form.c), None
         for start in range(0, len(run), self.chunk):
             raw = run[start : start + self.chunk]
-            y = raw[:, self.y]
-            signals, count = self._signals(raw), len(raw)
-            out, initial = np.empty((count, n, l, width)), np.empty((count, n, l, 1))
+            y, signals = raw[:, self.y], self._signals(raw)
+            if state is None:
+                state = np.zeros((form.n, form.l, signals.shape[1]))
+                state[:, :, -1] = form.c.T  # (F^T)^k C_o^T, the effect of x0
+            out = np.empty((len(raw), *state.shape))
             adjoint_responses(inner, form.c, signals, state, out)
-            adjoint_responses(inner, np.zeros_like(form.c), np.zeros((count, 1)), free, initial)
-            for o in range(l):
+            for o in range(form.l):
                 present = ~np.isnan(y[:, o])
-                rows = self._rows(o, signals, initial[:, :, o, 0], out[:, :, o], y[:, o])
-                yield form.weights[o] * (rows if present.all() else rows[present])
+                rows = self._rows(o, signals, out[:, :, o], y[:, o])
+                rows *= form.weights[o]
+                yield rows if present.all() else rows[present]
 
     def _signals(self, raw: Array) -> Array:
-        """Return [eta | (zeta simulated |) zeta | 1 (| y)]."""
+        """Return [eta | (zeta simulated |) zeta | (1 | y |) 0], the last without any effect but that of its state."""
         x = self.form.expansion
         found = x(raw)
-        parts = [found[:, list(x.eta)]]
+        parts = [found[:, : x.p]]
         if self.extra:
-            parts.append(found[:, list(x.zeta_simulated)])
-        parts += [found[:, list(x.zeta)], np.ones((len(raw), 1))]
+            parts.append(found[:, x.zeta_simulated.start :])
+        parts.append(found[:, x.p : x.p + x.q])
         if self.injected:
-            parts.append(found[:, list(x.y)])
-        return np.ascontiguousarray(np.concatenate(parts, axis=1))
+            parts += [np.ones((len(raw), 1)), raw[:, self.y]]
+        return np.concatenate([*parts, np.zeros((len(raw), 1))], axis=1)
 
-    def _rows(self, o: int, signals: Array, initial: Array, out: Array, y: Array) -> Array:
+    def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
         """Rows of output o: [x0 | d | D | B | E simulated | E | y], matrices with their rows outermost."""
         form, x = self.form, self.form.expansion
-        l, p, q, count = form.l, x.p, x.q, len(signals)  # noqa: E741
+        n, l, p, q, count = form.n, form.l, x.p, x.q, len(signals)  # noqa: E741
         feeds = 2 * q if self.extra else q
-        direct = np.zeros((count, l, p))
-        if self.injected:
-            direct -= np.einsum("kij,io->koj", out[:, :, :p], form.gain)
-        direct[:, o] += signals[:, :p]
-        parts = [initial]
+        rows = np.zeros((count, n + self.common + self.extra + 1))
+        offset, direct, inner = np.cumsum([n, l * form.offset, l * p])
+        rows[:, :n], rows[:, -1] = out[:, :, -1], y
         if form.offset:
-            constant = -out[:, :, p + feeds] @ form.gain if self.injected else np.zeros((count, l))
-            constant[:, o] += 1.0
-            parts.append(constant)
-        parts += [direct.reshape(count, -1), out[:, :, :p].reshape(count, -1)]
-        if self.extra:
-            parts.append(out[:, :, p : p + q].reshape(count, -1))
-        parts.append(out[:, :, p + feeds - q : p + feeds].reshape(count, -1))
-        target = y.copy()
+            rows[:, offset + o] = 1.0
+        rows[:, direct + o * p : direct + (o + 1) * p] = signals[:, :p]
         if self.injected:
-            target -= np.einsum("kij,ij->k", out[:, :, p + feeds + 1 :], form.gain)
-        return np.concatenate([*parts, target[:, None]], axis=1)
+            if form.offset:
+                rows[:, offset:direct] -= out[:, :, p + feeds] @ form.gain
+            rows[:, direct:inner] -= np.einsum("kij,io->koj", out[:, :, :p], form.gain).reshape(count, -1)
+            rows[:, -1] -= np.einsum("kij,ij->k", out[:, :, p + feeds + 1 : -1], form.gain)
+        for first, last in pairwise((0, p, p + q, p + 2 * q) if self.extra else (0, p, p + q)):
+            size = n * (last - first)
+            rows[:, inner : inner + size] = out[:, :, first:last].reshape(count, -1)
+            inner += size
+        return rows
 
     def turn(self, states: int) -> Array:
         """Return the matrix that carries z to the order [x0 | d | D | B | E] of the rows."""
