@@ -231,7 +231,8 @@ _SHARES = st.floats(1e-12, 0.5)
 @given(name=_NAMES, labels=st.lists(_NAMES, min_size=2, max_size=2, unique=True), warm=st.booleans(),
        accuracy=st.lists(_SHARES, min_size=1), noise=st.lists(st.floats(0, 1e3)),
        seeds=st.lists(st.integers(0, 2**40), min_size=1, max_size=5),
-       options=st.dictionaries(_NAMES, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()))
+       options=st.dictionaries(_NAMES, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()
+                               | st.datetimes() | st.dates() | st.times()))
 def test_round_trip_of_any_study(name, labels, accuracy, seeds, noise, warm, options):
     study = Study(
         name, data=[{"system": "linear", "name": labels[0], "noise": noise}, {"system": "linear", "name": labels[1]}],
@@ -268,6 +269,22 @@ def test_python_hears_all_problems_with_their_places():
     lines = [line.strip().split(":")[0] for line in str(caught.value).splitlines()]
     assert set(lines[1:]) == {"warm", "seeds", "data[1].system", "formulations[0]", "formulations[1]",
                               "solvers[1].acuracy"}
+
+
+@pytest.mark.parametrize("value, words", [
+    (object(), "initial is of type object, which a study file cannot hold"), ([1, {2}], "[1]: initial is of type set"),
+    (None, "None, which a study file cannot hold: leave it out"), ({"a": 1j}, ".a: a is of type complex"),
+    ({1: 2}, "initial has the key 1, which is no text"),
+])
+def test_options_are_what_a_study_file_can_hold(value, words):
+    """Others have no text that tells two of them apart: cells would share a key, and one take over the other's rows."""
+    data = {"system": "linear", "samples": 200}
+    for place, of_formulation, of_solver in (("formulations[0].initial", {"initial": value}, {}),
+                                             ("solvers[0].options.initial", {}, {"initial": value})):
+        with pytest.raises(StudyError) as caught:
+            Study("t", data, {"formulation": "subspace.nuclear", "nx": 2, **of_formulation},
+                  {"solver": "scs", "options": of_solver})
+        assert place in str(caught.value) and words in str(caught.value)
 
 
 def test_files_are_looked_for_before_a_run(rig):

@@ -151,6 +151,8 @@ def _formulation(path: Path, raw: Mapping[str, Any], data: Sequence[str], proble
         except Exception as error:  # a broken plug-in is told like everything else
             problems.add((*path, "formulation"),
                          f"formulation {name!r} cannot be loaded: {type(error).__name__}: {error}")
+    for key, value in options.items():
+        problems.writable((*path, key), value)
     constraints = problems.texts((*path, "constraints"), raw["constraints"]) if "constraints" in raw else ()
     for i, text in enumerate(constraints):
         _constraint((*path, "constraints", i), text, problems)
@@ -262,6 +264,7 @@ def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> Sol
                 if key in _TOP else "the study sets it for every solver"
             problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}",
                          value=False)
+    problems.writable((*path, "options"), options)
     accuracy = _accuracies((*path, "accuracy"), raw["accuracy"], problems) if "accuracy" in raw else ()
     return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
+from datetime import time as clock
 from typing import Any
 
 import numpy as np
@@ -97,6 +99,23 @@ class Problems(list[Problem]):
         self.add(path, f"{_last_word(path)} is a whole number from {low}; "
                  + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
         return None
+
+    def writable(self, path: Path, value: Any) -> None:
+        """Note what a study file cannot hold: it has no text from which the key of a cell could be made."""
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                if isinstance(key, str):
+                    self.writable((*path, key), item)
+                else:
+                    self.add(path, f"{_last_word(path)} has the key {key!r}, which is no text")
+        elif isinstance(value, list):
+            for i, item in enumerate(value):
+                self.writable((*path, i), item)
+        elif value is None:
+            self.add(path, f"{_last_word(path)} is None, which a study file cannot hold: leave it out")
+        elif not isinstance(value, str | int | float | date | clock):
+            self.add(path, f"{_last_word(path)} is of type {type(value).__name__}, which a study file cannot hold: "
+                           "give texts, numbers, true, false, dates, or lists and tables of them")
 
 
 def one_or_several(value: Any) -> Sequence[Any]:

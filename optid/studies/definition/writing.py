@@ -111,7 +111,7 @@ def as_toml(study: "Study") -> str:
     """Return the text of a study file.
 
     Raises:
-        StudyError: a record in memory, or a value that TOML cannot hold.
+        StudyError: a record in memory, which no file holds.
     """
     lines = [f"name = {_value(study.name)}"]
     for key in _ALONE:
@@ -154,7 +154,7 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_key(str(key))} = {_value(item)}" for key, item in value.items()) + " }"
-    raise StudyError(f"{shown(value)} cannot be written to a study file")
+    return value.isoformat()  # a date or a time: an entry holds nothing else
 
 
 def _text(text: str) -> str:
