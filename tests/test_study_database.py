@@ -37,7 +37,6 @@ def test_rows_come_back_as_they_went_in(path):
 
 
 def test_hashes_of_data_files_by_study_and_label(path):
-    assert data_hashes(path) == {}
     made = rows(200)
     append(path, made)
     expected = {("synthetic", row["data"]): {row["data_hash"]} for row in made if row["data_hash"]}
@@ -101,6 +100,15 @@ def test_studies_in_one_database_do_not_touch_each_other(path):
     append(path, [{**row, "study": "another", "place": row["place"][::-1]} for row in made[:4]])
     assert [read_rows(path, name)["key"].size for name in ("synthetic", "another")] == [10, 4]
     assert len(finished(path, "another")) == 4 and read_rows(path)["key"].size == 14
+
+
+def test_of_rows_of_several_studies_one_that_is_done_comes_first_then_the_newest(path):
+    (one,) = rows(1)
+    for study, outcome, year, first in (("a", "crashed", 2031, "a"), ("b", "done", 2028, "b"),
+                                        ("c", "done", 2030, "c"), ("d", "error", 2029, "c")):
+        append(path, [{**one, "study": study, "outcome": outcome, "started": f"{year}-01-01T00:00:00+00:00"}])
+        found = database.rows_of(path, None, [(one["key"], one["repetition"])])
+        assert [row["study"] for row in found] == [first]
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv"])

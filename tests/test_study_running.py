@@ -136,20 +136,20 @@ def test_ctrl_c_while_a_batch_is_written_loses_nothing(path, grid, monkeypatch, 
     monkeypatch.setattr(running, "BATCH", 4)
     real, calls = database.append, []
 
-    def interrupted(db, rows):
+    def interrupted(db, rows, patience):
         calls.append(len(rows))
         if after_commit:
-            real(db, rows)
-        if len(calls) == 3:  # the first two: what the journal and other labels left
+            real(db, rows, patience)
+        if len(calls) == 2:  # the first: what the journal left
             raise KeyboardInterrupt
         if not after_commit:
-            real(db, rows)
+            real(db, rows, patience)
 
     monkeypatch.setattr(database, "append", interrupted)
     grid([cell(k) for k in range(9)])
     with pytest.raises(KeyboardInterrupt):
         run(STUDY, path, execute=Hands())
-    assert calls[2] == 4 and len(finished(path)) == 4
+    assert calls[1] == 4 and len(finished(path)) == 4
     rest = Hands()
     run(STUDY, path, execute=rest)
     assert rest.ran == [4, 5, 6, 7, 8]
@@ -219,6 +219,59 @@ def test_outcomes_are_retried_on_request(path, grid):
         assert connection.execute("SELECT outcome FROM superseded").fetchall() == [("crashed",)]
     with pytest.raises(StudyError, match="Did you mean 'crashed'"):
         run(STUDY, path, execute=hands, retry=["crash"])
+
+
+def test_what_is_retried_is_not_taken_over_from_another_study(path, grid):
+    from dataclasses import replace
+
+    cells = grid([cell(k) for k in range(3)])
+    other = replace(STUDY, name="another")
+    outcomes = ("crashed", "time limit", "done")
+    run(STUDY, path, execute=lambda todo: iter([row(c, outcome=o) for c, o in zip(todo, outcomes)]))
+    grid([replace(c, study="another") for c in cells])
+    assert [r["outcome"] for r in run(other, path, execute=Hands())] == list(outcomes)
+    grid(cells)
+    hands = Hands()
+    assert [r["outcome"] for r in run(STUDY, path, execute=hands, retry="crashed")] == ["done", "time limit", "done"]
+    assert hands.ran == [0]
+    grid([replace(c, study="third") for c in cells])
+    rows = run(replace(STUDY, name="third"), path, execute=hands)
+    assert [r["outcome"] for r in rows] == ["done", "time limit", "done"]  # of two rows the one that is done
+    assert hands.ran == [0]
+
+
+HOLD = "import duckdb, sys; c = duckdb.connect({!r}, read_only=True); print('open', flush=True); sys.stdin.read()"
+
+
+@pytest.mark.parametrize("until", [5, None])
+def test_a_reader_of_the_database_does_not_stop_the_run(path, grid, monkeypatch, until):
+    """It is waited for until the last row, and what is not in the database then is in the journal."""
+    from optid.studies.storage import database
+
+    monkeypatch.setattr(running, "EVERY", 0.0)
+    monkeypatch.setattr(running, "WAIT", 0.0)
+    monkeypatch.setattr(database, "PATIENCE", 0.1)
+    grid([cell(k) for k in range(9)])
+    hands, readers = Hands(), []
+
+    def progress(done, total, found):
+        if done == 2:
+            readers.append(subprocess.Popen([sys.executable, "-c", HOLD.format(str(path))], stdin=subprocess.PIPE,
+                                            stdout=subprocess.PIPE))
+            assert readers[0].stdout.readline() == b"open\n"
+        if done == until:
+            readers[0].communicate()
+
+    if until:
+        assert len(run(STUDY, path, execute=hands, progress=progress)) == 9
+    else:
+        with pytest.raises(DatabaseError, match="in use by another process.*Nothing is lost: .*journal has the rows"):
+            run(STUDY, path, execute=hands, progress=progress)
+        readers[0].communicate()
+        assert len(finished(path)) == 2
+    assert hands.ran == list(range(9))
+    rest = Hands()
+    assert len(run(STUDY, path, execute=rest)) == 9 == len(finished(path)) and rest.ran == []
 
 
 def test_other_labels_and_other_studies_take_over_what_is_there(path, grid):
@@ -323,6 +376,27 @@ def test_a_link_to_the_database_is_the_same_database(path, tmp_path, grid):
     link.symlink_to(path)
     with locked(link), pytest.raises(DatabaseError, match="another run"):
         run(STUDY, path, execute=Hands())
+
+
+def test_rows_of_a_run_through_a_link_that_was_killed_are_found_without_the_link(path, tmp_path, grid):
+    (tmp_path / "there").mkdir()
+    link = tmp_path / "there" / "link.duckdb"
+    link.symlink_to(path)
+    program = f"""
+import os, sys
+sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+from study_trouble import cell
+from optid.studies.execution import running
+from test_study_running import STUDY, Hands
+running.cells = lambda study: [cell(k) for k in range(5)]
+running.run(STUDY, {str(link)!r}, execute=Hands(),
+            progress=lambda done, total, found: os.kill(os.getpid(), 9) if done == 3 else None)
+"""
+    assert subprocess.run([sys.executable, "-c", program]).returncode == -9
+    grid([cell(k) for k in range(5)])
+    rest = Hands()
+    assert len(run(STUDY, path, execute=rest)) == 5 and rest.ran == [3, 4]
+    assert [p.name for p in link.parent.iterdir()] == ["link.duckdb"] and link.is_symlink()
 
 
 def test_another_version_is_refused_before_anything_is_run(path, grid):

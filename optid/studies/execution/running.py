@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,12 @@ from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
 from optid.studies.grid import Cell, cells, check_unchanged, left
 from optid.studies.storage import database
+from optid.studies.storage.database import InUse
 from optid.studies.storage.journal import Journal, locked
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 
 BATCH, EVERY = 500, 2.0  # rows, and seconds, after which what is in the journal goes to the database
+WAIT = 0.2  # seconds that it then waits for a reader of the database; it is safe in the journal, and tried again later
 
 Row = dict[str, Any]
 Executor = Callable[[Sequence[Cell]], Iterator[Row]]
@@ -23,8 +25,8 @@ Executor = Callable[[Sequence[Cell]], Iterator[Row]]
 Progress = Callable[[int, int, Row | None], None]
 
 
-def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: str | None = None,
-        progress: Progress | None = None, accept_changed_data: bool = False, retry: Sequence[str] = (),
+def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: Any = None,
+        progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = (),
         execute: Executor | None = None) -> list[Row]:
     """Run the cells of a study that have no row yet.
 
@@ -32,10 +34,12 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         study: what to run.
         db: the database; made when it is not there.
         workers: processes on this machine; one per core when not given.
-        scheduler: address of a Dask scheduler whose workers run the cells instead.
+        scheduler: Dask scheduler whose workers run the cells instead, as for `optid.clusters.connected`: an address, a
+            scheduler file or a Client.
         progress: called with (cells that have a row, all cells, None) before work starts and with the row after each.
         accept_changed_data: run cells again whose data file is not what it was; their former rows are set aside.
-        retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit".
+        retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit"; rows of other
+            studies with such an outcome are not taken over.
         execute: another way to run cells, in place of ``workers`` and ``scheduler``.
 
     Returns:
@@ -47,7 +51,8 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
             (what is finished is kept then, and the next run goes on from there).
         ClusterError: the cluster cannot be used.
     """
-    db = Path(db)
+    db = Path(db).resolve()  # a link and what it leads to have one journal
+    retry = (retry,) if isinstance(retry, str) else retry
     for outcome in retry:
         if outcome not in OUTCOMES:
             raise StudyError(f"no outcome is called {outcome!r}. {nearest(outcome, OUTCOMES)}")
@@ -61,7 +66,8 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
                 check_unchanged(grid, database.data_hashes(db))
             database.keep(db, study.name, [(cell.key, cell.repetition) for cell in grid])
             database.set_aside(db, study.name, retry)
-            writer.write(_relabelled(db, grid))
+            if relabelled := _relabelled(db, grid, retry):
+                writer.write(relabelled)
             todo = left(grid, database.finished(db, study.name))
             database.describe(db, study.name, _description(study))
             _work(todo, len(grid), execute, writer, progress)
@@ -84,7 +90,7 @@ def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) ->
     return _framed(run(study, db, **settings))
 
 
-def _executor(grid: Sequence[Cell], workers: int | None, scheduler: str | None) -> Executor:
+def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Executor:
     if workers is not None and scheduler is not None:
         raise StudyError("workers are processes of this machine; a cluster has its own. Leave workers or scheduler out")
     if scheduler is not None:
@@ -102,13 +108,11 @@ class _Writer:
     """The one writer of a database: every row to the journal at once, batches of rows to the database."""
 
     def __init__(self, db: Path) -> None:
-        self._db = db
-        database.make(db)  # refuses one of another version before anything is written
-        self._journal = Journal(db)
+        self._db, self._journal = db, Journal(db)
         self._pending: list[Row] = []
-        self._since = time.monotonic()
+        self._full, self._since = BATCH, time.monotonic()
         try:
-            self.absorb()
+            self.absorb()  # refuses a database of another version before anything is written
         except BaseException:
             self._journal.close()
             raise
@@ -128,17 +132,24 @@ class _Writer:
         if not self._pending:
             self._since = time.monotonic()
         self._pending.append(row)
-        if len(self._pending) >= BATCH or time.monotonic() - self._since > EVERY:
-            self.flush()
+        if len(self._pending) >= self._full or time.monotonic() - self._since > EVERY:
+            try:
+                self.write(self._pending, WAIT)
+            except InUse:
+                self._full, self._since = len(self._pending) + BATCH, time.monotonic()
 
     def flush(self) -> None:
-        if self._pending:
-            self.write(self._pending)
+        try:
+            if self._pending:
+                self.write(self._pending)
+        except InUse as error:
+            raise InUse(f"{error}. Nothing is lost: {self._journal.path} has the rows, and the next run of the study "
+                        "takes them over") from None
 
-    def write(self, rows: Sequence[Row]) -> None:
+    def write(self, rows: Sequence[Row], patience: float | None = None) -> None:
         """Write rows to the database; the journal is empty then."""
-        database.append(self._db, rows)
-        self._pending = []
+        database.append(self._db, rows, patience)
+        self._pending, self._full = [], BATCH
         self._journal.clear()
 
     def close(self) -> None:
@@ -165,7 +176,8 @@ def _work(todo: list[Cell], total: int, execute: Executor, writer: _Writer, prog
         except DatabaseError:
             raise
         except BaseException:  # Ctrl-C at any point, a lost cluster
-            writer.absorb()
+            with suppress(InUse):  # the journal has the rows
+                writer.absorb()
             raise
     writer.flush()
     if expected:
@@ -178,8 +190,11 @@ def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, N
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
-def _relabelled(db: Path, grid: Iterable[Cell]) -> list[Row]:
-    """Rows for cells that were run under other labels or for another study: what determines them is the same."""
+def _relabelled(db: Path, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
+    """Rows for cells that were run under other labels or for another study: what determines them is the same.
+
+    Those with an outcome that is to be run again are left out.
+    """
     places = database.identities(db)
     wanted, found = [], {(key, repetition) for _, key, repetition in places}
     for cell in grid:
@@ -188,8 +203,10 @@ def _relabelled(db: Path, grid: Iterable[Cell]) -> list[Row]:
             if places.get((cell.study, cell.key, cell.repetition)) != facts["place"]:
                 wanted.append((cell, facts))
     former = {(row["key"], row["repetition"]): row
-              for row in database.rows_of(db, None, [(cell.key, cell.repetition) for cell, _ in wanted])}
-    return [{**former[cell.key, cell.repetition], **{name: facts[name] for name in LABELS}} for cell, facts in wanted]
+              for row in database.rows_of(db, None, [(cell.key, cell.repetition) for cell, _ in wanted])
+              if row["outcome"] not in retry}
+    return [{**former[cell.key, cell.repetition], **{name: facts[name] for name in LABELS}} for cell, facts in wanted
+            if (cell.key, cell.repetition) in former]
 
 
 LABELS = ("place", "study", "data", "formulation", "solver", "file")
@@ -198,7 +215,7 @@ LABELS = ("place", "study", "data", "formulation", "solver", "file")
 def _description(study: Study) -> str:
     try:
         return study.to_toml()
-    except StudyError:  # records in memory have no text
+    except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 
 

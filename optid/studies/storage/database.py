@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.errors import DatabaseError, OptidError
-from optid.studies.storage.rows import COLUMNS, NAMES, SCHEMA_VERSION, complete
+from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
 
 if TYPE_CHECKING:
     import duckdb
@@ -23,24 +23,31 @@ FORMATS: dict[str, str] = {".parquet": "FORMAT parquet", ".csv": "FORMAT csv, HE
 PATIENCE = 10.0  # seconds to wait for another process that has the file open for a moment
 
 
+class InUse(DatabaseError):
+    """Another process has the database open."""
+
+
 @contextmanager
-def opened(path: str | Path, write: bool = False) -> "Iterator[duckdb.DuckDBPyConnection]":
+def opened(path: str | Path, write: bool = False, patience: float | None = None
+           ) -> "Iterator[duckdb.DuckDBPyConnection]":
     """Open a database of studies; it is made when it is not there and ``write`` is asked for.
 
     Args:
         path: the file.
         write: open it for writing.
+        patience: seconds to wait for another process that has it open; `PATIENCE` when not given.
 
     Raises:
-        DatabaseError: no such file, not a database of studies, another schema version, in use for longer than a few
-            seconds, or duckdb is missing (with the pip line).
+        InUse: by another process, for longer than that.
+        DatabaseError: no such file, not a database of studies, another schema version, or duckdb is missing (with the
+            pip line).
     """
     path = Path(path)
     if not write and not path.is_file():
         raise DatabaseError(f"{path}: no such database; `optid study run` makes one")
     if not path.exists():
         _create(path)
-    connection = _connected(path, write)
+    connection = _connected(path, write, PATIENCE if patience is None else patience)
     try:
         _check(path, connection)
         yield connection
@@ -48,22 +55,12 @@ def opened(path: str | Path, write: bool = False) -> "Iterator[duckdb.DuckDBPyCo
         connection.close()
 
 
-def make(path: str | Path) -> None:
-    """Make a database when it is not there, and see that it can be written.
-
-    Raises:
-        DatabaseError: as in `writing`.
-    """
-    with writing(path):
-        pass
-
-
-def _connected(path: Path, write: bool) -> "duckdb.DuckDBPyConnection":
+def _connected(path: Path, write: bool, patience: float) -> "duckdb.DuckDBPyConnection":
     try:
         import duckdb
     except ImportError:
         raise DatabaseError("a database of studies needs duckdb: pip install 'optid[study]'") from None
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + patience
     while True:
         try:
             return duckdb.connect(str(path), read_only=not write, config={"threads": 1})
@@ -72,7 +69,7 @@ def _connected(path: Path, write: bool) -> "duckdb.DuckDBPyConnection":
             if "set lock" not in text.lower():
                 raise DatabaseError(f"{path} cannot be opened: {text}") from None
             if time.monotonic() > until:
-                raise DatabaseError(f"{path} has been in use by another process for {PATIENCE:.0f} s: {text}") from None
+                raise InUse(f"{path} has been in use by another process for {patience:g} s: {text}") from None
             time.sleep(0.02)
 
 
@@ -86,7 +83,7 @@ def _create(path: Path) -> None:
     unsaved = new.with_name(new.name + ".wal")
     for rest in (new, unsaved):
         rest.unlink(missing_ok=True)
-    connection = _connected(new, write=True)
+    connection = _connected(new, True, PATIENCE)
     try:
         _fill(connection)
     finally:
@@ -123,7 +120,7 @@ def _check(path: Path, connection: "duckdb.DuckDBPyConnection") -> None:
                             f"version {SCHEMA_VERSION}. Export it with the optid that made it, or give another file")
 
 
-def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def append(path: str | Path, rows: Sequence[Mapping[str, Any]], patience: float | None = None) -> None:
     """Append rows in one transaction.
 
     A row whose place in the grid is taken by one of another key (other data, options or versions), or whose key stands
@@ -132,6 +129,7 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
     Args:
         path: the database; made when it is not there.
         rows: mappings of columns; completed and checked by `rows.complete`.
+        patience: as in `opened`.
 
     Raises:
         DatabaseError: as in `opened`; or it cannot be written, such as on a full disk: nothing of the batch is in it
@@ -139,28 +137,33 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
         ValueError: a row that does not keep the schema.
     """
     whole = [complete(row) for row in rows]
-    with writing(path) as connection:
+    with writing(path, patience) as connection:
         if not whole:
             return
         connection.register("batch", {c.name: _packed([row[c.name] for row in whole], c.kind) for c in COLUMNS})
         names = ", ".join(f'"{name}"' for name in NAMES)
         casts = ", ".join(f'CAST("{c.name}" AS {c.sql})' for c in COLUMNS)
-        older = ("EXISTS (SELECT 1 FROM batch AS b WHERE b.study = rows.study AND ((b.place = rows.place) <> "
-                 "(b.key = rows.key AND b.repetition = rows.repetition)))")
+        same = "SELECT r.rowid FROM rows AS r JOIN batch AS b ON b.study = r.study AND "  # by equality: hashed, no loop
+        older = (f"rowid IN ({same} b.place = r.place WHERE b.key <> r.key OR b.repetition <> r.repetition UNION ALL "
+                 f"{same} b.key = r.key AND b.repetition = r.repetition WHERE b.place <> r.place)")
         connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {older}")
         connection.execute(f"DELETE FROM rows WHERE {older}")
         connection.execute(f"INSERT INTO rows ({names}) SELECT {casts} FROM batch")
 
 
 @contextmanager
-def writing(path: str | Path) -> "Iterator[duckdb.DuckDBPyConnection]":
+def writing(path: str | Path, patience: float | None = None) -> "Iterator[duckdb.DuckDBPyConnection]":
     """Open a database for one transaction, which is undone when anything fails.
+
+    Args:
+        path: the database; made when it is not there.
+        patience: as in `opened`.
 
     Raises:
         DatabaseError: as in `opened`, or it cannot be written.
     """
     try:
-        with opened(path, write=True) as connection:
+        with opened(path, write=True, patience=patience) as connection:
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
@@ -228,12 +231,7 @@ def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]
     Raises:
         DatabaseError: as in `opened`.
     """
-    if not Path(path).exists():
-        return set()
-    with opened(path) as connection:
-        condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
-        found = connection.execute(f"SELECT key, repetition FROM rows {condition}", values).fetchall()
-    return {(key, int(repetition)) for key, repetition in found}
+    return {(key, repetition) for owner, key, repetition in identities(path) if study in (None, owner)}
 
 
 def identities(path: str | Path) -> dict[tuple[str, str, int], str]:
@@ -254,7 +252,7 @@ def rows_of(path: str | Path, study: str | None, identified: Sequence[tuple[str,
 
     Args:
         path: the database.
-        study: only rows of this study; None for any, one of each.
+        study: only rows of this study; None for any: one of each, one that is "done" before others, then the newest.
         identified: (key, repetition) of the rows.
 
     Raises:
@@ -266,7 +264,8 @@ def rows_of(path: str | Path, study: str | None, identified: Sequence[tuple[str,
                       else f'"{c.name}"' for c in COLUMNS)
     condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
     with opened(path) as connection:
-        found = connection.execute(f"SELECT {names} FROM rows {condition}", values).fetchall()
+        found = connection.execute(f"SELECT {names} FROM rows {condition} ORDER BY outcome = '{DONE}', rows.started, "
+                                   "rows.study", values).fetchall()
     rows = [dict(zip(NAMES, values)) for values in found]
     by_identity = {(row["key"], row["repetition"]): row for row in rows}
     return [by_identity[identity] for identity in identified if identity in by_identity]
@@ -309,7 +308,7 @@ def set_aside(path: str | Path, study: str, outcomes: Sequence[str]) -> None:
     Raises:
         DatabaseError: as in `writing`.
     """
-    if not outcomes or not Path(path).exists():
+    if not outcomes:
         return
     names = ", ".join(f'"{name}"' for name in NAMES)
     chosen = f"study = ? AND outcome IN ({', '.join('?' * len(outcomes))})"
@@ -350,8 +349,6 @@ def data_hashes(path: str | Path) -> dict[tuple[str, str], set[str]]:
     Raises:
         DatabaseError: as in `opened`.
     """
-    if not Path(path).exists():
-        return {}
     with opened(path) as connection:
         found = connection.execute("SELECT DISTINCT study, data, data_hash FROM rows WHERE data_hash <> ''").fetchall()
     hashes: dict[tuple[str, str], set[str]] = {}
