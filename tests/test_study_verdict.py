@@ -519,6 +519,15 @@ def test_one_failure_more_is_no_lack_of_reliability():
     assert "c solved 20, no difference beyond chance" in conclude(table_of(third)).headline.text
 
 
+def test_who_refuses_many_and_is_ahead_is_for_where_it_runs():
+    for limit, word in ((14, "Solves most: a"), (16, "Use a where it runs")):
+        rows = table_of(times_of(1.0, 3.0, problems=60))
+        for row in rows:
+            if row["seed"] < 30 and (row["solver"] == "a") == (row["seed"] < limit):
+                row |= {"outcome": "refused", "status_verified": None, "objective": None}
+        assert conclude(rows).headline.word == word
+
+
 def test_failures_by_chance_do_not_decide_and_those_beyond_it_do():
     rng = np.random.default_rng(5)
 

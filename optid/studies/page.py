@@ -26,6 +26,7 @@ TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm"
 FOLDED = 8  # formulations above which their list is folded away
 LISTED = 40  # false claims on the page; the database has them all
 WIDEST = 120  # characters of a text in a table
+REASON = 400  # characters of a reason, which is broken into lines
 
 
 def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: str = "",
@@ -105,8 +106,8 @@ def embedded(payload: Any) -> Markup:
                   .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))  # fmt: skip
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= WIDEST else text[: WIDEST - 1] + "…"
+def _short(text: str, most: int = WIDEST) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _lead(verdict: Verdict) -> str:
@@ -164,7 +165,7 @@ def _claims(verdict: Verdict) -> Table | None:
         return None
     rows = []
     for c in claims[:LISTED]:
-        why = _short(c.reason) or "verified otherwise"
+        why = _short(c.reason, REASON) or "verified otherwise"
         rows.append((_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", why))
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
     return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)

@@ -39,8 +39,8 @@ function drawStandings() {
   const growth = (one) => one.growth.slope === null ? "-" : element("span", {}, `N^${one.growth.slope.toFixed(2)}`,
     element("span", { class: "faint" }, ` (${one.growth.low.toFixed(2)} to ${one.growth.high.toFixed(2)})`));
   const columns = [
-    { name: "solver", title: "solver", head: true, value: (s) => s.solver, node: (s) => element("span", {}, swatch(s.solver), " ", s.solver,
-      section.first === s.solver && section.kind === "first" ? element("span", { class: "mark", title: "first choice" }, " ★") : section.kind === "tie" && (section.first === s.solver || section.tied.includes(s.solver)) ? element("span", { class: "faint", title: "tied for the first place" }, " tied") : null) },
+    { name: "solver", title: "solver", hint: "★ the first choice; tied: not to be told apart from it", head: true, value: (s) => s.solver, node: (s) => element("span", {}, swatch(s.solver), " ", s.solver,
+      section.first === s.solver && section.kind === "first" ? element("span", { class: "mark" }, " ★") : section.kind === "tie" && (section.first === s.solver || section.tied.includes(s.solver)) ? element("span", { class: "faint" }, " tied") : null) },
     { name: "solved", title: "accuracy reached on", hint: "problems it was run on, and where it reached the verified accuracy", number: true, descending: true, value: (s) => s.share, node: shareBar },
     { name: "time", title: "time", hint: "shifted geometric mean on what it solved: compares only where others solved the same", number: true, value: (s) => s.time, text: (s) => duration(s.time) },
     { name: "against", title: section.first ? `against ${section.first.length > 24 ? section.first.slice(0, 23) + "…" : section.first}` : "against", hint: "ratio of times on the problems both solved, with its 95 % interval", number: true, value: (s) => (s.against ? s.against[0] : section.first === s.solver ? 1 : null),
@@ -49,11 +49,12 @@ function drawStandings() {
     { name: "penalised", title: "failures at limit", hint: "shifted geometric mean with every failure counted as the time limit", number: true, value: (s) => s.penalised, text: (s) => duration(s.penalised) },
     { name: "rank", title: "mean rank", hint: "over the data sets, 1 is best", number: true, value: (s) => s.rank, text: (s) => significant(s.rank) },
     { name: "growth", title: "grows as", hint: "exponent of the record length N, with its 95 % interval", number: true, value: (s) => s.growth.slope, node: growth },
-    { name: "residual", title: "residual", hint: "median verified residual on what it solved", number: true, value: (s) => s.residual, text: (s) => significant(s.residual, 2) },
-    { name: "false", title: "false claims", number: true, descending: true, value: (s) => s.false, node: (s) => s.false ? element("a", { href: "#failures", class: "state-bad" }, String(s.false)) : "0" },
+    { name: "residual", title: "residual", hint: "median on what it solved of the largest of violation, complementarity and a tenth of the stationarity", number: true, value: (s) => s.residual, text: (s) => significant(s.residual, 2) },
+    { name: "false", title: "false claims", hint: "problems on which a claim of success or infeasibility was false", number: true, descending: true, value: (s) => s.false, node: (s) => s.false ? element("a", { href: "#failures", class: "state-bad" }, String(s.false)) : "0" },
   ];
   const idle = section.idle.length ? `Not run on any of these problems: ${section.idle.join(", ")}.` : null;
   standings = makeGrid(byId("standings"), { label: "Standings of the solvers", columns, rows: section.standings, caption: idle });
+  byId("standings").append(element("details", {}, element("summary", {}, "What the columns say"), element("dl", { class: "words" }, ...columns.flatMap((c) => [element("dt", {}, c.title), element("dd", {}, c.hint)]))));
   const word = (name) => element("b", {}, name + ". ");
   byId("said").replaceChildren(...(DATA.sections.length > 2 ? section.said.map(([mood, title, text]) => element("p", { class: `chosen ${mood}` }, word(title), text)) : []));
 }
@@ -62,7 +63,7 @@ function drawStandings() {
 
 function numbersBelow(head, rows) {
   const line = (cells, tag) => element("tr", {}, ...cells.map((text, k) => element(k && tag === "td" ? "td" : "th", { scope: tag === "th" ? "col" : k ? null : "row" }, text)));
-  return element("details", {}, element("summary", {}, "Numbers"), element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Numbers of the figure" },
+  return element("details", {}, element("summary", {}, "Numbers"), element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Numbers" },
     element("table", {}, element("thead", {}, line(head, "th")), element("tbody", {}, ...rows.map((row) => line(row, "td"))))));
 }
 
@@ -167,7 +168,7 @@ function countLink(solver, state, count) {
 }
 
 function drawReasons() {
-  const columns = [["solver", 0], ["how it ended", 1], ["reason", 2]].map(([title, k]) => ({ name: title, title, head: !k, value: (f) => f[k], text: (f) => f[k] || "-" }));
+  const columns = [["solver", 0], ["how it ended", 1], ["reason", 2]].map(([title, k]) => ({ name: title, title, head: !k, value: (f) => f[k], node: (f) => element("span", {}, f[k] || "-") }));
   columns.push({ name: "problems", title: "problems", number: true, descending: true, value: (f) => f[3], text: (f) => f[3].toLocaleString("en") });
   makeGrid(byId("reasons"), { label: "Reasons of failures", columns, rows: DATA.failures, size: 25 });
 }
@@ -181,17 +182,19 @@ function drawAgreement() {
     const n = a.common[i][j], m = a.compared[i][j];
     if (i === j || !n) return element("td", { class: "faint" }, i === j ? "" : element("span", { title: "no problem in common" }, "-"));
     const part = a.objective[i][j] / n, model = m ? a.model[i][j] / m : null, percent = (v) => (v === 1 ? "100 %" : `${(Math.floor(1000 * v) / 10).toFixed(1)} %`);
-    const title = `${a.solvers[i]} and ${a.solvers[j]}: ${plural(n, "common problem")}; equal objectives on ${a.objective[i][j]}, largest difference ${significant(a.worst_objective[i][j], 2)}; equal models on ${a.model[i][j]} of ${m}, largest difference ${significant(a.worst_model[i][j], 2)}`;
-    const made = element("td", { title }, element("b", {}, percent(part)), element("br"), element("span", { class: "faint" }, n.toLocaleString("en") + (model === 1 ? "" : `; models ${model === null ? "-" : percent(model)}`)));
+    const made = element("td", {}, element("b", {}, percent(part)), element("br"), element("span", {}, n.toLocaleString("en") + (model === 1 ? "" : `; models ${model === null ? "-" : percent(model)}`)));
     const low = Math.min(part, model === null ? 1 : model);
     made.style.setProperty("--heat", part >= 0.99 ? (low >= 0.99 ? "var(--green)" : "var(--orange)") : "var(--red)");
     made.style.setProperty("--much", `${part >= 0.99 ? 16 : 12 + 40 * (1 - part)}%`);
     return made;
   };
+  const pairs = order.flatMap((one, k) => order.slice(k + 1).map((other) => [at(one), at(other)])).filter(([i, j]) => a.common[i][j]);
+  const numbers = numbersBelow(["pair", "common problems", "equal objectives", "largest difference", "equal models", "largest difference"], pairs.map(([i, j]) => [
+    `${a.solvers[i]} and ${a.solvers[j]}`, a.common[i][j].toLocaleString("en"), a.objective[i][j].toLocaleString("en"), significant(a.worst_objective[i][j], 2), `${a.model[i][j].toLocaleString("en")} of ${a.compared[i][j].toLocaleString("en")}`, significant(a.worst_model[i][j], 2)]));
   const head = element("tr", {}, element("th", { scope: "col" }, ""), ...order.map((name) => element("th", { scope: "col" }, name)));
   const body = order.map((one) => element("tr", {}, element("th", { scope: "row" }, one), ...order.map((other) => share(at(one), at(other)))));
   host.replaceChildren(element("div", { class: "grid heat", tabindex: "0", role: "region", "aria-label": "Agreement of pairs of solvers" }, element("table", {}, element("thead", {}, head), element("tbody", {}, ...body))),
-    element("p", { class: "lead small" }, "In bold the share with equal objectives; below it the common problems, and the share with equal models where it is not all. Red: other minima or a wrong answer. Orange: the same objective from different models."));
+    element("p", { class: "lead small" }, "In bold the share with equal objectives; below it the common problems, and the share with equal models where it is not all. Red: other minima or a wrong answer. Orange: the same objective from different models."), numbers);
 }
 
 // ---- runs
@@ -256,8 +259,8 @@ function searchable(i) {
 function conditionsOf(text) {
   const tests = [];
   const rest = (text || "").replace(/([a-z_]+)\s*(<=|>=|!=|<|>|=)\s*(\S+)/gi, (all, name, sign, value) => {
+    if (!Object.hasOwn(COLUMN, name.toLowerCase())) return all;
     const column = COLUMN[name.toLowerCase()];
-    if (!column) return all;
     const want = column.kind === "number" ? Number(value) : value.toLowerCase();
     if (column.kind === "number" && Number.isNaN(want)) return all;
     tests.push((i) => {

@@ -76,8 +76,10 @@ def choice_of_solver(section: Section) -> Statement:
         word = f"A tie: {listed(names)}"
     else:
         text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (lead.solver,))}"
-        most = lead.refused > RARE * n and lead.solved == max(choice.solved.values())
-        word = f"Solves most: {lead.solver}" if most else f"Use {lead.solver}"
+        word = f"Use {lead.solver}"
+        if lead.refused > RARE * n:
+            most = lead.solved == max(choice.solved.values())
+            word = f"Solves most: {lead.solver}" if most else f"{word} where it runs"
     return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text.rstrip(), "solver")
 
 

@@ -106,11 +106,11 @@ def _reliable(known: np.ndarray, allowed: int) -> list[int]:
     counts = known.sum(axis=0)
     best = known[:, int(np.argmax(counts))]
 
-    def behind(s: int) -> bool:
-        lost, won = int((best & ~known[:, s]).sum()), int((known[:, s] & ~best).sum())
+    def behind(one: np.ndarray) -> bool:
+        lost, won = int((best & ~one).sum()), int((one & ~best).sum())
         return lost - won > allowed and float(binom.sf(lost - 1, lost + won, 0.5)) < LEVEL
 
-    return [int(s) for s in np.flatnonzero(counts) if not behind(s)]
+    return [int(s) for s in np.flatnonzero(counts) if not behind(known[:, s])]
 
 
 def _beaten(costs: np.ndarray, reliable: list[int], minor: float,
