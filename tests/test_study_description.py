@@ -349,6 +349,20 @@ def test_versions_change_the_key(monkeypatch):
     assert before == {cell.key for cell in grid.cells(study)}
 
 
+def test_versions_do_not_depend_on_how_optid_was_installed(monkeypatch):
+    """In place it is no distribution that holds the package; as a wheel it is."""
+    from optid.studies import versions
+
+    found = []
+    for holders in ((), ("optid",)):
+        monkeypatch.setattr(versions, "packages_of", lambda package, holders=holders: holders)
+        found.append([versions.determining.__wrapped__("arx", solver) for solver in ("gauss_newton", "scs", "auto")])
+    assert found[0] == found[1]
+    own, other, auto = found[0]
+    assert "source of gauss_newton" in own and other["scs"] != "not installed"
+    assert {"source of admm", "source of block_descent", "scs", "unopy"} <= set(auto)
+
+
 def test_the_same_cell_twice_is_refused():
     study = replace(Study.from_text(SMALL), solvers={"one": "clarabel", "two": "clarabel"})
     with pytest.raises(StudyError, match="solver 'one' and 'two'"):

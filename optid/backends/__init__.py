@@ -150,6 +150,13 @@ def find(name: str) -> BackEnd:
     return back_end
 
 
+AUTO: dict[str, tuple[str, ...]] = {
+    "rank one": ("gauss_newton",), "nuclear norm": ("admm",), "groups": ("block_descent",),
+    "small NLP": ("uno", "ipopt"), "NLP": ("ipopt", "uno"), "convex": ("clarabel", "scs"),
+}
+"""What `choose` chooses from: of a kind of programme the first that is installed."""
+
+
 def choose(program: Program) -> tuple[BackEnd, str]:
     """Choose a back end by class and size of the programme, and say why.
 
@@ -157,18 +164,16 @@ def choose(program: Program) -> tuple[BackEnd, str]:
         StructureError: when no installed back end accepts the programme.
     """
     if program.rank_one is not None:
-        return find("gauss_newton"), (
+        return find(*AUTO["rank one"]), (
             f"gauss_newton: rank-one least squares with {program.rank_one.problem.root.shape[0]} lifted unknowns"
         )
     if program.nuclear is not None and not program.user_constraints:
-        return find("admm"), f"admm: nuclear norm of a Hankel matrix, {program.nuclear.problem.shape} entries"
+        shape = program.nuclear.problem.shape
+        return find(*AUTO["nuclear norm"]), f"admm: nuclear norm of a Hankel matrix, {shape} entries"
     if program.group is not None and not program.user_constraints:
-        return find("block_descent"), f"block_descent: {program.group.problem.weights.size} groups"
+        return find(*AUTO["groups"]), f"block_descent: {program.group.problem.weights.size} groups"
     kind = program.kind
-    order = ("uno", "ipopt") if kind == "NLP" and program.size <= 200 else ("ipopt", "uno")
-    if kind != "NLP":
-        order = ("clarabel", "scs")
-    for name in order:
+    for name in AUTO["convex" if kind != "NLP" else "small NLP" if program.size <= 200 else "NLP"]:
         back_end = back_ends().get(name)
         if back_end is not None and back_end.installed and kind in back_end.classes:
             return back_end, f"{name}: class {kind}, {program.size} unknowns"

@@ -5,7 +5,7 @@ import inspect
 from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 
-from optid.backends import back_ends
+from optid.backends import AUTO, back_ends
 from optid.registry import FORMULATIONS, registered
 
 ALWAYS = ("optid", "numpy", "scipy", "cvxpy")
@@ -27,7 +27,7 @@ def determining(formulation: str, solver: str, simulated: bool = False) -> dict[
     if point.dist is not None:
         found[point.dist.name] = point.dist.version
     found[f"source of {formulation}"] = source_hash(point.value.partition(":")[0])
-    for name in ("gauss_newton", "uno", "ipopt", "clarabel", "scs") if solver == "auto" else (solver,):
+    for name in sorted({name for names in AUTO.values() for name in names}) if solver == "auto" else (solver,):
         found |= _of_back_end(name)
     if simulated:
         found["source of the systems"] = source_hash("optid.studies.sources.systems")
@@ -58,17 +58,17 @@ def source_hash(module: str) -> str:
 
 
 def _of_back_end(name: str) -> dict[str, str]:
-    """Distributions of a back end: those it names for pip, or the one its code is in."""
+    """Distributions of a back end, those it names for pip and the one its code is in, and its source.
+
+    The source may be edited in place; ours is looked at, too, so that no key depends on how optid was installed.
+    """
     back_end = back_ends().get(name)
     if back_end is None:
         return {}
-    if back_end.pip:
-        return {distribution: installed(distribution) for distribution in back_end.pip.split()}
     module = getattr(inspect.getmodule(back_end.run), "__name__", "")
-    found = {distribution: version(distribution) for distribution in packages_of(module.partition(".")[0])}
-    if "optid" not in found:  # a third party's, which may be edited in place
-        found[f"source of {name}"] = source_hash(module)
-    return found
+    distributions = {*back_end.pip.split(), *packages_of(module.partition(".")[0])}
+    found = {distribution: installed(distribution) for distribution in sorted(distributions)}
+    return found | {f"source of {name}": source_hash(module)}
 
 
 @cache
