@@ -48,7 +48,7 @@ RATIOS = (1e-2, 1.0, 1e2)
 """Process over measurement noise of the observers behind the starts, in units of C."""
 
 TRIED = 2
-"""Starts that are refined, the best of all."""
+"""Observers whose errors are whitened, and then starts that are refined, the best of all."""
 
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 """Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
@@ -92,8 +92,7 @@ def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
     observer = _observer(model)
     data, _ = between_gaps(data.without_transform(), 2 * model.nx + 1)
     rest = residuals(replace(model, K=observer, noise=None), data)
-    level = float(np.nanmax(np.abs(np.vstack([e.y for e in data.experiments])), initial=0.0))
-    if not np.nanmax(np.abs(np.vstack(rest)), initial=0.0) > ROUNDING * level:
+    if not _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
         return Noise(observer, NoiseCovariances.of_innovations(observer, covariance_of(rest)))
     A = model.A - observer @ model.C
     gain, covariance = _most_likely(A, model.C, rest)
@@ -164,6 +163,11 @@ def output_noise(model: "HammersteinSS") -> Array:
     return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
 
 
+def _largest(signals: Sequence[Array]) -> float:
+    """Largest modulus of any sample that is present."""
+    return max(float(np.nanmax(np.abs(s), initial=0.0)) for s in signals)
+
+
 def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
     """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part.
 
@@ -193,10 +197,13 @@ def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
 
 
 def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
-    """Gains to start from, the most promising first: of several observers, and from the whitening of their errors.
+    """Gains to start from, the most promising first: of observers, and from the whitening of the errors of the best.
 
     The observers are those of equal noise in all states and equal noise at all outputs.
     """
+    def size_of_errors(gain: Array) -> float:
+        return log_determinant(innovations_covariance(A, C, gain, rest))
+
     size = np.linalg.norm(C, axis=1)
     unit, observers = np.diag(np.where(size > 0, size, 1.0) ** 2), [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
@@ -204,15 +211,15 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
             observers.append(np.array(kalman_gain(A, C, ratio * np.eye(len(A)), unit).K))
         except StructureError:
             continue
-    found = list(observers)
-    for gain in observers:
+    found = sorted(observers, key=size_of_errors)
+    for gain in found[:TRIED]:
         errors = whitened(A, C, gain, rest)
         whole = [e[start:stop] for e in errors for start, stop in runs_of(~np.isnan(e).any(axis=1))]
         try:
             found.append(np.array(innovation_form(A, C, gain, whole)[0]))
         except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
             continue
-    return sorted(found, key=lambda gain: log_determinant(innovations_covariance(A, C, gain, rest)))
+    return sorted(found, key=size_of_errors)
 
 
 def _observer(model: "HammersteinSS") -> Array:

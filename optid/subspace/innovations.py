@@ -41,8 +41,12 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         model: a model in the units of the data.
         data: the record it was identified on.
     """
-    stretches = [(e.u[start:stop], e.y[start:stop]) for e in data.experiments
-                 for start, stop in runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1)))]
+    stretches = []
+    for e in data.experiments:
+        runs = [(0, len(e.y))]
+        if np.isnan(e.u.sum() + e.y.sum()):
+            runs = runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1)))
+        stretches += [(e.u[start:stop], e.y[start:stop]) for start, stop in runs]
     try:
         regression_lags([len(y) for _, y in stretches], *model.K.shape)
         if any(data.missing[name] for name in data.inputs):
@@ -53,7 +57,7 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
             found = with_noise(model, data)
     except StructureError as reason:
         return model, f"none: {reason}"
-    spread = np.std(np.concatenate([y for _, y in stretches]), axis=0)
+    spread = np.std(np.concatenate([y.T for _, y in stretches], axis=1), axis=1)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
         return model, "none: the prediction errors vanish, there is no noise to model"
     return found, ""
