@@ -3,12 +3,13 @@
 const DATA = JSON.parse(document.getElementById("payload").textContent);
 const COLUMN = Object.fromEntries(DATA.columns.map((column) => [column.name, column]));
 const BAD = new Set(["false claim", "contradicted", "crashed", "memory limit", "non-finite", "failed", "error"]);
+const ASIDE = new Set(["refused", "other accuracy", "no time"]);
 const DASHES = [null, "8 3", "2 3", "9 3 2 3"];
 const STYLE = Object.fromEntries(DATA.solvers.map((name, k) => [name, { colour: `var(--c${k % 10})`, dash: DASHES[Math.floor(k / 10) % 4] }]));
 const hidden = new Set();
 const byId = (id) => document.getElementById(id);
 const plural = (n, noun) => `${n.toLocaleString("en")} ${noun}${n === 1 ? "" : "s"}`;
-const tone = (state) => (state === "solved" ? "good" : state === "refused" ? "none" : BAD.has(state) ? "bad" : "fair");
+const tone = (state) => (state === "solved" ? "good" : ASIDE.has(state) ? "none" : BAD.has(state) ? "bad" : "fair");
 let section = DATA.sections[0], drawn = [], standings = null;
 
 function cell(name, row) {
