@@ -129,7 +129,7 @@ def test_figures_follow_the_colours_of_the_page(pages):
     drawings = re.findall(r"<svg .*?</svg>", pages["thruster"], re.DOTALL)
     colours = {colour for drawing in drawings for colour in re.findall(r"#[0-9a-f]{6}\b", drawing)}
     assert colours <= {"#000000", "#ffffff"}  # defaults of glyphs and of what is not drawn
-    assert "prefers-color-scheme: dark" in pages["thruster"]
+    assert "--blue: light-dark(" in pages["thruster"]
 
 
 def test_write_returns_the_path(tmp_path):

@@ -192,5 +192,6 @@ def _show(found: Any, posed: str, record: str) -> None:
     if found.refused:
         say(Text(f"not for {posed}: {', '.join(found.refused)}", "dim"))
     say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: the largest of "
-             "ours, of the stationarity a tenth. 1-step, simul.: fit in % on held-out samples.", "dim"))
+             "violation, complementarity and a tenth of the stationarity. 1-step, simul.: fit in % on held-out "
+             "samples.", "dim"))
     say(Text(found.recommendation, "bold"))
