@@ -12,6 +12,7 @@ hence K and Re.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -201,8 +202,8 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
 
     The observers are those of equal noise in all states and equal noise at all outputs.
     """
-    def size_of_errors(gain: Array) -> float:
-        return log_determinant(innovations_covariance(A, C, gain, rest))
+    def measured(gain: Array) -> tuple[float, Array]:
+        return log_determinant(innovations_covariance(A, C, gain, rest)), gain
 
     size = np.linalg.norm(C, axis=1)
     unit, observers = np.diag(np.where(size > 0, size, 1.0) ** 2), [np.zeros((len(A), len(C)))]
@@ -211,15 +212,15 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
             observers.append(np.array(kalman_gain(A, C, ratio * np.eye(len(A)), unit).K))
         except StructureError:
             continue
-    found = sorted(observers, key=size_of_errors)
-    for gain in found[:TRIED]:
+    found = sorted(map(measured, observers), key=itemgetter(0))
+    for _, gain in found[:TRIED]:
         errors = whitened(A, C, gain, rest)
         whole = [e[start:stop] for e in errors for start, stop in runs_of(~np.isnan(e).any(axis=1))]
         try:
-            found.append(np.array(innovation_form(A, C, gain, whole)[0]))
+            found.append(measured(np.array(innovation_form(A, C, gain, whole)[0])))
         except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
             continue
-    return sorted(found, key=size_of_errors)
+    return [gain for _, gain in sorted(found, key=itemgetter(0))]
 
 
 def _observer(model: "HammersteinSS") -> Array:

@@ -160,7 +160,7 @@ def innovation_form(a: Array, c: Array, gain: Array, errors: Sequence[Array]) ->
         for out, left in _responses(inner, c, e, part - e, lags):
             for o in range(l):
                 normal = add_to_root(normal, np.concatenate([out[:, o], left[:, o, None]], axis=1) / spread[o])
-    change = np.linalg.lstsq(normal[:size, :size], normal[:size, size], rcond=None)[0].reshape(n, l)
+    change = np.linalg.lstsq(normal[:size, :size], normal[:size, size], rcond=None)[0].reshape(l, n).T
     k, rest, count = gain + change, np.zeros((l, l)), 0
     for part, e in zip(errors, innovations):
         x = np.empty((len(e), n))
@@ -194,15 +194,15 @@ def _responses(inner: Array, c: Array, e: Array, target: Array, first: int) -> I
         first: sample, less than `CHUNK`.
 
     Yields:
-        (K, l, n l) and (K, l).
+        (K, l, l n), M column by column, and (K, l).
     """
     from optid.subspace.kernels import adjoint_responses
 
     l, n = c.shape  # noqa: E741
-    state = np.zeros((n, l, l))
+    state = np.zeros((l, l, n))
     for start in range(0, len(e), CHUNK):
         signals = np.ascontiguousarray(e[start : start + CHUNK])
-        out = np.empty((len(signals), n, l, l))
+        out = np.empty((len(signals), *state.shape))
         adjoint_responses(inner, c, signals, state, out)
         left_out = max(first - start, 0)
-        yield out[left_out:].swapaxes(1, 2).reshape(-1, l, n * l), target[start + left_out : start + CHUNK]
+        yield out[left_out:].reshape(-1, l, l * n), target[start + left_out : start + CHUNK]

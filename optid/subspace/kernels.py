@@ -38,23 +38,25 @@ def window_products(flat: Array, count: int, d: int, out: Array) -> None:
 def adjoint_responses(inner: Array, outputs: Array, signals: Array, state: Array, out: Array) -> None:
     """Write the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
 
-    The regressor of output o is the matrix X_o(k) (n, d) with X_o(k + 1) = F^T X_o(k) + C_o^T s(k)^T.
+    The regressor of output o is the matrix X_o(k) (d, n), like M transposed, with X_o(k + 1) = X_o(k) F + s(k) C_o.
 
     Args:
         inner: (n, n) F.
         outputs: (l, n) C.
         signals: (T, d) s.
-        state: (n, l, d) X at the first sample, for every output; left at the sample after the last.
-        out: (T, n, l, d) X, written.
+        state: (l, d, n) X at the first sample, for every output; left at the sample after the last.
+        out: (T, l, d, n) X, written.
     """
-    n, l, d = state.shape  # noqa: E741
+    l, d, n = state.shape  # noqa: E741
     width = l * d
-    x, rows = state.reshape(n, width), out.reshape(out.shape[0], n * width)
+    rows, left = out.reshape(out.shape[0], width * n), state.reshape(width, n)
+    x, before = left.T.copy(), np.empty((n, width))  # states outermost: the inner loops are long
     for t in range(signals.shape[0]):
         row = rows[t]
         for i in range(n):
             for j in range(width):
-                row[i * width + j] = x[i, j]
+                row[j * n + i] = x[i, j]
+                before[i, j] = x[i, j]
             for o in range(l):
                 for j in range(d):
                     x[i, o * d + j] = outputs[o, i] * signals[t, j]
@@ -62,7 +64,8 @@ def adjoint_responses(inner: Array, outputs: Array, signals: Array, state: Array
             for i in range(n):
                 weight = inner[h, i]
                 for j in range(width):
-                    x[i, j] += weight * row[h * width + j]
+                    x[i, j] += weight * before[h, j]
+    left[:] = x.T
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

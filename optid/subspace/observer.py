@@ -12,7 +12,6 @@ of samples has its own initial state; those of all but the first run of an exper
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -260,48 +259,44 @@ class _Regressors:
             raw = run[start : start + self.chunk]
             y, signals = raw[:, self.y], self._signals(raw)
             if state is None:
-                state = np.zeros((form.n, form.l, signals.shape[1]))
-                state[:, :, -1] = form.c.T  # (F^T)^k C_o^T, the effect of x0
+                state = np.zeros((form.l, signals.shape[1], form.n))
+                state[:, 0] = form.c  # C_o F^k, the effect of x0
             out = np.empty((len(raw), *state.shape))
             adjoint_responses(inner, form.c, signals, state, out)
             for o in range(form.l):
                 present = ~np.isnan(y[:, o])
-                rows = self._rows(o, signals, out[:, :, o], y[:, o])
+                rows = self._rows(o, signals, out[:, o], y[:, o])
                 rows *= form.weights[o]
                 yield rows if present.all() else rows[present]
 
     def _signals(self, raw: Array) -> Array:
-        """Return [eta | (zeta simulated |) zeta | (1 | y |) 0], the last without any effect but that of its state."""
+        """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
         x = self.form.expansion
         found = x(raw)
-        parts = [found[:, : x.p]]
+        parts = [np.zeros((len(raw), 1)), found[:, : x.p]]
         if self.extra:
             parts.append(found[:, x.zeta_simulated.start :])
         parts.append(found[:, x.p : x.p + x.q])
         if self.injected:
             parts += [np.ones((len(raw), 1)), raw[:, self.y]]
-        return np.concatenate([*parts, np.zeros((len(raw), 1))], axis=1)
+        return np.concatenate(parts, axis=1)
 
     def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
-        """Rows of output o: [x0 | d | D | B | E simulated | E | y], matrices with their rows outermost."""
+        """Rows of output o: [x0 | d | D | B | E simulated | E | y], D row by row, B and E column by column."""
         form, x = self.form, self.form.expansion
-        n, l, p, q, count = form.n, form.l, x.p, x.q, len(signals)  # noqa: E741
-        feeds = 2 * q if self.extra else q
+        n, l, p, count = form.n, form.l, x.p, len(signals)  # noqa: E741
+        past = 1 + p + (2 if self.extra else 1) * x.q
         rows = np.zeros((count, n + self.common + self.extra + 1))
         offset, direct, inner = np.cumsum([n, l * form.offset, l * p])
-        rows[:, :n], rows[:, -1] = out[:, :, -1], y
+        rows[:, :n], rows[:, inner:-1], rows[:, -1] = out[:, 0], out[:, 1:past].reshape(count, -1), y
         if form.offset:
             rows[:, offset + o] = 1.0
-        rows[:, direct + o * p : direct + (o + 1) * p] = signals[:, :p]
+        rows[:, direct + o * p : direct + (o + 1) * p] = signals[:, 1 : 1 + p]
         if self.injected:
             if form.offset:
-                rows[:, offset:direct] -= out[:, :, p + feeds] @ form.gain
-            rows[:, direct:inner] -= np.einsum("kij,io->koj", out[:, :, :p], form.gain).reshape(count, -1)
-            rows[:, -1] -= np.einsum("kij,ij->k", out[:, :, p + feeds + 1 : -1], form.gain)
-        for first, last in pairwise((0, p, p + q, p + 2 * q) if self.extra else (0, p, p + q)):
-            size = n * (last - first)
-            rows[:, inner : inner + size] = out[:, :, first:last].reshape(count, -1)
-            inner += size
+                rows[:, offset:direct] -= out[:, past] @ form.gain
+            rows[:, direct:inner] -= np.einsum("kji,io->koj", out[:, 1 : 1 + p], form.gain).reshape(count, -1)
+            rows[:, -1] -= np.einsum("kji,ij->k", out[:, past + 1 :], form.gain)
         return rows
 
     def turn(self, states: int) -> Array:
@@ -316,13 +311,14 @@ class _Regressors:
         for i, (functions, entries) in enumerate(form.blocks):
             columns = np.arange(form.size)[form.block(i)].reshape(entries, functions)
             for b in range(entries):
+                position = starts[i] + np.arange(functions)
                 if i >= x.m:
-                    where = feed + b * q + starts[i] - p
+                    where = feed + (position - p) * n + b
                 elif b < n:
-                    where = inner + b * p + starts[i]
+                    where = inner + position * n + b
                 else:
-                    where = direct + (b - n) * p + starts[i]
-                turn[where + np.arange(functions), columns[b]] = 1.0
+                    where = direct + (b - n) * p + position
+                turn[where, columns[b]] = 1.0
         return turn
 
 
