@@ -1,5 +1,6 @@
 """Running a study: nothing twice, nothing lost, one writer, and a clear word where it cannot go on."""
 
+import errno
 import subprocess
 import sys
 import time
@@ -348,6 +349,27 @@ def test_two_runs_at_once_are_refused(path, grid):
             run(STUDY, path, execute=Hands())
     assert not path.exists()
     assert len(run(STUDY, path, execute=Hands())) == 1
+
+
+def test_a_disk_without_locks_is_no_other_run(path, monkeypatch):
+    def without(handle, how):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("optid.studies.storage.journal.fcntl.flock", without)
+    with pytest.raises(DatabaseError, match="cannot be locked: No locks available: .*on a disk of this machine"):
+        run(STUDY, path, execute=Hands())
+
+
+def no_room(handle, content):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_lock_holds_on_a_disk_without_room_for_its_words(path, monkeypatch):
+    with monkeypatch.context() as full:
+        full.setattr("optid.studies.storage.journal.os.write", no_room)
+        with locked(path), pytest.raises(DatabaseError, match="another run is writing"), locked(path):
+            pass
+    assert list(path.parent.iterdir()) == []
 
 
 def test_the_lock_of_a_killed_run_is_free(path):

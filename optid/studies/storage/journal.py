@@ -10,7 +10,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,15 +26,16 @@ def locked(path: Path) -> Iterator[None]:
         path: the database, which need not be there yet.
 
     Raises:
-        DatabaseError: another run holds it (says which), or its folder cannot be written.
+        DatabaseError: another run holds it (says which), its folder cannot be written, or its file system has no locks.
     """
     path = path.resolve()
     name = path.with_name(path.name + ".lock")
     handle = _acquired(path, name)
     try:
         os.ftruncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"
-                 .encode())
+        holder = f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"
+        with suppress(OSError):  # a full disk, of which the first row tells; the lock holds without these words
+            os.write(handle, holder.encode())
         yield
     finally:
         name.unlink(missing_ok=True)  # before the lock goes: nobody locks a name that is about to vanish
@@ -49,11 +50,15 @@ def _acquired(path: Path, name: Path) -> int:
             raise DatabaseError(f"{path} cannot be written: {error.strerror}: {name}") from None
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             holder = os.pread(handle, 200, 0).decode(errors="replace") or "a process that has only just started"
             os.close(handle)
             raise DatabaseError(f"another run is writing to {path}: {holder}. Wait until it ends, stop it, or give "
                                 "another database") from None
+        except OSError as error:
+            os.close(handle)
+            raise DatabaseError(f"{path} cannot be locked: {error.strerror}: {name}. Give a database on a disk of this "
+                                "machine") from None
         try:
             if os.stat(name).st_ino == os.fstat(handle).st_ino:
                 return handle
