@@ -132,6 +132,10 @@ def _other(cell: Cell, words: dict[str, Any]) -> Any:
     return row(cell, key="f" * 64)
 
 
+def _vast(cell: Cell, words: dict[str, Any]) -> Any:
+    return {**row(cell), "iterations": 2**70}
+
+
 def _nan(cell: Cell, words: dict[str, Any]) -> Any:
     return {**row(cell), "objective": float("nan"), "gap": np.float64("inf")}
 

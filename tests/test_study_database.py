@@ -36,6 +36,14 @@ def test_rows_come_back_as_they_went_in(path):
     assert found["repetition"].dtype == np.int64 and found["proved"].dtype == bool
 
 
+def test_the_largest_whole_numbers_come_back(path):
+    (row,) = rows(1)
+    row |= {"iterations": 2**63 - 1, "seed": -(2**63)}
+    append(path, [row])
+    (back,) = database.rows_of(path, None, [(row["key"], row["repetition"])])
+    assert (back["iterations"], back["seed"]) == (2**63 - 1, -(2**63))
+
+
 def test_hashes_of_data_files_by_study_and_label(path):
     made = rows(200)
     append(path, made)

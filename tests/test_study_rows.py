@@ -25,9 +25,9 @@ def test_synthetic_rows_hold_every_outcome_but_error_and_false_claims():
 
 def test_non_finite_numbers_become_empty():
     row = dict(rows(1)[0])
-    row["objective"], row["gap"], row["bound"] = math.nan, math.inf, np.float64(-math.inf)
+    row["objective"], row["gap"], row["bound"], row["scale"] = math.nan, math.inf, np.float64(-math.inf), 10**400
     done = complete(row)
-    assert done["objective"] is done["gap"] is done["bound"] is None
+    assert done["objective"] is done["gap"] is done["bound"] is done["scale"] is None
     assert as_json([1.0, math.nan, np.array([math.inf, 2.0])]) == "[1.0, null, [null, 2.0]]"
 
 
@@ -43,6 +43,9 @@ def test_numpy_scalars_become_plain_numbers():
     ({"status_verified": "ok"}, "status_verified 'ok'"),
     ({"key": None}, "'key' needs a value"),
     ({"accuracy": math.nan}, "'accuracy' needs a value"),
+    ({"iterations": 2**63}, "'iterations' holds whole numbers of 64 bits; this one has more"),
+    ({"seed": -(2**63) - 1}, "'seed' holds whole numbers of 64 bits"),
+    ({"unknowns": 1e300}, "'unknowns' holds whole numbers of 64 bits"),
     ({"iterations": 1.5}, "'iterations' holds a integer"),
     ({"proved": 1}, "'proved' holds a flag"),
     ({"objective": "1.0"}, "'objective' holds a number"),

@@ -46,6 +46,7 @@ FAILURES = {
     "raise": ("error", "KeyError: 'no such thing'"),
     "garbage": ("error", "TypeError"),
     "partial": ("error", "is no row: .*needs a value in every row"),
+    "vast": ("error", "is no row: column 'iterations' holds whole numbers of 64 bits"),
     "other": ("error", "is no row: it is of another cell"),
 }
 
