@@ -18,18 +18,17 @@ def resident_mb() -> float:
 class Peak:
     """Largest resident memory of this process since the object was made.
 
-    Linux keeps the figure and lets a process reset it. Elsewhere it is the largest of the whole life of the process
-    where that grew meanwhile, and the larger of start and end where it did not.
+    Linux keeps the figure and lets a process reset it. Where it does not, it is the largest of the whole life of the
+    process where that grew meanwhile, and the larger of start and end where it did not.
     """
 
     def __init__(self) -> None:
-        self.start = resident_mb()
+        self.start, self._before = resident_mb(), _lifetime_mb()
         try:
             _CLEAR.write_text("5")
             self._exact = True
         except OSError:
             self._exact = False
-            self._before = _lifetime_mb()
 
     def mb(self) -> float:
         """Return the peak until now, in MB."""
