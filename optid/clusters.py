@@ -116,12 +116,8 @@ def _greets(connection: socket.socket) -> bool:
     return len(greeting) == 8 and int.from_bytes(greeting, "little") < 1 << 20
 
 
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions that this process has: Python, each distribution, and a digest of optid's source files."""
-    return _reader(packages)()
-
-
 def _reader(packages: Sequence[str]) -> Callable[[], dict[str, str]]:
+    """What reads the versions of a process: Python, each distribution, and a digest of optid's source files."""
     names, sources = tuple(packages), SOURCES
 
     def read() -> dict[str, str]:  # nested: it travels by value, and so runs where optid is not installed
@@ -157,8 +153,8 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
                      for name in here if there.get(name) != here[name])
 
 
-def check_workers(client: Any, packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of this process once every worker is known to have the same.
+def check_workers(client: Any, packages: Sequence[str]) -> None:
+    """Refuse workers that have other versions than this process.
 
     Raises:
         ClusterError: no worker, or the first one that differs, with the difference.
@@ -170,7 +166,7 @@ def check_workers(client: Any, packages: Sequence[str]) -> dict[str, str]:
             address = client.scheduler.address
             raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
         if not (refusal := _differences(here, there)):
-            return here
+            return
     raise ClusterError(refusal)
 
 
