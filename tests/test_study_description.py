@@ -78,6 +78,8 @@ BAD = [
     ("accuracy = 2.0", 1, 12, "between 0 and 1"),
     ("accuracy = [1e-4,\n  'tight']", 2, 3, "between 0 and 1"),
     ("time_limit = '60'", 1, 14, "the text '60' is not"),
+    ("time_limit = " + 400 * "9", 1, 14, "positive number of seconds; a number of more than 60 digits is not"),
+    ("seeds = [" + 80 * "9" + "]", 1, 10, "must be below 2**62"),
     ("time_limit = inf", 1, 14, "positive number of seconds"),
     ("memory_limit = 0", 1, 16, "positive number of MB"),
     ("repetitions = 1.5", 1, 15, "whole number from 1"),
@@ -148,6 +150,11 @@ def test_what_is_missing_altogether():
 ])
 def test_what_is_not_toml_has_its_place(text, place):
     assert problems(text)[0].startswith(place)
+
+
+def test_a_number_that_python_does_not_read_is_told():
+    (told,) = problems("time_limit = " + 5000 * "9")
+    assert "Exceeds the limit" in told
 
 
 def test_files_that_are_not_there_or_not_text(tmp_path):
@@ -388,6 +395,25 @@ def test_data_that_changed_are_refused(rig):
     assert after[0].key != before[0].key
     with pytest.raises(StudyError, match=r"(?s)rig: .*rig.csv.*--accept-changed-data"):
         grid.check_unchanged(after, hashes)
+
+
+def test_the_content_of_a_file_is_what_sha256sum_says(rig):
+    import hashlib
+
+    digest = hashlib.sha256((rig / "rig.csv").read_bytes())
+    assert grid.content_hash(DataEntry("x", (str(rig / "rig.csv"),))) == digest.hexdigest()
+    assert (grid.content_hash(DataEntry("x", (str(rig / "rig.csv"),) * 2))
+            == hashlib.sha256(2 * digest.digest()).hexdigest())
+    assert grid.content_hash(DataEntry("x", system="linear")) == ""
+
+
+def test_a_file_that_went_after_it_was_checked_is_told(rig):
+    study = Study("t", data={"file": "rig.csv", "inputs": "current", "outputs": "thrust"}, solvers="auto",
+                  formulations={"formulation": "arx", "na": 2, "nb": 1}, folder=rig)
+    study.check_data()
+    (rig / "rig.csv").unlink()
+    with pytest.raises(StudyError, match="study 't': .*rig.csv cannot be read: No such file"):
+        grid.cells(study)
 
 
 def test_records_in_memory_have_a_content():

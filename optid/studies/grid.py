@@ -32,7 +32,7 @@ class Cell:
         formulation: label of the formulation entry.
         solver: label of the solver entry.
         data_source: where the record comes from, its file names absolute.
-        data_hash: sha256 of the bytes of the files or of the record in memory; empty for a simulated system.
+        data_hash: sha256 of the data file, see `content_hash`; empty for a simulated system.
         samples: length of a simulated record; None for a file.
         noise: relative standard deviation of its noise; None for a file.
         seed: of its simulation; None for a file.
@@ -88,7 +88,11 @@ def cells(study: Study) -> list[Cell]:
     """
     study.check_data()
     found: list[Cell] = []
-    sources = [(located(entry, study.folder), content_hash(entry, study.folder)) for entry in study.data]
+    entries = [located(entry, study.folder) for entry in study.data]
+    try:
+        sources = [(entry, content_hash(entry)) for entry in entries]
+    except OSError as error:  # it was there when the data were checked
+        raise StudyError(f"study {study.name!r}: {error.filename} cannot be read: {error.strerror}") from error
     for (entry, content), samples, noise, seed in _records(sources, study.seeds):
         for formulation in study.formulations:
             if formulation.data and entry.name not in formulation.data:
@@ -137,15 +141,24 @@ def located(entry: DataEntry, folder: Path) -> DataEntry:
     return replace(entry, files=tuple(str((folder / name).resolve()) for name in entry.files))
 
 
-def content_hash(entry: DataEntry, folder: Path) -> str:
-    """Return the sha256 (hex) of the bytes of the files or of the record in memory; empty for a simulated system."""
+def content_hash(entry: DataEntry) -> str:
+    """Return the sha256 (hex) of a data file, of the sha256 of several, or of a record in memory.
+
+    Args:
+        entry: its file names absolute; empty is returned for a simulated system.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
     if entry.record is not None:
         return _hash_of_record(entry.record)
-    digest = hashlib.sha256()
+    digests = []
     for name in entry.files:
-        with open(folder / name, "rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest() if entry.files else ""
+        with open(name, "rb") as file:
+            digests.append(hashlib.file_digest(file, "sha256"))
+    if len(digests) > 1:
+        return hashlib.sha256(b"".join(digest.digest() for digest in digests)).hexdigest()
+    return digests[0].hexdigest() if digests else ""
 
 
 def _hash_of_record(data: Data) -> str:

@@ -1,5 +1,6 @@
 """What is wrong with the description of a study, collected so that everything is told at once."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -82,7 +83,7 @@ class Problems(list[Problem]):
     def number(self, path: Path, value: Any, what: str, low: float, high: float = np.inf, *, closed: bool = False
                ) -> float | None:
         """Return a number between low and high, itself included where `closed`, or note a problem."""
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
         if fits and (low < value < high or (closed and value == low)):
             return float(value)
         self.add(path, f"{_last_word(path)} is {what}; {shown(value)} is not")
@@ -93,7 +94,7 @@ class Problems(list[Problem]):
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
             if value < LARGEST:
                 return int(value)
-            self.add(path, f"{_last_word(path)} = {value} is too large: it must be below 2**62")
+            self.add(path, f"{_last_word(path)} is too large: it must be below 2**62; {shown(value)} is not")
             return None
         whole = isinstance(value, float) and value.is_integer() and value >= low
         self.add(path, f"{_last_word(path)} is a whole number from {low}; "
@@ -131,6 +132,8 @@ def shown(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, Mapping):
         return "a table"
+    if isinstance(value, int) and value.bit_length() > 200:  # Python does not even write one of 5000 digits
+        return "a number of more than 60 digits"
     text = repr(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= 60 else text[:57] + "..."
 

@@ -12,6 +12,7 @@ from optid.studies.definition.problems import Problems
 from optid.studies.definition.trial import Records, note_impossible, note_unreadable
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
+_END = " (at end of document)"
 
 
 def read_study(path: Path) -> Study:
@@ -40,7 +41,7 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
     text = text.replace("\r\n", "\n")
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # what is not TOML, and a whole number of so many digits that Python does not read it
         raise StudyError(f"{label} has a problem:\n  {_syntax(str(error), text)}") from None
     positions, problems = locate(text), Problems()
     found = {"name": title, **read(raw, problems)}
@@ -60,7 +61,9 @@ def _syntax(message: str, text: str) -> str:
     found = _PLACE.fullmatch(message)
     if found:
         return f"line {found[2]}, column {found[3]}: {found[1][:1].lower()}{found[1][1:]}"
+    if not message.endswith(_END):
+        return message
     last = text.rstrip("\n")
     line = last.count("\n") + 1
     column = len(last) - last.rfind("\n")
-    return f"line {line}, column {column}: {message.removesuffix(' (at end of document)')}, at the end of the file"
+    return f"line {line}, column {column}: {message.removesuffix(_END)}, at the end of the file"

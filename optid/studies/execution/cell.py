@@ -11,7 +11,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -189,7 +188,7 @@ def _loaded(cell: Cell) -> Record:
     entry = cell.data_source
     identity = (cell.data_hash, entry.system, cell.samples, cell.noise, cell.seed, cell.holdout, as_json(entry.options))
     if identity not in _records:
-        if entry.files and content_hash(entry, Path()) != cell.data_hash:
+        if entry.files and content_hash(entry) != cell.data_hash:
             raise DataError(f"{', '.join(entry.files)}: not the content that the study started with; it changed since, "
                             "or this machine has another file of that name")
         _records[identity] = load(cell)

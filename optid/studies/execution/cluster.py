@@ -185,7 +185,7 @@ class _Flight:
                 return lost_row(cell, ERROR, f"a worker does not have {names}, which is too large to be sent there "
                                              f"({size / 1e6:.0f} MB): put it where every worker sees the same path")
             contents = [Path(name).read_bytes() for name in entry.files]
-            if content_hash(entry, Path()) != cell.data_hash:
+            if content_hash(entry) != cell.data_hash:
                 return lost_row(cell, ERROR, f"{names} changed while the study ran")
         except OSError as error:
             return lost_row(cell, ERROR, f"a worker does not have {names}, and it cannot be sent there: {error}")

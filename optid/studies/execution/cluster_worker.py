@@ -134,6 +134,6 @@ def _hash(files: tuple[str, ...], _: tuple[tuple[int, int], ...]) -> str:
     from optid.studies.definition.description import DataEntry
 
     try:
-        return content_hash(DataEntry(name="files", files=files), Path())
+        return content_hash(DataEntry(name="files", files=files))
     except OSError as error:
         return f"unreadable: {error}"
