@@ -3,7 +3,8 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,8 @@ ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
 OUTCOMES = {
     DONE: "the fit ran to its end and was judged; `status_verified` says with what result",
     TIME_LIMIT: "the worker was killed because the cell took longer than its time limit",
-    MEMORY_LIMIT: "the worker was killed because it held more memory than the limit",
+    MEMORY_LIMIT: "the worker held more memory than the limit, for which it was killed where that was seen in time, or "
+                  "the machine gave it no more",
     CRASHED: "the worker died: segmentation fault, abort, kill by another hand",
     ERROR: "the cell could not be run: unreadable record, wrong argument, an exception outside the solver",
     REFUSED: "the solver cannot take this formulation, or is not installed; nothing was run",
@@ -151,6 +153,8 @@ COLUMNS: tuple[Column, ...] = (
 NAMES: tuple[str, ...] = tuple(column.name for column in COLUMNS)
 BY_NAME: Mapping[str, Column] = {column.name: column for column in COLUMNS}
 
+LARGEST = 2**63  # what a whole number in the database is below
+
 _TYPES: Mapping[str, tuple[type, ...]] = {"text": (str,), "json": (str,), "number": (float, int), "integer": (int,),
                                           "flag": (bool,), "time": (str,)}
 
@@ -165,8 +169,8 @@ def complete(values: Mapping[str, Any]) -> dict[str, Any]:
         values: {column: value}; numpy scalars are taken as the numbers they are.
 
     Raises:
-        ValueError: unknown column, value of another type, unknown outcome or status, or no value where every row has
-            one.
+        ValueError: unknown column, value of another type, whole number that the database cannot hold, unknown outcome
+            or status, or no value where every row has one.
     """
     unknown = sorted(set(values) - set(NAMES))
     if unknown:
@@ -183,6 +187,8 @@ def _cell_value(column: Column, value: Any) -> Any:
     value = value.item() if hasattr(value, "item") else value
     if value is None and column.always and column.kind == "flag":
         return False
+    if column.kind == "number" and isinstance(value, int) and abs(value) > sys.float_info.max:
+        value = math.inf
     if column.kind in ("number", "integer") and isinstance(value, float) and not math.isfinite(value):
         value = None
     if column.kind == "integer" and isinstance(value, float) and value.is_integer():
@@ -193,6 +199,8 @@ def _cell_value(column: Column, value: Any) -> Any:
         return None
     if isinstance(value, bool) != (column.kind == "flag") or not isinstance(value, _TYPES[column.kind]):
         raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
+    if column.kind == "integer" and not -LARGEST <= value < LARGEST:
+        raise ValueError(f"column {column.name!r} holds whole numbers of 64 bits; this one has more")
     if isinstance(value, str):  # a solver's words may hold bytes that are no text
         return value.encode(errors="replace").decode().replace("\0", "")
     return float(value) if column.kind == "number" else value
@@ -222,7 +230,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def markdown(columns: Iterable[Column] = COLUMNS) -> str:
+def markdown() -> str:
     """Return the documentation of the schema as two Markdown tables: columns and outcomes."""
     lines = ["# The rows of a study", "",
              f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the DuckDB "
@@ -232,6 +240,6 @@ def markdown(columns: Iterable[Column] = COLUMNS) -> str:
              "study has again; the text of the study file is in `studies`, the schema version in `meta`.", "",
              "| column | type | unit | meaning |", "|---|---|---|---|"]
     lines += [f"| `{c.name}` | {c.sql}{' (JSON)' if c.kind == 'json' else ''}{' NOT NULL' if c.always else ''} "
-              f"| {c.unit} | {c.meaning} |" for c in columns]
+              f"| {c.unit} | {c.meaning} |" for c in COLUMNS]
     lines += ["", "| outcome | meaning |", "|---|---|", *(f"| {word} | {text} |" for word, text in OUTCOMES.items())]
     return "\n".join(lines) + "\n"
