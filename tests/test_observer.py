@@ -90,6 +90,26 @@ def test_step_is_least_squares_on_the_recursion(gain, feedback, offset):
     assert np.array_equal(d, best[4:6]) if offset else not d.any()
 
 
+@pytest.mark.parametrize("kind", ["noisy", "injected", "exact"])
+def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch, kind):
+    records = records_of(np.random.default_rng(6), [900, 700], holes=0 if kind == "exact" else 4)
+    gain = observer_gain(A, C) if kind == "injected" else np.zeros((2, 2))
+    form = ObserverForm(A, C, gain, expansion_of(records, kind != "exact"), 2, (True, True), True, np.array([1.0, 3.0]))
+    if kind == "exact":  # the Gram matrix would know half the digits of what remains
+        z = np.random.default_rng(7).normal(size=form.size)
+        for e, record in enumerate(records):
+            record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
+    step = observer_problem(records, form)
+    monkeypatch.setattr("optid.subspace.observer.MANY", np.inf)
+    stacked = observer_problem(records, form)
+    scale = np.sqrt(np.outer(np.diag(stacked.problem.H), np.diag(stacked.problem.H)))
+    np.testing.assert_allclose(step.problem.H / scale, stacked.problem.H / scale, atol=1e-11)
+    np.testing.assert_allclose(step.least_squares(), stacked.least_squares(), atol=1e-10)
+    assert step.problem.remainder == pytest.approx(stacked.problem.remainder, rel=1e-9)
+    assert (step.problem.remainder < 1e-24 * step.problem.c) == (kind == "exact")
+    assert step.rows == stacked.rows and step.problem.c == pytest.approx(stacked.problem.c)
+
+
 def test_missing_outputs_without_feedback_leave_the_state_alone():
     records = records_of(np.random.default_rng(1), [60])
     expansion = expansion_of(records, False)

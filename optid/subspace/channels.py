@@ -34,7 +34,8 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
         if count <= len(names) + 1:
             raise DataError(f"only {count} samples have all {kind}s at once: {len(names)} {kind}s cannot be told apart "
                             "from so few.")
-        root = root_of_gram(np.sum([rows.T @ rows for rows in _with_constant(parts)], axis=0), len(names) + 1)
+        root = np.zeros((len(names) + 1, len(names) + 1))
+        root = root_of_gram(sum((rows.T @ rows for rows in _with_constant(parts)), root), len(root))
         if not conditioning(root) <= CONDITION_LIMIT:
             root = reduce(add_to_root, _with_constant(parts), np.zeros_like(root))
         for c, name in enumerate(names, start=1):

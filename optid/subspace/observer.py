@@ -244,7 +244,7 @@ class _Regressors:
         given = (self.form.weights * run[:, self.y])[~np.isnan(run[:, self.y])]
         root = np.zeros((size, size))
         if given.size > MANY * size:
-            root = root_of_gram(np.sum([rows.T @ rows for rows in self._weighted(run)], axis=0), size - 1)
+            root = root_of_gram(sum((rows.T @ rows for rows in self._weighted(run)), root), size - 1)
         if not conditioning(root) <= CONDITION_LIMIT:
             root = reduce(add_to_root, self._weighted(run), np.zeros((size, size)))
         return root, given.size, float(given @ given)
