@@ -99,3 +99,28 @@ def _row(rng: np.random.Generator, k: int, turn: int, data: str, formulation: st
 def hash_of(*labels: Any) -> int:
     """A number that depends on the labels alone, not on the process."""
     return int(place(*labels)[:8], 16)
+
+
+# ---- rows by hand, for the tests of a verdict
+
+
+def run(solver, problem=0, data="tank", seconds=1.0, *, formulation="exact", objective: float | None = 1.0, **more):
+    """One row: solved unless said otherwise."""
+    return {"study": "s", "data": data, "formulation": formulation, "solver": solver, "seed": problem, "samples": 1000,
+            "noise": 0.1, "n_samples": 1000, "accuracy": 1e-8, "outcome": "done", "status_claimed": "optimal",
+            "status_verified": "optimal", "objective": objective, "scale": 10.0, "solve_s": seconds, "violation": 0.0,
+            "stationarity": 1e-10, "time_limit": 60.0, "false_claim": False, "proved": True, **more}  # fmt: skip
+
+
+def table_of(times, **more):
+    """Rows of times (P, S), solvers a, b, ...; NaN fails."""
+    return [run("abcdefgh"[s], p, seconds=t, **more) if np.isfinite(t) else
+            run("abcdefgh"[s], p, seconds=1.0, status_verified="failed", reason="gave up", **more)
+            for p, row in enumerate(times) for s, t in enumerate(row)]  # fmt: skip
+
+
+def times_of(*factors, problems=20, spread=0.1, seed=0):
+    """Times (P, S) of solvers that take so many times a time that differs from problem to problem."""
+    rng = np.random.default_rng(seed)
+    base = np.exp(rng.normal(size=(problems, 1)))
+    return base * np.array(factors) * np.exp(spread * rng.normal(size=(problems, len(factors))))

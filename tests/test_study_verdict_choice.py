@@ -1,0 +1,275 @@
+"""Who is recommended, and in which words."""
+
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from study_rows import run, table_of, times_of
+
+from optid.studies.verdicts.averages import paired_ratio
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
+from optid.studies.verdicts.profiles import time_ratios
+from optid.studies.verdicts.verdict import conclude
+
+NAN = float("nan")
+
+
+def test_the_faster_of_the_reliable_comes_first():
+    choice = conclude(table_of(times_of(1.0, 3.0, 2.0))).overall.choice
+    assert choice.kind == FIRST and choice.first == "a"
+    assert choice.against["c"].value == pytest.approx(2.0, rel=0.1)
+
+
+def test_reliability_goes_before_speed_and_the_quick_one_is_named():
+    times = times_of(1.0, 0.2)
+    times[:5, 1] = NAN  # five problems to none: a probability of 1/32
+    verdict = conclude(table_of(times))
+    assert verdict.recommended == ("a",)
+    value = verdict.overall.choice.against["b"].value
+    assert f"The next, b, solved only 15, in {value:.3g} × the time" in verdict.headline.text
+    third = np.column_stack([times, 9 * times[:, 0]])
+    assert "b is" in (text := conclude(table_of(third)).headline.text) and "solved only 15 of 20 problems" in text
+
+
+def test_one_failure_more_is_no_lack_of_reliability():
+    times = times_of(1.0, 0.002)
+    times[0, 1] = NAN
+    headline = conclude(table_of(times)).headline
+    assert headline.word == "Use b" and "b reached the accuracy on 19 of 20 problems" in headline.text
+    assert "The next, a, solved 20, no difference beyond chance or 1 %, and takes" in headline.text
+    third = np.column_stack([0.004 * times[:, 0], times[:, 1], times[:, 0]])
+    third[:2, 0] = NAN
+    assert "c solved 20, no difference beyond chance" in conclude(table_of(third)).headline.text
+
+
+def test_who_refuses_many_and_is_ahead_is_for_where_it_runs():
+    for limit, word in ((14, "Solves most: a"), (16, "Use a where it runs")):
+        rows = table_of(times_of(1.0, 3.0, problems=60))
+        for row in rows:
+            if row["seed"] < 30 and (row["solver"] == "a") == (row["seed"] < limit):
+                row |= {"outcome": "refused", "status_verified": None, "objective": None}
+        assert conclude(rows).headline.word == word
+
+
+def test_failures_by_chance_do_not_decide_and_those_beyond_it_do():
+    rng = np.random.default_rng(5)
+
+    def first(fail_slow, fail_fast):
+        times = np.exp(0.1 * rng.normal(size=(40, 2))) * [5.0, 0.1]
+        times[rng.random((40, 2)) < [fail_slow, fail_fast]] = NAN
+        return choose(times, ("slow", "fast"), 0.1, paired_ratio, none=1.0).first
+
+    assert sum(first(0.05, 0.05) == "slow" for _ in range(300)) / 300 <= 0.05
+    assert sum(first(0.02, 0.35) == "slow" for _ in range(100)) / 100 >= 0.95
+
+
+def test_who_is_faster_than_the_leader_of_the_common_problems_is_not_called_tied():
+    """The mean on the problems that all solve misleads where they are few and unlike the others."""
+    rng = np.random.default_rng(0)
+    times = np.full((100, 3), NAN)
+    times[:60, 0] = 1.0
+    times[:10, 1], times[10:50, 1], times[50:60, 1] = 1.2, 0.6, 1.2
+    times[:10, 2] = times[52:100, 2] = 3.0
+    times *= np.exp(0.05 * rng.normal(size=times.shape))
+    choice = choose(times, ("a", "b", "c"), 0.1, paired_ratio, none=1.0)
+    assert paired_ratio(times[:, 1], times[:, 0]).high < 0.9
+    assert (choice.kind, choice.first, choice.tied) == (FIRST, "b", ())
+
+
+def test_an_order_that_goes_in_a_circle_cannot_be_told():
+    times = np.full((30, 3), NAN)
+    for k, (one, other) in enumerate([(0, 1), (1, 2), (2, 0)]):
+        times[10 * k : 10 * k + 10, one], times[10 * k : 10 * k + 10, other] = 1.0, 2.0
+    verdict = conclude(table_of(times))
+    assert verdict.headline.word == "Cannot tell" and "goes in a circle: each of a, b and c" in verdict.headline.text
+    assert verdict.recommended == ()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_nobody_is_ahead_of_the_first(seed):
+    rng = np.random.default_rng(seed)
+    times = np.exp(rng.normal(size=(40, 4)) * 0.2 + rng.normal(size=4) * 0.3)
+    times[rng.random(times.shape) < rng.choice([0.02, 0.2, 0.5])] = NAN
+    choice = choose(times, tuple("abcd"), 0.1, paired_ratio, none=1.0)
+    for name in choice.candidates:
+        if choice.first and name != choice.first:
+            pair = choice.against[name]
+            assert not (pair.enough and pair.high < 1 and pair.value < 1 / 1.1)
+            assert (name in choice.tied) == (not (pair.enough and pair.low > 1 and pair.value > 1.1))
+
+
+def test_who_fails_on_most_problems_is_not_recommended():
+    rows = [run(s, p, formulation=f, status_verified="optimal" if p < limit else "failed")
+            for f in "fg" for p in range(20) for s, limit in (("a", 6), ("b", 4))]  # fmt: skip
+    verdict = conclude(rows)
+    assert verdict.headline.word == "No solver can be recommended" and verdict.headline.tone == "bad"
+    assert "12 of 40 problems" in verdict.headline.text and verdict.recommended == ()
+    assert all(section.recommended == () for section in verdict.sections)
+    few = [run(s, p, status_verified="optimal" if (s, p) == ("a", 0) else "failed") for p in range(100) for s in "ab"]
+    assert conclude(few).headline.word == "No solver can be recommended"
+
+
+def test_the_tone_of_one_solver_for_every_formulation_is_that_of_its_figures():
+    times = times_of(1.0, 3.0, problems=40)
+    times[:8, 0], times[:16, 1] = NAN, NAN
+    headline = conclude(table_of(times) + table_of(times, formulation="linear")).headline
+    assert (headline.word, headline.tone) == ("Use a", "fair") and "64 of 80 problems" in headline.text
+    only = table_of(times) + table_of(times[:, ::-1], formulation="linear")
+    assert conclude(only).headline.tone == "fair"
+
+
+def test_ties_are_called_ties():
+    verdict = conclude(table_of(times_of(1.0, 1.0, 4.0)))
+    assert verdict.headline.word == "A tie: a and b" or verdict.headline.word == "A tie: b and a"
+    trifle = conclude(table_of(times_of(1.0, 1.05, spread=1e-3)))
+    assert trifle.overall.choice.kind == TIE  # certain, but below 10 %
+
+
+def test_too_few_problems_cannot_tell_and_say_how_many_are_needed():
+    for problems in (1, 2, 5):
+        verdict = conclude(table_of(times_of(1.0, 9.0, problems=problems)))
+        assert verdict.overall.choice.kind == CANNOT_TELL and not verdict.recommended
+        assert "at least 6 problems" in verdict.headline.text and verdict.headline.word == "Cannot tell yet"
+    assert conclude(table_of(times_of(1.0, 9.0, problems=6))).recommended == ("a",)
+
+
+def test_a_wide_interval_is_no_tie():
+    times = np.ones((8, 2))
+    times[:, 1] = [0.05, 40.0, 0.1, 20.0, 9.0, 0.2, 30.0, 5.0]
+    verdict = conclude(table_of(times))
+    assert verdict.overall.choice.kind == CANNOT_TELL and not verdict.recommended
+    assert "needs more than 8 problems to tell a and b apart" in verdict.headline.text
+
+
+def test_too_few_problems_in_common_cannot_tell():
+    times = times_of(1.0, 9.0, problems=400)
+    times[:2, 0] = times[2:, 1] = NAN
+    choice = conclude(table_of(times)).overall.choice
+    assert choice.kind == FIRST and choice.first == "a"  # b is not as reliable
+    split = np.full((20, 2), NAN)
+    split[:10, 0] = split[10:, 1] = 1.0
+    choice = conclude(table_of(split)).overall.choice
+    assert choice.kind == CANNOT_TELL and "a problem that a and b all solve" in choice.missing
+
+
+def test_a_solver_that_never_solved_anything_is_never_recommended():
+    times = times_of(1.0, 1.0)
+    times[:, 1] = NAN
+    verdict = conclude(table_of(times))
+    assert verdict.recommended == ("a",) and "b" not in verdict.overall.choice.candidates
+    (never,) = [s.text for s in verdict.statements if s.word == "Never reached the accuracy"]
+    assert "b: 20 problems, failed 20" in never
+    nobody = conclude(table_of(np.full((8, 2), NAN)))
+    assert nobody.overall.choice.kind == NOBODY and not nobody.recommended and nobody.headline.tone == "bad"
+    assert "No solver can be recommended" == nobody.headline.word
+
+
+def test_a_lie_is_a_failure_and_is_listed():
+    rows = table_of(times_of(1.0, 3.0))
+    for row in rows:
+        if row["solver"] == "a" and row["seed"] < 15:
+            row |= {"false_claim": True, "status_verified": "inaccurate", "reason": f"violation {row['seed']}e-3"}
+    verdict = conclude(rows)
+    assert verdict.recommended == ("b",)
+    (claim,) = verdict.false_claims
+    assert (claim.solver, claim.count, claim.claimed) == ("a", 15, "optimal")
+    assert verdict.overall.standing("a").false_claims == 15 and verdict.overall.standing("a").solved == 5
+    (failure,) = verdict.failures
+    assert failure.count == 15 and failure.reason == "violation …"
+
+
+def test_a_claim_of_infeasibility_that_a_verified_point_contradicts_is_listed():
+    rows = table_of(times_of(1.0, 3.0))
+    rows[1] |= {"status_verified": "infeasible", "status_claimed": "primal infeasible", "objective": None}
+    verdict = conclude(rows)
+    (claim,) = verdict.false_claims
+    assert claim.solver == "b" and claim.reason == "a has a verified point"
+    assert verdict.overall.standing("b").false_claims == 1
+
+
+def test_a_proof_that_another_point_contradicts_is_reported():
+    rows = [run(s, p, bound=1.0) for s in "ab" for p in range(7)]
+    assert not any(s.about == "claims" for s in conclude(rows).statements)
+    rows.append(run("c", 0, objective=0.9))
+    assert any(s.word == "A proof is contradicted" for s in conclude(rows).statements)
+
+
+def test_one_solver_only_is_said():
+    verdict = conclude(table_of(times_of(1.0)))
+    assert verdict.overall.choice.kind == ONLY_ONE and verdict.headline.word == "Only one solver"
+    assert not verdict.recommended
+
+
+def test_it_depends_on_the_formulation_where_it_does():
+    rows = table_of(times_of(1.0, 5.0), formulation="exact") + table_of(times_of(5.0, 1.0), formulation="linear")
+    for row in rows:
+        if row["formulation"] == "exact" and row["solver"] == "b":
+            row |= {"outcome": "refused", "status_verified": None, "objective": None}
+        if row["formulation"] == "linear" and row["solver"] == "a":
+            row |= {"outcome": "refused", "status_verified": None, "objective": None}
+    verdict = conclude(rows)
+    assert verdict.headline.word == "a for exact; b for linear"
+    assert [section.choice.kind for section in verdict.sections] == [ONLY_ONE, ONLY_ONE]
+    few = [row for row in rows if row["formulation"] == "exact" or row["seed"] < 3]
+    headline = conclude(few).headline
+    assert headline.word == "a for exact; b for linear" and headline.tone == "good"  # each the only one to take it
+    short = table_of(times_of(1.0, 5.0)) + table_of(times_of(NAN, 1.0, 2.0, problems=3), formulation="linear")
+    headline = conclude(short).headline
+    assert headline.word == "a for exact" and "For 1 of 2 formulations it cannot be told" in headline.text
+    ahead = table_of(times_of(1.0, 9.0, problems=90)) + table_of(times_of(2.0, 1.0, problems=9), formulation="linear")
+    assert conclude(ahead).overall.choice.first == "a"  # on the whole, but not everywhere
+    assert conclude(ahead).headline.word == "a for exact; b for linear"
+    same = conclude(table_of(times_of(1.0, 5.0)) + table_of(times_of(1.0, 5.0), formulation="linear"))
+    assert same.headline.word == "Use a" and same.recommended == ("a",)
+
+
+def test_a_standing_counts_what_it_says():
+    times = np.array([[1.0, 2.0], [4.0, 1.0], [3.0, NAN], [2.0, 2.0], [1.0, 8.0], [1.0, 2.0]])
+    verdict = conclude(table_of(times))
+    a, b = verdict.overall.standing("a"), verdict.overall.standing("b")
+    assert (a.solved, a.problems, a.fastest) == (6, 6, 5) and (b.solved, b.problems, b.fastest) == (5, 6, 2)
+    expected = np.exp(np.mean(np.log(np.array([2.0, 1, 60, 2, 8, 2]) + 0.01))) - 0.01
+    assert b.penalised == pytest.approx(expected) and b.failures == {"failed": 1}
+    rows = [{**row, "time_limit": None} for row in table_of(times)]
+    assert conclude(rows).overall.standing("b").penalised == np.inf  # a failure of unknown cost is not left out
+    assert a.share == 1.0 and b.against is not None and b.against.n == 5
+
+
+@pytest.mark.parametrize("problems", [6, 12, 60])
+def test_equal_solvers_are_seldom_told_apart(problems):
+    rng = np.random.default_rng(problems)
+    kinds = []
+    for _ in range(400):
+        times = np.exp(rng.normal(size=(problems, 1)) + 0.4 * rng.normal(size=(problems, 2)))
+        kinds.append(choose(times, ("a", "b"), 0.1, paired_ratio, none=1.0).kind)
+    assert kinds.count(FIRST) / 400 <= 0.075
+    assert kinds.count(TIE) / 400 >= {6: 0.35, 12: 0.85, 60: 0.925}[problems]  # of few problems some cannot be told
+    assert kinds.count(FIRST) + kinds.count(TIE) + kinds.count(CANNOT_TELL) == 400
+
+
+def test_solvers_that_differ_are_told_apart():
+    rng = np.random.default_rng(1)
+    first = [choose(np.exp(0.4 * rng.normal(size=(30, 2)) + [0.0, 0.5]), ("a", "b"), 0.1, paired_ratio, none=1.0)
+             for _ in range(200)]  # fmt: skip
+    assert sum(c.kind == FIRST and c.first == "a" for c in first) / 200 > 0.9
+    assert not any(c.kind == FIRST and c.first == "b" for c in first)
+
+
+def test_numbers_of_one_thing_are_singular():
+    rows = [run("a", 0, status_verified="failed"), run("b", 0, status_verified="failed")]
+    assert "on the only problem (failed 2)" in conclude(rows).headline.text
+    rows = [run("a", bound=1.0), run("b", objective=0.9)]
+    assert any(s.text.startswith("On 1 problem a proved") for s in conclude(rows).statements)
+
+
+def test_names_are_listed_as_in_a_sentence():
+    texts = [listed(list("abcdef"[:k])) for k in (0, 1, 2, 4, 6)]
+    assert texts == ["", "a", "a and b", "a, b, c and d", "a, b, c and 3 more"]
+    assert listed(["free", "monotone, odd"]) == "\u201cfree\u201d and \u201cmonotone, odd\u201d"
+
+
+def test_choose_alone_has_nothing_to_choose_from_nothing():
+    assert choose(np.zeros((0, 0)), (), 0.1, paired_ratio, none=1.0).kind == NOBODY
+    np.testing.assert_array_equal(time_ratios(np.array([[NAN, NAN]])), [[np.inf, np.inf]])

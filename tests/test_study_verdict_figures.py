@@ -1,0 +1,293 @@
+"""Profiles, averages, ranks, growth and agreement of a verdict, every figure by an independent route."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from study_rows import run
+
+from optid.studies.verdicts.agreement import agreement_matrix, model_distance
+from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
+from optid.studies.verdicts.growth import time_growth
+from optid.studies.verdicts.outcomes import columns, tabulate
+from optid.studies.verdicts.profiles import performance_profiles
+from optid.studies.verdicts.ranks import (
+    MINIMUM_DATA_SETS,
+    critical_difference,
+    friedman,
+    rank_over_data_sets,
+    ranks_of_problems,
+    signed_ranks,
+)
+
+NAN = float("nan")
+
+# Ranks of four classifiers on 14 data sets: table 6 of Demsar (2006).
+DEMSAR = np.array([[4, 3, 2, 1], [1, 2, 3, 4], [4, 1, 2, 3], [4, 1, 3, 2], [4, 2, 3, 1], [1, 2.5, 4, 2.5], [3, 2, 4, 1],
+                   [2.5, 2.5, 4, 1], [4, 3, 2, 1], [2.5, 2.5, 2.5, 2.5], [4, 2.5, 1, 2.5], [3, 2, 4, 1], [4, 1, 2, 3],
+                   [3, 1, 4, 2]])  # fmt: skip
+# AUC of C4.5 and C4.5+m on the same data sets: table 2 there.
+C45 = np.array([.763, .599, .954, .628, .882, .936, .661, .583, .775, 1.0, .940, .619, .972, .957])
+C45M = np.array([.768, .591, .971, .661, .888, .931, .668, .583, .838, 1.0, .962, .666, .981, .978])
+
+
+# ---- profiles and averages
+
+
+def test_the_profile_equals_its_definition_counted_by_hand():
+    times = np.array([[1.0, 2.0], [4.0, 1.0], [3.0, NAN], [NAN, NAN]])
+    a, b = performance_profiles(times)
+    assert [a(t) for t in (0.9, 1, 3.9, 4, 100)] == [0, 0.5, 0.5, 0.75, 0.75]
+    assert [b(t) for t in (1, 1.9, 2, 100)] == [0.25, 0.25, 0.5, 0.5]
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_profiles_against_brute_force_and_their_invariances(seed):
+    rng = np.random.default_rng(seed)
+    times = np.round(np.exp(rng.normal(size=(rng.integers(1, 15), rng.integers(1, 5)))), 1) + 0.1
+    times[rng.random(times.shape) < 0.3] = NAN
+    profiles = performance_profiles(times)
+    for s, profile in enumerate(profiles):
+        for factor in (1.0, 1.5, 2.0, 7.0):
+            count = 0
+            for row in times:
+                if np.isfinite(row[s]) and row[s] / np.nanmin(row) <= factor:
+                    count += 1
+            assert profile(factor) == pytest.approx(count / len(times))
+        assert np.all(np.diff(profile.shares) > 0) and np.all(np.diff(profile.factors) > 0)
+    for other in (times[rng.permutation(len(times))], 1024 * times):
+        for one, two in zip(profiles, performance_profiles(other)):
+            np.testing.assert_allclose(one.factors, two.factors, rtol=1e-12)
+            np.testing.assert_allclose(one.shares, two.shares)
+    dominated = np.column_stack([times, 3 * np.nanmax(np.where(np.isnan(times), -1, times), axis=1) + 1])
+    dominated[np.isnan(times).all(axis=1), -1] = NAN
+    for one, two in zip(profiles, performance_profiles(dominated)):
+        np.testing.assert_array_equal(one.factors, two.factors)
+
+
+def test_shifted_geometric_mean_against_scipy():
+    t = np.array([0.001, 0.02, 3.0, NAN])
+    assert shifted_geometric_mean(t, 0.0) == pytest.approx(scipy.stats.gmean(t[:3]))
+    assert shifted_geometric_mean(t, 0.5) == pytest.approx(scipy.stats.gmean(t[:3] + 0.5) - 0.5)
+    assert shifted_geometric_mean(1000 * t, 500.0) == pytest.approx(1000 * shifted_geometric_mean(t, 0.5))
+    assert np.isnan(shifted_geometric_mean(np.array([NAN])))
+
+
+def test_paired_ratio_against_scipy_and_its_reciprocal():
+    rng = np.random.default_rng(4)
+    a, b = np.exp(rng.normal(size=(2, 30)))
+    a[3] = b[7] = NAN
+    both = np.isfinite(a) & np.isfinite(b)
+    ratio, back = paired_ratio(a, b), paired_ratio(b, a)
+    interval = scipy.stats.ttest_rel(np.log(a[both]), np.log(b[both])).confidence_interval()
+    assert (ratio.low, ratio.high) == pytest.approx(tuple(np.exp(interval)))
+    assert ratio.value == pytest.approx(1 / back.value) and ratio.low == pytest.approx(1 / back.high)
+    assert ratio.n == 28
+    assert paired_ratio(a[:1], b[:1]).high == np.inf and paired_ratio(a[3:4], b[3:4]).n == 0
+
+
+def test_the_interval_of_a_paired_difference_covers_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(2000):
+        pair = paired_difference(1.0 + rng.normal(size=8), np.zeros(8))
+        hits += pair.low <= 1.0 <= pair.high
+    assert hits / 2000 == pytest.approx(0.95, abs=0.015)
+
+
+# ---- ranks
+
+
+def test_published_friedman_test_and_critical_difference():
+    """Demsar (2006), section 3.2.3: 9.28 and 3.69 (without a correction for ties), F(3, 39) and CD 1.25."""
+    n, k = DEMSAR.shape
+    np.testing.assert_allclose(DEMSAR.mean(axis=0), [3.143, 2.000, 2.893, 1.964], atol=5e-4)
+    corrected, p = friedman(DEMSAR)
+    ties = sum(np.sum(c**3 - c) for c in (np.unique(row, return_counts=True)[1] for row in DEMSAR))
+    plain = corrected * (1 - ties / (n * k * (k * k - 1)))
+    assert plain == pytest.approx(9.28, abs=0.01)
+    assert (n - 1) * plain / (n * (k - 1) - plain) == pytest.approx(3.69, abs=0.01)
+    assert corrected == pytest.approx(scipy.stats.friedmanchisquare(*DEMSAR.T).statistic)
+    assert p < scipy.stats.f.sf(3.69, k - 1, (k - 1) * (n - 1)) < 0.05
+    assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
+    assert critical_difference(4, 14, 0.10) == pytest.approx(1.12, abs=0.006)
+    ranking = rank_over_data_sets(DEMSAR, ("C4.5", "C4.5+m", "C4.5+cf", "C4.5+m+cf"))
+    assert ranking.names[0] == "C4.5+m+cf" and ranking.told
+    assert not any(ranking.differ(*pair) for pair in itertools.combinations(ranking.names, 2))  # as printed
+    assert rank_over_data_sets(DEMSAR, tuple("wxyz"), level=0.10).differ("w", "z")  # 3.143 - 1.964 > 1.12, as printed
+
+
+def test_critical_values_are_those_printed():
+    """Table 5a of Demsar (2006)."""
+    printed = {2: 1.960, 3: 2.343, 4: 2.569, 5: 2.728, 6: 2.850, 7: 2.949, 8: 3.031, 9: 3.102, 10: 3.164}
+    for k, q in printed.items():
+        assert critical_difference(k, 10) / np.sqrt(k * (k + 1) / 60) == pytest.approx(q, abs=1.5e-3)
+
+
+def test_published_wilcoxon_test():
+    """Demsar (2006), section 3.1.3: the two differ at 0.05; every assignment of signs counted."""
+    d = C45M - C45
+    rounded = np.round(d, 3)
+    exact = signed_ranks(rounded)
+    assert exact < 0.05
+    left = rounded[rounded != 0]
+    r = scipy.stats.rankdata(np.abs(left))
+    observed = min(r[left > 0].sum(), r[left < 0].sum())
+    brute = [min(r[s].sum(), r[~s].sum()) <= observed + 1e-9
+             for s in (np.array(signs) for signs in itertools.product([True, False], repeat=left.size))]  # fmt: skip
+    assert exact == pytest.approx(np.mean(brute))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_signed_ranks_against_scipy_and_every_sign(seed):
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=rng.integers(1, 12)) + 0.4
+    assert signed_ranks(d) == pytest.approx(scipy.stats.wilcoxon(d, mode="exact").pvalue)
+    assert signed_ranks(-d) == pytest.approx(signed_ranks(d)) and signed_ranks(7 * d) == pytest.approx(signed_ranks(d))
+    tied = np.append(np.round(d, 1), [9.0, 9.0])
+    tied = tied[tied != 0]
+    r = scipy.stats.rankdata(np.abs(tied))
+    observed = min(r[tied > 0].sum(), r[tied < 0].sum())
+    if tied.size <= 10:
+        signs = np.array(list(itertools.product([0, 1], repeat=tied.size)))
+        sums = signs @ r
+        assert signed_ranks(tied) == pytest.approx(np.mean(np.minimum(sums, r.sum() - sums) <= observed + 1e-9))
+
+
+def test_the_probability_of_friedman_is_the_one_of_all_permutations():
+    """Iman and Davenport's F against the permutation distribution, which is exact."""
+    rng = np.random.default_rng(3)
+    scores = rng.normal(size=(8, 4)) + [0, 0.4, 0.8, 1.6]
+    statistic, p = friedman(scores)
+    ranks = scipy.stats.rankdata(scores, axis=1)
+    at = np.argsort(rng.random((20000, *ranks.shape)), axis=2)
+    shuffled = np.take_along_axis(np.broadcast_to(ranks, at.shape), at, axis=2).sum(axis=1)
+    spread = ((shuffled - shuffled.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    own = ((ranks.sum(axis=0) - ranks.sum(axis=0).mean()) ** 2).sum()
+    assert p == pytest.approx(np.mean(spread >= own - 1e-9), abs=0.01)
+    assert statistic == pytest.approx(scipy.stats.friedmanchisquare(*scores.T).statistic)
+
+
+def test_the_test_over_data_sets_keeps_its_level():
+    rng = np.random.default_rng(1)
+    found = [rank_over_data_sets(rng.normal(size=(7, 4)), tuple("abcd")).probability for _ in range(1000)]
+    assert np.mean(np.array(found) < 0.05) == pytest.approx(0.05, abs=0.02)
+    pairs = sum(rank_over_data_sets(rng.normal(size=(9, 2)), tuple("ab")).probability < 0.05 for _ in range(1000))
+    assert pairs / 1000 <= 0.065
+
+
+def test_the_minimum_of_data_sets_is_where_a_unanimous_pair_can_first_be_told():
+    assert signed_ranks(np.ones(MINIMUM_DATA_SETS)) < 0.05 <= signed_ranks(np.ones(MINIMUM_DATA_SETS - 1))
+    few = rank_over_data_sets(np.tile([1.0, 2.0, 3.0], (5, 1)), tuple("abc"))
+    assert not few.told and "at least 6 data sets; there are 5" in few.missing and not few.differ("a", "c")
+    alone = rank_over_data_sets(np.ones((9, 1)), ("a",))
+    assert not alone.told and "at least 2 solvers" in alone.missing
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_a_solver_that_is_always_last_changes_no_rank_and_turns_no_tie_into_a_difference(seed):
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(size=(10, 4)) + [0, 0.5, 1.0, 1.5]
+    before = rank_over_data_sets(scores, tuple("abcd"))
+    after = rank_over_data_sets(np.column_stack([scores, scores.max(axis=1) + 1]), tuple("abcde"))
+    assert after.names[:4] == before.names and after.names[4] == "e"
+    np.testing.assert_allclose(after.ranks[:4], before.ranks)
+    if before.probability < 0.05:
+        for one, two in itertools.combinations("abcd", 2):
+            assert before.differ(one, two) or not after.differ(one, two)
+
+
+@pytest.mark.parametrize("row", [[1, 2, 3], [1, 2, 2], [2, 2, 1], [1, 1, 1], [3, 1, 1, 1]])
+def test_the_probability_of_the_same_order_everywhere_counts_ties(row):
+    """Against all permutations within the data sets."""
+    ranks = scipy.stats.rankdata(row)
+    orders = set(itertools.permutations(ranks))
+    same = [len(set(drawn)) == 1 for drawn in itertools.product(orders, repeat=4)]
+    assert friedman(np.tile(row, (4, 1)))[1] == pytest.approx(np.mean(same))
+
+
+def test_failures_rank_last_and_tie():
+    np.testing.assert_array_equal(ranks_of_problems(np.array([[2.0, NAN, 1.0, NAN]])), [[2, 3.5, 1, 3.5]])
+
+
+# ---- growth
+
+
+def test_growth_recovers_a_power_law_and_equals_linear_regression():
+    n = np.repeat([100.0, 1000.0, 10000.0, 1e5], 5)
+    rng = np.random.default_rng(2)
+    t = 1e-4 * n**1.3 * np.exp(0.2 * rng.normal(size=n.size))
+    found = time_growth(t, n, np.zeros(n.size))
+    means = np.log([scipy.stats.gmean(t[n == v]) for v in np.unique(n)])
+    line = scipy.stats.linregress(np.log(np.unique(n)), means)
+    half = scipy.stats.t.ppf(0.975, 2) * line.stderr
+    assert found.slope == pytest.approx(line.slope)
+    assert (found.low, found.high) == pytest.approx((line.slope - half, line.slope + half))
+    assert found.low < 1.3 < found.high
+    assert time_growth(1000 * t, n, np.zeros(n.size)).slope == pytest.approx(found.slope)
+
+
+def test_growth_is_taken_within_groups_so_that_slow_data_at_one_length_do_not_count():
+    n = np.array([100.0, 1000, 10000, 100, 1000, 10000, 10000])
+    group = np.array([0, 0, 0, 1, 1, 1, 2])
+    t = np.array([1.0, 10, 100, 50, 500, 5000, 1e6])  # group 2 has one length only
+    found = time_growth(t, n, group)
+    assert found.slope == pytest.approx(1.0) and found.high - found.low < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("n", "t", "word"),
+    [
+        ([], [], "there are at most 0"),
+        ([100, 1000], [1, 2], "there are at most 2"),
+        ([100, 150, 200], [1, 2, 3], "4 times the shortest"),
+        ([100, 1000, 10000], [1, 2, NAN], "there are at most 2"),
+        ([NAN, NAN, NAN], [1, 2, 3], "there are at most 0"),
+    ],
+)
+def test_growth_that_cannot_be_told_says_what_is_missing(n, t, word):
+    found = time_growth(np.array(t, dtype=float), np.array(n, dtype=float), np.zeros(len(n)))
+    assert np.isnan(found.slope) and word in found.missing
+
+
+def test_short_spans_of_different_data_are_no_growth_over_the_whole():
+    n = np.array([100.0, 200, 1000, 2000])
+    found = time_growth(n / 1000, n, np.array([0, 0, 1, 1]))
+    assert np.isnan(found.slope) and "there are at most 2" in found.missing
+    n, group = np.append(n, [100, 300, 900]), np.array([0, 0, 1, 1, 2, 2, 2])
+    assert time_growth(n / 1000, n, group).slope == pytest.approx(1.0)
+
+
+# ---- agreement
+
+
+def test_agreement_counts_objectives_and_models_of_both_verified():
+    poles = json.dumps([[0.5, 0.3], [0.5, -0.3]])
+    turned, other = json.dumps([[0.5, -0.3], [0.5, 0.3]]), json.dumps([[0.6, 0.3], [0.6, -0.3]])
+    rows = [run("a", p, poles=poles, simulation_fit=80.0) for p in range(4)]
+    rows += [run("b", 0, poles=turned, simulation_fit=80.0), run("b", 1, poles=other, simulation_fit=80.0),
+             run("b", 2, objective=1.1, poles=poles), run("b", 3, status_verified="failed", poles=poles)]  # fmt: skip
+    table = columns(rows)
+    found = agreement_matrix(tabulate(table), table)
+    assert found.common[0, 1] == found.common[1, 0] == 3
+    assert found.objective[0, 1] == 2 and found.compared[0, 1] == 2 and found.model[0, 1] == 1
+    assert found.worst_objective[0, 1] == pytest.approx(0.1) and found.worst_model[1, 0] == pytest.approx(0.1)
+
+
+def test_the_distance_of_models_matches_poles_the_best_way():
+    rng = np.random.default_rng(5)
+    one = rng.normal(size=(4, 2))
+    two = one[rng.permutation(4)] + 1e-4 * rng.normal(size=(4, 2))
+    table = columns([run("a", poles=json.dumps(p.tolist())) for p in (one, two)])
+    orders = itertools.permutations(range(4))
+    brute = min(max(np.hypot(*(one[i] - two[j])) for i, j in enumerate(order)) for order in orders)
+    assert model_distance(table, 0, 1) == pytest.approx(brute, rel=1e-6)
+    bad = columns([run("a", poles="not json"), run("b", poles="[[0.1, 0.2]]"), run("c", poles="[]")])
+    assert np.isnan(model_distance(bad, 0, 1)) and model_distance(bad, 1, 2) == np.inf
