@@ -71,7 +71,8 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     allowed = int(slack * problems)
     reliable = _reliable(known, allowed)
     candidates = tuple(names[s] for s in reliable)
-    unbeaten = [s for s in reliable if s not in _beaten(costs, reliable, minor, compare, none)]
+    beaten = _beaten(costs, reliable, minor, compare, none)
+    unbeaten = [s for s in reliable if s not in beaten]
     if not unbeaten:
         missing = f"goes in a circle: each of {listed(candidates)} is behind another one on the {noun}s that both solve"
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
