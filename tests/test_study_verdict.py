@@ -55,6 +55,13 @@ def test_the_model_of_the_best_verified_objective_speaks_for_a_formulation():
     assert conclude(rows).quality.figures["simulation_fit"]["exact"].mean == 80.0
 
 
+def test_models_are_compared_whatever_clock_is_asked_for():
+    rows = models({"exact": 0.0, "relaxed": -1.5})
+    cold, warm = conclude(rows), conclude(rows, time="warm")
+    assert not warm.overall.standings and warm.quality.choice == cold.quality.choice
+    assert any(s.word == "Best models: exact" for s in warm.statements)
+
+
 def test_a_formulation_that_is_solved_less_often_is_compared_where_it_is_solved():
     rows = models({"exact": 0.0, "linear": -9.0})
     for row in rows:

@@ -185,6 +185,11 @@ class Results:
         """Which entries are solved, (P, S)."""
         return self.state == SOLVED
 
+    @property
+    def verified(self) -> np.ndarray:
+        """Which entries are solved, or would be but for the time that is compared, (P, S)."""
+        return np.isin(self.state, VERIFIED)
+
     def where(self, problems: np.ndarray, solvers: np.ndarray | None = None) -> "Results":
         """Return some of the problems (mask over P) and solvers (mask over S; all unless given)."""
         kept = np.ones(len(self.solvers), dtype=bool) if solvers is None else solvers
@@ -233,6 +238,7 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     accuracy = usual_accuracy(table) if accuracy is None else accuracy
     residual, seconds = worst_residual(table), seconds_of(table, time)
     states = _row_states(table, accuracy, time)
+    verified = np.isin(states, VERIFIED)
     problem, solver, solvers = _places(table)
     entries: dict[tuple[int, int], list[int]] = {}
     members: list[list[int]] = [[] for _ in range(int(problem.max(initial=-1)) + 1)]
@@ -248,14 +254,14 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     row, numbers = np.full(shape, -1), {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
     for (p, s), runs in entries.items():
         runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
-        bad = next((i for i in runs if states[i] not in VERIFIED), next((i for i in runs if states[i] != SOLVED), None))
+        bad = next((i for i in runs if not verified[i]), next((i for i in runs if states[i] != SOLVED), None))
         speaks = runs[0] if bad is None else bad
         row[p, s], state[p, s] = speaks, states[speaks]
         reason[p, s] = "" if bad is None else table["reason"][speaks]
         numbers["residual"][p, s] = np.max(residual[runs])
         if bad is None:
             numbers["time"][p, s] = np.median(seconds[runs])
-        if np.isin(states[runs], VERIFIED).all():
+        if verified[runs].all():
             numbers["objective"][p, s] = np.max(table["objective"][runs])
     found = Results(
         *(table[name][first] for name in ("study", "data", "formulation", "samples", "noise", "seed")),

@@ -71,10 +71,10 @@ def compare_formulations(found: Results, table: Mapping[str, np.ndarray], level:
     case = found.case
     records = int(case.max()) + 1 if case.size else 0
     row = np.full((records, len(names)), -1)
-    for p in range(len(case)):
-        if found.solved[p].any():
-            best = int(np.nanargmin(np.where(found.solved[p], found.objective[p], np.nan)))
-            row[case[p], names.index(found.formulation[p])] = found.row[p, best]
+    verified = found.verified  # a model without a time is a model
+    for p in np.flatnonzero(verified.any(axis=1)):
+        best = int(np.nanargmin(np.where(verified[p], found.objective[p], np.nan)))
+        row[case[p], names.index(found.formulation[p])] = found.row[p, best]
     values = {c: np.where(row >= 0, table[c][row] if len(table[c]) else np.nan, np.nan) for c in FIGURES}
     values |= {c: np.maximum(values[c], WORST) for c in FITS}
     figures = {
