@@ -85,6 +85,10 @@ BAD = [
     ("repetitions = 1.5", 1, 15, "whole number from 1"),
     ("warm = 1", 1, 8, "true or false"),
     ("seeds = [1, -2]", 1, 13, "whole number from 0"),
+    ("seeds = [1, 2, 1]", 1, 16, "seeds has 1 twice"),
+    ("accuracy = [1e-4, 1e-8, 0.0001]", 1, 25, "accuracy has 0.0001 twice"),
+    ("[[data]]\nname = 'x'\nsystem = 'thruster'\nsamples = [100, 100]", 4, 17, "samples has 100 twice"),
+    ("[[data]]\nname = 'x'\nsystem = 'thruster'\nnoise = [0, 0.0]", 4, 13, "noise has 0.0 twice"),
     ("seeds = []", 1, 9, "seeds is empty"),
     ("holdout = 1", 1, 11, "below 1"),
     ("name = ''", 1, 8, "name is a text"),
@@ -234,10 +238,14 @@ _NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\r"), min_size
 _SHARES = st.floats(1e-12, 0.5)
 
 
+def _lists(entries, **size):
+    return st.lists(entries, unique=True, **size)
+
+
 @settings(max_examples=60, deadline=None)
 @given(name=_NAMES, labels=st.lists(_NAMES, min_size=2, max_size=2, unique=True), warm=st.booleans(),
-       accuracy=st.lists(_SHARES, min_size=1), noise=st.lists(st.floats(0, 1e3)),
-       seeds=st.lists(st.integers(0, 2**40), min_size=1, max_size=5),
+       accuracy=_lists(_SHARES, min_size=1), noise=_lists(st.floats(0, 1e3)),
+       seeds=_lists(st.integers(0, 2**40), min_size=1, max_size=5),
        options=st.dictionaries(_NAMES, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()
                                | st.datetimes() | st.dates() | st.times()))
 def test_round_trip_of_any_study(name, labels, accuracy, seeds, noise, warm, options):
@@ -266,6 +274,7 @@ def test_all_solvers_are_those_installed():
     from optid.backends import back_ends
 
     study = replace(Study.from_text(SMALL), solvers="all")
+    assert study.solvers == replace(study, solvers=["all"]).solvers
     assert {entry.solver for entry in study.solvers} == {n for n, b in back_ends().items() if b.installed}
 
 

@@ -226,5 +226,5 @@ def _check_distinct(found: list[Cell]) -> None:
         if other is not cell:
             names = [f"{axis} {getattr(other, axis)!r} and {getattr(cell, axis)!r}"
                      for axis in ("data", "formulation", "solver") if getattr(other, axis) != getattr(cell, axis)]
-            raise StudyError(f"study {cell.study!r} has the same cell twice: {', '.join(names) or cell.data} differ in "
+            raise StudyError(f"study {cell.study!r} has the same cell twice: {', '.join(names)} differ in "
                              "nothing that determines the result. Leave one of them out")

@@ -90,6 +90,7 @@ class Study:
         seeds: of the simulated records; their number, or a list of them.
         holdout: share of a record that the fit does not see.
         folder: where relative file names start.
+        data_checked: whether `check_data` has found nothing wrong.
 
     Raises:
         StudyError: lists everything that is wrong. Whether the files can be read is found out by `check_data`.
@@ -107,6 +108,7 @@ class Study:
     seeds: tuple[int, ...] | Any = (0,)
     holdout: float = 0.3
     folder: Path = field(default_factory=Path, compare=False)
+    data_checked: bool = field(default=False, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         from optid.studies.definition.entries import read
@@ -170,7 +172,7 @@ class Study:
         from optid.studies.definition.problems import Problems
         from optid.studies.definition.trial import Records, note_impossible, note_unreadable
 
-        if getattr(self, "data_checked", False):
+        if self.data_checked:
             return
         problems, records = Problems(), Records(self.folder)
         note_unreadable(self.data, records, problems)
@@ -184,7 +186,8 @@ class Study:
 
         Args:
             db: database file, from which an interrupted study goes on; a temporary one when not given.
-            settings: workers, scheduler, progress and accept_changed_data of `optid.studies.execution.running.run`.
+            settings: workers, scheduler, progress, accept_changed_data and retry of
+                `optid.studies.execution.running.run`.
 
         Returns:
             A pandas frame with the columns of `optid.studies.storage.rows`; a list of dictionaries where pandas is not

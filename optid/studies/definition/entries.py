@@ -116,7 +116,7 @@ def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
     default = system or (PurePath(files[0]).stem if files else getattr(record, "name", "") or "record")
     return DataEntry(
         _label(path, raw, default, problems), files, system, record if in_memory else None,
-        tuple(value for value in samples if value is not None), tuple(value for value in noise if value is not None),
+        problems.once((*path, "samples"), samples), problems.once((*path, "noise"), noise),
         {key: _reading((*path, key), raw[key], problems) for key in READING if key in raw},
     )
 
@@ -281,7 +281,7 @@ def _accuracies(path: Path, value: Any, problems: Problems) -> tuple[float, ...]
     numbers = [problems.number((*path, i), one, "a number between 0 and 1", 0.0, 1.0) for i, one in enumerate(several)]
     if not several:
         problems.add(path, "accuracy is empty; give at least one number")
-    return tuple(number for number in numbers if number is not None)
+    return problems.once(path, numbers)
 
 
 def _seeds(value: Any, problems: Problems) -> tuple[int, ...]:
@@ -291,7 +291,7 @@ def _seeds(value: Any, problems: Problems) -> tuple[int, ...]:
     seeds = [problems.whole(("seeds", i), seed, 0) for i, seed in enumerate(value)]
     if not seeds:
         problems.add(("seeds",), "seeds is empty; give their number or a list of them")
-    return tuple(seed for seed in seeds if seed is not None)
+    return problems.once(("seeds",), seeds)
 
 
 def _label(path: Path, raw: Mapping[str, Any], default: str, problems: Problems) -> str:

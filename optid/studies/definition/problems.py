@@ -5,12 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from datetime import time as clock
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from optid.errors import StudyError
 from optid.studies.definition.positions import Path, Positions
+
+T = TypeVar("T")
 
 LARGEST = 2**62  # whole numbers from here on have no place in the database
 
@@ -100,6 +102,13 @@ class Problems(list[Problem]):
         self.add(path, f"{_last_word(path)} is a whole number from {low}; "
                  + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
         return None
+
+    def once(self, path: Path, values: Sequence[T | None]) -> tuple[T, ...]:
+        """Return the values without those that were noted as problems (None); note every one that is there twice."""
+        for i, value in enumerate(values):
+            if value is not None and value in values[:i]:
+                self.add((*path, i), f"{_last_word(path)} has {value} twice; leave one of them out")
+        return tuple(value for value in values if value is not None)
 
     def writable(self, path: Path, value: Any) -> None:
         """Note what a study file cannot hold: it has no text from which the key of a cell could be made."""

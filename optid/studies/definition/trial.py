@@ -35,14 +35,13 @@ class Records:
         Raises:
             DataError: what `optid.read` refuses.
         """
-        from optid.readers import read
+        from optid.studies.grid import located
+        from optid.studies.sources.records import read_entry
 
-        if entry.record is not None:
-            return entry.record
         if entry.name not in self._read:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # they are told when the record is used
-                self._read[entry.name] = read([self.path(name) for name in entry.files], **entry.options)
+                self._read[entry.name] = read_entry(located(entry, self._folder))
         return self._read[entry.name]
 
     def beginning(self, entry: DataEntry, samples: float = SHORT) -> Data:

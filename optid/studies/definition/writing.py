@@ -38,7 +38,7 @@ def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
         entry = {"formulation": entry} if isinstance(entry, str) else entry
         raw["formulation"].append(_with_label(entry, label))
     solvers = given["solvers"]
-    if solvers == ALL:
+    if solvers == ALL or plain(solvers) == [ALL]:
         raw["solvers"] = ALL
     else:
         raw["solver"] = []
