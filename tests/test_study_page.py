@@ -15,7 +15,8 @@ from optid.solution import Status
 from optid.studies.page import embedded, render, write_page
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import SUCCESS
-from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate
+from optid.studies.verdicts.outcomes import states_of_rows, tabulate
+from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)

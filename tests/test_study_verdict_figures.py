@@ -13,7 +13,7 @@ from study_rows import run
 from optid.studies.verdicts.agreement import agreement_matrix, model_distance
 from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
 from optid.studies.verdicts.growth import time_growth
-from optid.studies.verdicts.outcomes import columns, tabulate
+from optid.studies.verdicts.outcomes import tabulate
 from optid.studies.verdicts.profiles import performance_profiles
 from optid.studies.verdicts.ranks import (
     MINIMUM_DATA_SETS,
@@ -23,6 +23,7 @@ from optid.studies.verdicts.ranks import (
     ranks_of_problems,
     signed_ranks,
 )
+from optid.studies.verdicts.table import columns
 
 NAN = float("nan")
 

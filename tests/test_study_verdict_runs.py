@@ -13,7 +13,8 @@ from optid.backends import Answer
 from optid.errors import DataError
 from optid.solution import Residuals, Status
 from optid.studies.verdicts.comparison import compare
-from optid.studies.verdicts.outcomes import columns, states_of_rows, tabulate
+from optid.studies.verdicts.outcomes import states_of_rows, tabulate
+from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")

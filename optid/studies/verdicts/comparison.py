@@ -10,8 +10,9 @@ from optid.errors import DataError
 from optid.showing.wording import seconds
 from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.choice import listed
-from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, columns, tabulate
+from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
 from optid.studies.verdicts.standings import MINOR
+from optid.studies.verdicts.table import columns
 
 
 @dataclass(frozen=True)

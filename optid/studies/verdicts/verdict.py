@@ -26,13 +26,13 @@ from optid.studies.verdicts.outcomes import (
     VALUE,
     Results,
     applicable,
-    columns,
     states_of_rows,
     tabulate,
     usual_accuracy,
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import Section, compare_solvers
+from optid.studies.verdicts.table import columns
 
 
 @dataclass(frozen=True)
