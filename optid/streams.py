@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,8 +61,19 @@ class Stream:
             return _not_empty(self._channels.read(self._whole), self._whole.label)
         if self.n_experiments > 1:
             raise DataError(f"this stream has {self.n_experiments} experiments; one at a time can be read in order.")
-        fetch = partial(fetched, scheduler=self.scheduler)
-        return _not_empty(chain.from_iterable(map(self._channels.read, map(fetch, self.parts))), self.name)
+        return _not_empty(self._in_order(), self.name)
+
+    def _in_order(self) -> Iterator[Chunk]:
+        """Chunks of all parts of the one experiment; the clock must run on from each part to the next."""
+        last, before = None, ""
+        for part in self.parts:
+            begun = False
+            for u, y, stamps in self._channels.read(fetched(part, self.scheduler)):
+                if stamps is not None and stamps.size:
+                    if last is not None and not begun:
+                        self._channels.check_border(last, before, stamps[:1], part.label)
+                    begun, last, before = True, stamps[-1:].copy(), part.label
+                yield u, y, stamps
 
     @property
     def n_experiments(self) -> int:
@@ -164,7 +174,7 @@ def open_stream(
             (N, channels) numbers; it is read, not mapped, because mapped pages count as resident memory.
         inputs: columns by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
         outputs: likewise; y, or y1, y2, ..., when not given.
-        dt: sampling time; from the first time stamps when not given, 1 without stamps.
+        dt: sampling time; when not given from the first block or part with two time stamps, 1 without stamps.
         chunk: samples read at a time.
         time: column of time stamps, checked on every pass; a column t or time when not given; False ignores it.
         columns: names of the columns of an npy file, a Dask array, or a CSV file without a header.
@@ -204,11 +214,8 @@ def open_stream(
         if len({part.experiment for part in parts}) < len(opened):
             raise DataError("a source of the list has no rows.")
     if clock is not None:
-        first = fetched(parts[0], scheduler) if parts else opened[0]
-        if first.blocks is not None:
-            stamps = next(first.blocks([clock], clock), {clock: np.empty(0)})[clock]
-            stamps = as_stamps(stamps, f"{first.label}, column {clock!r}")
-            dt = agreed_step(uniform_step(stamps, time_tolerance, first.label), dt, time_tolerance, first.label)
+        found, where = _step((fetched(part, scheduler) for part in parts) if parts else opened, clock, time_tolerance)
+        dt = agreed_step(found, dt, time_tolerance, where)
     step = 1.0 if dt is None else dt
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
@@ -240,6 +247,18 @@ def _chosen(
             raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "
                             f"has {found[0][:2]} and {found[0][2]!r}: name the columns, or pass time=False.")
     return found[0]
+
+
+def _step(sources: Iterable[Any], clock: str, tolerance: float) -> tuple[float | None, str]:
+    """Return the step of the first stamps that have one, and where they are; None where no source has two stamps."""
+    for one in sources:
+        stamps = np.empty(0)
+        for block in one.blocks([clock], clock):
+            more = as_stamps(block[clock], f"{one.label}, column {clock!r}")
+            stamps = np.concatenate([stamps, more]) if stamps.size else more
+            if stamps.size > 1:
+                return uniform_step(stamps, tolerance, one.label), one.label
+    return None, ""
 
 
 def _of_part(leaf: Callable[[Part, Iterable[Chunk]], Any], channels: Channels, part: Part) -> Any:

@@ -234,6 +234,46 @@ def test_parts_that_do_not_join_are_refused(record, folders):
         optid.open_stream(folders[1])
 
 
+def _timed(folder, *pieces, gap=0.0):
+    """A folder with a Parquet file per piece; ``gap`` seconds are lost before the last."""
+    folder.mkdir()
+    start = 0
+    for i, length in enumerate(pieces):
+        t = 0.05 * np.arange(start, start + length) + (gap if i == len(pieces) - 1 else 0.0)
+        pd.DataFrame({"t": t, "u": np.cos(7 * t), "y": np.sin(t)}).to_parquet(folder / f"p{i}.parquet")
+        start += length
+    return folder
+
+
+def test_the_clock_is_compared_between_parts_on_every_pass(tmp_path):
+    for u, y in optid.open_stream(_timed(tmp_path / "whole", 30, 1, 40), chunk=7):
+        assert u.shape == y.shape
+    stream = optid.open_stream(_timed(tmp_path / "torn", 30, 1, 40, gap=50.0), chunk=7)
+    for _ in range(2):
+        seen = 0
+        with pytest.raises(DataError, match="p2.parquet begins 50.05 after the last sample of p1.parquet"):
+            for u, _y in stream:
+                seen += len(u)
+        assert seen == 31
+
+
+@pytest.mark.parametrize("pieces, chunk", [((0, 1, 50), 100), ((1, 50), 100), ((50, 1), 1)])
+def test_the_sampling_time_comes_from_the_first_two_stamps_of_a_part(tmp_path, pieces, chunk):
+    stream = optid.open_stream(_timed(tmp_path / "folder", *pieces), chunk=chunk)
+    assert stream.dt == pytest.approx(0.05, rel=1e-9)
+    assert sum(len(u) for u, _ in stream) == sum(pieces) and stream.ranges()[0].shape == (1,)
+
+
+@pytest.mark.parametrize("source, words", [
+    ({"u": np.zeros(9), "y": np.zeros(9)}, "channel 'u' is of type ndarray"),
+    ({"u": "u.npy", "y": da.zeros(9)}, "channel 'y' is of type Array: a stream takes paths .* or Dask arrays for all"),
+    ({}, "is empty; give every channel"),
+])
+def test_mappings_that_are_no_stream_are_refused(source, words):
+    with pytest.raises(DataError, match=words):
+        optid.open_stream(source)
+
+
 def test_a_file_that_changes_after_opening_is_refused(record, folders):
     stream = optid.open_stream(folders)
     stream.ranges()

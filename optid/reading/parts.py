@@ -150,35 +150,32 @@ def pyarrow_parquet(label: str) -> Any:
     return pyarrow.parquet
 
 
-def parquet_blocks(
-    path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
-) -> Iterator[Block]:
-    """Yield blocks of some row groups of a Parquet file, of all of them for None.
+@dataclass(frozen=True)
+class RowGroups:
+    """Blocks of some row groups of a Parquet file, of all of them for None.
 
     Raises:
         DataError: a column that does not hold numbers.
     """
-    parquet = pyarrow_parquet(path.name)
-    import pyarrow as pa
 
-    # Both settings bound the memory: by default pyarrow fetches the whole file ahead, or a whole row group.
-    with parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as file:
-        for name in wanted:
-            kind = file.schema_arrow.field(name).type
-            if name != clock and not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-                raise DataError(f"{path.name}: column {name!r} is of type {kind}; convert it to numbers first.")
-        for batch in file.iter_batches(chunk, row_groups=groups, columns=list(dict.fromkeys(wanted))):
-            yield {name: batch.column(name).to_numpy(zero_copy_only=False) for name in wanted}
-
-
-@dataclass(frozen=True)
-class _RowGroups:
     path: Path
-    groups: tuple[int, ...]
+    groups: tuple[int, ...] | None
     chunk: int
 
     def __call__(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
-        return parquet_blocks(self.path, self.groups, self.chunk, wanted, clock)
+        """Start a pass over some columns."""
+        parquet = pyarrow_parquet(self.path.name)
+        import pyarrow as pa
+
+        # Both settings bound the memory: by default pyarrow fetches the whole file ahead, or a whole row group.
+        with parquet.ParquetFile(self.path, buffer_size=1 << 20, pre_buffer=False) as file:
+            for name in wanted:
+                kind = file.schema_arrow.field(name).type
+                if name != clock and not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+                    raise DataError(f"{self.path.name}: column {name!r} is of type {kind}; convert it to numbers "
+                                    "first.")
+            for batch in file.iter_batches(self.chunk, row_groups=self.groups, columns=list(dict.fromkeys(wanted))):
+                yield {name: batch.column(name).to_numpy(zero_copy_only=False) for name in wanted}
 
 
 def parquet_parts(path: Path, chunk: int) -> list[FilePart]:
@@ -189,7 +186,7 @@ def parquet_parts(path: Path, chunk: int) -> list[FilePart]:
         groups.append(group)
         rows += contents.row_group(group).num_rows
         if rows >= SAMPLES or group == contents.num_row_groups - 1:
-            read = _RowGroups(path.absolute(), tuple(groups), chunk)
+            read = RowGroups(path.absolute(), tuple(groups), chunk)
             whole = len(groups) == contents.num_row_groups
             where = "" if whole else f", row groups {groups[0]} to {groups[-1]}"
             parts.append(FilePart((path.absolute(),), prints, rows, read, where))

@@ -12,7 +12,7 @@ from optid.errors import DataError
 from optid.reading.chunks import Block
 from optid.reading.csvfile import open_csv
 from optid.reading.npyfile import NpyFile, open_npy
-from optid.reading.parts import FilePart, FramePart, Part, is_dask, parquet_blocks, parquet_parts, pyarrow_parquet
+from optid.reading.parts import FilePart, FramePart, Part, RowGroups, is_dask, parquet_parts, pyarrow_parquet
 from optid.reading.tables import existing, position_names
 
 
@@ -42,11 +42,17 @@ def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimite
     Raises:
         DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
     """
-    if isinstance(source, Mapping) and source and all(is_dask(item) for item in source.values()):
-        return _of_dask(_stacked(source), chunk, list(map(str, source)))
     if is_dask(source):
         return _of_dask(source, chunk, columns)
     if isinstance(source, Mapping):
+        if source and all(is_dask(item) for item in source.values()):
+            return _of_dask(_stacked(source), chunk, list(map(str, source)))
+        if not source:
+            raise DataError("the mapping {channel: path of an npy file, or Dask array} is empty; give every channel.")
+        for name, item in source.items():
+            if not isinstance(item, str | Path):
+                raise DataError(f"channel {str(name)!r} is of type {type(item).__name__}: a stream takes paths of npy "
+                                "files for all channels, or Dask arrays for all; use read for what is in memory.")
         return _of_npy({str(name): open_npy(existing(Path(path))) for name, path in source.items()}, chunk)
     if not isinstance(source, str | Path):
         raise DataError(f"a stream is opened from a path or a Dask collection, not from {type(source).__name__}; "
@@ -60,7 +66,7 @@ def _of_file(path: Path, chunk: int, columns: Sequence[str] | None, delimiter: s
     kind = path.suffix.lower()
     if kind == ".parquet":
         names, rows = _parquet_footer(path)
-        return Source(path.name, names, rows, _ParquetFile(path, chunk), lambda _: parquet_parts(path, chunk))
+        return Source(path.name, names, rows, RowGroups(path, None, chunk), lambda _: parquet_parts(path, chunk))
     if kind in (".csv", ".txt", ".tsv"):
         file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
         names, rows, blocks = file.names, None, _CsvBlocks(file, chunk)
@@ -72,15 +78,6 @@ def _of_file(path: Path, chunk: int, columns: Sequence[str] | None, delimiter: s
         raise DataError(f"{path.name}: streams are read from .csv, .txt, .tsv, .parquet and .npy files, and from "
                         "folders of .parquet files; use read.")
     return Source(path.name, names, rows, blocks, lambda _: [FilePart.of((path,), rows, blocks)])
-
-
-@dataclass(frozen=True)
-class _ParquetFile:
-    path: Path
-    chunk: int
-
-    def __call__(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
-        return parquet_blocks(self.path, None, self.chunk, wanted, clock)
 
 
 @dataclass(frozen=True)

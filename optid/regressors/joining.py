@@ -8,7 +8,7 @@ in practice by far less, and a tree over parts by less than one pass.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -93,8 +93,8 @@ def _run_of(layout: Layout, start: Callable[[], Any], chunk: int, part: Part, ch
 
 def _joined(layout: Layout, start: Callable[[], Any], runs: Sequence[Run]) -> Run:
     total, reach = start(), layout.first_row
-    whole = runs[0]
-    total.merge(whole.total)
+    total.merge(runs[0].total)
+    whole = replace(runs[0], total=total)
     for run in runs[1:]:
         total.merge(run.total)
         head, tail = whole.head, run.tail
@@ -107,7 +107,7 @@ def _joined(layout: Layout, start: Callable[[], Any], runs: Sequence[Run]) -> Ru
             if run.first == run.last:
                 tail = _last(whole.tail, tail, reach)
         whole = Run(total, whole.first, run.last, head, tail)
-    return Run(total, whole.first, whole.last, whole.head, whole.tail)
+    return whole
 
 
 def _first(before: tuple[Array, Array], behind: tuple[Array, Array], count: int) -> tuple[Array, Array]:
