@@ -104,12 +104,12 @@ def test_a_second_solve_for_which_too_little_time_is_left_is_left_out(solver):
 
     def run(program, settings):
         calls.append(settings.time_limit)
-        time.sleep(0.6)
+        time.sleep(1.6)
         return back_ends()["ipopt"].run(program, settings)
 
-    row = run_cell(one(solver(run), warm=True, time_limit=1.0))
+    row = run_cell(one(solver(run), warm=True, time_limit=3.0))
     assert row["outcome"] == "done" and row["reached"] and row["warm_s"] is None and len(calls) == 1
-    assert "no warm solve: 0." in row["reason"] and "s of the time limit were left" in row["reason"]
+    assert "no warm solve: " in row["reason"] and "s of the time limit were left" in row["reason"]
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("no"), MemoryError("no"), SystemExit("no")])
