@@ -233,6 +233,8 @@ def test_runs_sort_in_both_directions_with_empty_ones_last(opened, rows):
 
 @in_browser
 def test_filters_count_as_the_rows_do(opened, rows):
+    """A focus that scrolls would still be scrolling, smoothly, while the next click is on its way."""
+
     def choose(name, word):
         opened.run(f"(() => {{ const s = document.getElementById('filter-{name}'); "
                    f"s.value = [...s.options].find(o => o.text === {json.dumps(word)}).value; "
@@ -245,18 +247,18 @@ def test_filters_count_as_the_rows_do(opened, rows):
     some = [row for row in scs if row["formulation"] == "linear"]
     assert shown(opened) == f"{len(some)} of {RUNS:,} runs"
     assert set(column(opened, heading(opened, "solver"))) == {"scs"}
-    opened.run("document.getElementById('filter-text').focus()")
+    opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("tanks objective > 0 n_samples=1500")
     exact = [r for r in some if r["data"] == "two tanks" and r["objective"] is not None and r["n_samples"] == 1500]
     opened.wait(f"document.getElementById('runs-count').textContent === '{len(exact)} of {RUNS:,} runs'", 5)
     assert 0 < len(exact) < len(some)
     opened.click("#filter-reset")
-    assert shown(opened) == f"{RUNS:,} of {RUNS:,} runs"
-    opened.run("document.getElementById('filter-text').focus()")
+    opened.wait(f"document.getElementById('runs-count').textContent === '{RUNS:,} of {RUNS:,} runs'", 5)
+    opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("constructor = x")  # no column is called so, and no part of the page is mistaken for one
     opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'", 5)
     opened.click("#filter-reset")
-    opened.run("document.getElementById('filter-text').focus()")
+    opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("no such words anywhere")
     opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'", 5)
 
