@@ -192,6 +192,20 @@ def test_covariances_with_missing_samples_by_hand():
     assert covariance_of([x])[0, 0] == pytest.approx(10 / 3) and covariance_of([x])[0, 1] == pytest.approx(2 / 2)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_covariance_of_collinear_outputs_with_gaps_is_one(seed):
+    """Pairs of outputs are present at different samples: their means alone can be those of no signals."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((60, 1)) @ rng.standard_normal((1, 4)) + 1e-3 * rng.standard_normal((60, 4))
+    x[rng.random(x.shape) < 0.3] = np.nan
+    here = ~np.isnan(x)
+    pairs = np.array([[np.mean((x[:, i] * x[:, j])[here[:, i] & here[:, j]]) for j in range(4)] for i in range(4)])
+    assert np.linalg.eigvalsh(pairs)[0] < 0
+    found = covariance_of([x])
+    assert np.linalg.eigvalsh(found)[0] > 0
+    np.testing.assert_allclose(np.diag(found), np.diag(pairs))
+
+
 def test_missing_inputs_cut_the_record():
     model = truth(2)
     data = record(model, (6000, 3000))

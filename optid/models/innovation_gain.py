@@ -92,10 +92,19 @@ def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance:
 
 
 def covariance_of(signals: Sequence[Array]) -> Array:
-    """Mean of s(k) s(k)' over the samples that are present, pair by pair of outputs, (l, l)."""
+    """Mean of s(k) s(k)' over the samples that are present, pair by pair of outputs, (l, l), positive semidefinite.
+
+    Means over different samples may contradict each other where outputs are nearly collinear. There the products are
+    divided by the geometric mean of the counts of the two outputs, which keeps the variances and is semidefinite.
+    """
     sums, pairs = _products(signals)
     found = sums / np.maximum(pairs, 1.0)
-    return (found + found.T) / 2
+    found = (found + found.T) / 2
+    values = np.linalg.eigvalsh(found)
+    if values[0] < -1e-12 * abs(values[-1]):
+        own = np.sqrt(np.maximum(np.diag(pairs), 1.0))
+        found = (sums + sums.T) / 2 / np.outer(own, own)
+    return found
 
 
 def _products(signals: Sequence[Array]) -> tuple[Array, Array]:
