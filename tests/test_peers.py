@@ -213,7 +213,10 @@ def test_a_peer_is_compared_on_the_seeds_that_both_have():
     peer = table.line("sippy", 9, {i: {"seconds": 2.0, "one_step": 91.0, "simulation": 70.0} for i in (0, 1)})
     assert table.difference(ours, peer, "one_step") == pytest.approx(-0.5)
     rows = (records.ROWS[2],)
-    text = "\n".join(table.goals({"long": [ours, peer]}, rows))
+    bad = {"optid_": {"one NaN": "answers", "constant input": "error that names it: 'u' is constant"},
+           "sippy": {"one NaN": "error: SVD", "constant input": "silent nonsense (one-step fit 3.0 %)"}}
+    text = "\n".join(table.goals({"long": [ours, peer]}, rows, bad))
+    assert "trouble named: **optid** 2, SIPPY 0 of 2." in text
     assert "no, " in text and "one-step: SIPPY by 0.500" in text and "SIPPY 2" in text
 
 

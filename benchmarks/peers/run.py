@@ -113,6 +113,11 @@ class Comparison:
         reference = found[""].get("one_step", 0.0)
         return {name: verdict(name, found[name], reference) for name in paths}
 
+    def all_bad(self) -> dict[str, dict[str, str]]:
+        """What every entry does with bad records."""
+        found = {entry.stem: self.bad(entry) for entry in self.entries}
+        return {name: words for name, words in found.items() if words}
+
 
 def page(comparison: Comparison) -> list[str]:
     """Run what is missing and return the page."""
@@ -128,21 +133,22 @@ def page(comparison: Comparison) -> list[str]:
             print(f"{row.name}: {entry.stem}: " + (f"{len(one.scores)} seeds" if one.scores else one.reason[:100]),
                   flush=True)
         text += rows_text(row, table[row.name])
-    if not options.no_bad:
-        text += bad_text(comparison)
-    text += goals(table, rows)[:-1] + [comparison.equal_task(row) for row in rows if row.kind == "state_space"] + [""]
+    bad = {} if options.no_bad else comparison.all_bad()
+    text += bad_text(bad) + goals(table, rows, bad)[:-1]
+    text += [comparison.equal_task(row) for row in rows if row.kind == "state_space"] + [""]
     return text + versions(comparison)
 
 
-def bad_text(comparison: Comparison) -> list[str]:
+def bad_text(bad: dict[str, dict[str, str]]) -> list[str]:
     """The table of what every entry does with bad records."""
+    if not bad:
+        return []
     text = ["### Bad data", "",
             "What the code of the first row does with a record that something is wrong with. An answer is one without",
             "a word and with a fit as good as without the trouble (unstable plant: above 90 %).", "",
             "| peer | " + " | ".join(bad_records()) + " |", "|---|---|---|---|---|"]
-    for entry in comparison.entries:
-        if words := comparison.bad(entry):
-            text.append(f"| {label(entry.stem)} | " + " | ".join(cell(word, 130) for word in words.values()) + " |")
+    for name, words in bad.items():
+        text.append(f"| {label(name)} | " + " | ".join(cell(word, 130) for word in words.values()) + " |")
     return [*text, ""]
 
 

@@ -11,6 +11,9 @@ OURS = ("optid_", "optid_subspace")
 MARGIN = 0.1
 """Points of fit below the best peer that still count as equal."""
 
+HANDLED = ("answers", "error that names it", "warns")
+"""How a verdict begins when the user gets a good answer or is told what is wrong."""
+
 WORDS = {"one NaN": ("nan", "missing", "finite", "null", "infs"),
          "constant input": ("constant", "excit", "rank", "singular", "variation", "varies"),
          "unstable plant": ("stable", "diverg", "grow", "radius", "pole"),
@@ -143,7 +146,13 @@ def equal_task(ours: Mapping[int, Mapping], slicot: Mapping[int, Mapping], title
             f"singular values equal to {apart:.1e} of the largest.")
 
 
-def goals(table: Mapping[str, list[Line]], rows: tuple[Row, ...]) -> list[str]:
+def counts(numbers: Mapping[str, int]) -> str:
+    """Peers and their numbers, the largest first."""
+    return ", ".join(f"{label(peer)} {number}" for peer, number in sorted(numbers.items(), key=lambda item: -item[1]))
+
+
+def goals(table: Mapping[str, list[Line]], rows: tuple[Row, ...], bad: Mapping[str, Mapping[str, str]] | None = None
+          ) -> list[str]:
     """The figures asked for, each with what was reached."""
     text = ["### Against the goals", ""]
     worst, behind = [], []
@@ -160,12 +169,14 @@ def goals(table: Mapping[str, list[Line]], rows: tuple[Row, ...]) -> list[str]:
     if worst:
         text.append(f"* Fit within {MARGIN} point of the best peer or above, every row, both fits: "
                     f"{'yes' if not behind else 'no, ' + '; '.join(behind)} (smallest difference {min(worst):+.3f}).")
-    answered = {peer: [row.name for row in rows if any(
-        one.peer == peer and one.scores and not one.reason for one in table[row.name])]
-        for peer in dict.fromkeys(one.peer for lines in table.values() for one in lines if one.peer != OURS[1])}
-    text.append("* Rows answered: " + ", ".join(
-        f"{label(peer)} {len(names)}" for peer, names in sorted(answered.items(), key=lambda item: -len(item[1])))
-        + f" of {len(rows)}.")
+    answered = {peer: sum(any(one.peer == peer and one.scores and not one.reason for one in table[row.name])
+                          for row in rows)
+                for peer in dict.fromkeys(one.peer for lines in table.values() for one in lines if one.peer != OURS[1])}
+    text.append(f"* Rows answered: {counts(answered)} of {len(rows)}.")
+    if bad:
+        text.append("* Bad records answered as well as good ones, or the trouble named: " + counts(
+            {peer: sum(word.startswith(HANDLED) for word in words.values()) for peer, words in bad.items()})
+            + f" of {max(map(len, bad.values()))}.")
     for name in ("long", "long_state_space"):
         lines = {one.peer: one for one in table.get(name, []) if one.scores}
         ours = [lines[peer] for peer in OURS if peer in lines]
