@@ -294,6 +294,8 @@ def test_lines_have_the_numbers_of_the_rows():
     (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
     (("study", "report", "none.duckdb"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),
+    (("study", "report", "none.duckdb", "--accuracy", -1), "accuracy is a number between 0 and 1; -1 is not"),
+    (("study", "report", "none.duckdb", "--accuracy", "nan"), "accuracy is a number between 0 and 1; nan is not"),
     (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
     (("compare",), "give a data file, or --example"),
     (("compare", "none.csv"), "no file 'none.csv'"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.errors import DataError
 from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.advice import (
     Statement,
@@ -125,9 +126,11 @@ def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", l
         The verdict. A solver counts only where our residuals verified the accuracy; what the data cannot tell is said.
 
     Raises:
-        DataError: these are no rows of a study, or an unknown measure of time.
+        DataError: these are no rows of a study, an unknown measure of time, or an accuracy that is none.
         DatabaseError: the database cannot be read.
     """
+    if accuracy is not None and not 0 < accuracy < 1:
+        raise DataError(f"accuracy is a number between 0 and 1; {accuracy:g} is not")
     if isinstance(rows, str | Path):
         from optid.studies.storage.database import read_rows
 
