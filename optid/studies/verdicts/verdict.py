@@ -231,7 +231,7 @@ def _failures(found: Results) -> tuple[Failure, ...]:
     failed = (applicable(found) | (found.state == REFUSED)) & (found.state != SOLVED)
     for p, s in zip(*np.nonzero(failed)):
         reason = str(found.reason[p, s])
-        groups.setdefault((found.solvers[s], str(found.state[p, s]), _shape(reason)), []).append(reason)
+        groups.setdefault((found.solvers[s], str(found.state[p, s]), without_numbers(reason)), []).append(reason)
     failures = [
         Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
         for (solver, state, shape), reasons in groups.items()
@@ -239,6 +239,6 @@ def _failures(found: Results) -> tuple[Failure, ...]:
     return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))
 
 
-def _shape(reason: str) -> str:
-    """A sentence without its numbers, so that sentences of one kind count together."""
+def without_numbers(reason: str) -> str:
+    """Return a sentence without its numbers, so that sentences of one kind count together."""
     return re.sub(r"(?<![A-Za-z_])[-+]?\d[\d.,]*(?:e[-+]?\d+)?", "…", reason)
