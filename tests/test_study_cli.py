@@ -21,7 +21,7 @@ STUDY = """
 name = "rigs"
 solvers = {solvers}
 seeds = 2
-time_limit = 30.0
+time_limit = 300.0
 
 [[data]]
 system = "thruster"
@@ -122,7 +122,7 @@ def test_a_dry_run_counts_what_the_run_would_run(folder):
     from optid.studies.storage.journal import Journal, locked
 
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 2\nmemory_limit = 1.0"))
-    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
+    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 4
     rows, before = read_rows("rigs.duckdb"), Path("rigs.duckdb").read_bytes()
     assert set(rows["outcome"]) == {"memory limit"} and rows["key"].size == 6
 
@@ -150,6 +150,29 @@ def test_a_dry_run_counts_what_the_run_would_run(folder):
         assert "another run is writing to" in run("study", "run", "rigs.toml", "--dry-run").stderr
     told = run("study", "run", "rigs.toml", "--dry-run", "--db", "rig.csv").stderr
     assert told.startswith("error: rig.csv ")
+
+
+def test_every_reason_is_told_once_and_a_run_without_an_answer_ends_with_4(folder):
+    exact = STUDY.partition('[[formulation]]\nformulation = "arx"')[0]
+    Path("rigs.toml").write_text(exact.format(solvers='["clarabel", "scs"]'))
+    first = run("study", "run", "rigs.toml", "-w", 1, "--export", "rows.csv")
+    assert first.exit_code == 4 and Path("rows.csv").is_file()
+    for found in first, run("study", "report", "rigs.duckdb"):
+        told = [line for line in found.stdout.splitlines() if line.startswith("clarabel: refused 3: ")]
+        assert len(told) == 1 and ".exact' is not convex" in told[0] and found.stdout.count("scs: refused 3: ") == 1
+    Path("rigs.toml").write_text(exact.format(solvers='["clarabel", "gauss_newton"]'))
+    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
+
+
+def test_reasons_that_differ_in_their_numbers_are_one(capsys):
+    from optid.cli.study_summary import print_reasons
+    from optid.studies.verdicts.table import columns
+
+    failed = [row("a", **FAILED | {"reason": f"no step after {k} iterations"}, repetition=k) for k in range(3)]
+    print_reasons(columns([row("b"), row("b", **FAILED | {"reason": "it\nbroke"}), *failed]))
+    assert capsys.readouterr().out == "a: failed 3: no step after … iterations\nb: failed 1: it broke\n"
+    print_reasons(columns([row(f"s{k}", **FAILED | {"reason": "ab"[k % 2] * (k + 1)}) for k in range(14)]))
+    assert capsys.readouterr().out.splitlines()[-1].startswith("and 2 more reasons")
 
 
 def test_what_is_taken_out_of_a_study_leaves_its_reports_which_say_so(folder):

@@ -18,6 +18,7 @@ study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich
                     help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
 
 STOPPED = 130  # exit code after Ctrl-C, by convention of shells
+NOTHING_SOLVED = 4  # exit code of a run in which no cell has an answer, as where one fit fails in its solver
 
 Workers = Annotated[
     int | None,
@@ -85,10 +86,12 @@ def run(
     with follow_progress(db) as follow:
         running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
                     accept_changed_data=accept_changed_data, retry=retry or ())
-    _summary(db, described.name)
+    solved = _summary(db, described.name)
     if export is not None:
         count = database.export(db, export)
         say(f"{count} rows written to {export}")
+    if not solved:
+        raise typer.Exit(NOTHING_SOLVED)
 
 
 @study.command(cls=Command)
@@ -105,13 +108,15 @@ def report(
     Example: optid study report study.duckdb -o study.html
     """
     from optid.cli.arguments import check_folders
+    from optid.cli.study_summary import print_former, print_reasons
     from optid.studies.page import write_page
     from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
     verdict = conclude(db, accuracy=accuracy, time=clock)
     say(str(verdict))
-    _former(db)
+    print_reasons(verdict.table)
+    print_former(db)
     if page is not None:
         write_page(verdict, page, command=command_line())
         say(f"report written to {page}")
@@ -242,44 +247,17 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
         + (f", {refused:,} with a solver that is not installed" if refused else ""))
 
 
-def _summary(db: Path, name: str) -> None:
-    """Print how the cells ended, by solver, and the verdict in one line."""
+def _summary(db: Path, name: str) -> bool:
+    """Print how the cells ended, by solver, why, and the verdict in one line; return whether anything was solved."""
+    from optid.cli import study_summary as summary
     from optid.studies.storage.database import read_rows
     from optid.studies.verdicts.verdict import conclude
 
     rows = read_rows(db, study=name)
-    table = Table(title=name, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
-    table.add_column("solver", no_wrap=True)
-    for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
-        table.add_column(column, justify="right")
-    table.add_column("other outcomes", overflow="fold")
-    for solver in sorted(set(rows["solver"])):
-        mine = {key: values[rows["solver"] == solver] for key, values in rows.items()}
-        table.add_row(Text(solver, "bold"), *(f"{count:,}" if count else "-" for count in (
-            len(mine["key"]), int(mine["reached"].sum()), int(mine["proved"].sum()), int(mine["false_claim"].sum()),
-            int((mine["outcome"] == "refused").sum()))), _others(mine))
-    output().print(table)
+    summary.print_outcomes(name, rows)
+    summary.print_reasons(rows)
     headline = conclude(rows).headline
     say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
-    _former(db, name)
+    summary.print_former(db, name)
     say(Text(f"optid study report {db} -o {db.stem}.html", "dim"))
-
-
-def _former(db: Path, name: str | None = None) -> None:
-    """Say how many rows are in the database that no report has."""
-    from optid.studies.storage.database import former
-
-    if count := former(db, name):
-        rows, stay = ("row", "is") if count == 1 else ("rows", "are")
-        say(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run again, "
-                 f"{stay} kept in {db} (table superseded) and in no report", "dim"))
-
-
-def _others(mine: dict[str, Any]) -> str:
-    """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
-    counts: dict[str, int] = {}
-    for outcome, status, reached in zip(mine["outcome"], mine["status_verified"], mine["reached"]):
-        if not reached and outcome != "refused":
-            word = status if outcome == "done" else outcome
-            counts[word] = counts.get(word, 0) + 1
-    return ", ".join(f"{word} {count:,}" for word, count in sorted(counts.items(), key=lambda item: -item[1])) or "-"
+    return not summary.nothing_solved(rows)

@@ -1,0 +1,93 @@
+"""What the commands of studies print about rows: how cells ended, why, and which rows are kept apart."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from optid.cli.terminal import output, say
+from optid.solution import Status
+from optid.studies.storage.rows import DONE, REFUSED
+
+LISTED = 12
+"""Reasons that are printed; the page has them all."""
+
+
+def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
+    """Print a table of how the cells ended, by solver.
+
+    Args:
+        title: of the table.
+        rows: {column: (rows,) array}.
+    """
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    table.add_column("solver", no_wrap=True)
+    for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
+        table.add_column(column, justify="right")
+    table.add_column("other outcomes", overflow="fold")
+    for solver in sorted(set(rows["solver"])):
+        mine = {key: values[rows["solver"] == solver] for key, values in rows.items()}
+        table.add_row(Text(solver, "bold"), *(f"{count:,}" if count else "-" for count in (
+            len(mine["key"]), int(mine["reached"].sum()), int(mine["proved"].sum()), int(mine["false_claim"].sum()),
+            int((mine["outcome"] == REFUSED).sum()))), _others(mine))
+    output().print(table)
+
+
+def _others(mine: Mapping[str, Any]) -> str:
+    """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
+    counts: dict[str, int] = {}
+    for word in _failures(mine):
+        if word and word != REFUSED:
+            counts[word] = counts.get(word, 0) + 1
+    return ", ".join(f"{word} {count:,}" for word, count in sorted(counts.items(), key=lambda item: -item[1])) or "-"
+
+
+def _failures(rows: Mapping[str, Any]) -> list[str]:
+    """The outcome of every row, or the status of one that ended, in one word; empty for a success."""
+    return ["" if reached else status if outcome == DONE else outcome
+            for outcome, status, reached in zip(rows["outcome"], rows["status_verified"], rows["reached"])]
+
+
+def print_reasons(rows: Mapping[str, Any]) -> None:
+    """Print why cells did not reach their accuracy: every reason once, with its solvers and how often it came.
+
+    Sentences that differ in their numbers alone count as one. Refusals come last.
+
+    Args:
+        rows: {column: (rows,) array}.
+    """
+    from optid.studies.verdicts.choice import listed
+    from optid.studies.verdicts.verdict import without_numbers
+
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for word, solver, reason in zip(_failures(rows), rows["solver"], rows["reason"]):
+        if word and reason:
+            reason = " ".join(reason.split())
+            groups.setdefault((word, without_numbers(reason)), []).append((solver, reason))
+    ordered = sorted(groups.items(), key=lambda item: (item[0][0] == REFUSED, -len(item[1]), item[0]))
+    for (word, shape), found in ordered[:LISTED]:
+        reasons = {reason for _, reason in found}
+        names = listed(sorted({solver for solver, _ in found}), most=20)
+        say(Text(f"{names}: {word} {len(found):,}: {reasons.pop() if len(reasons) == 1 else shape}", "dim"))
+    if len(ordered) > LISTED:
+        say(Text(f"and {len(ordered) - LISTED} more reasons, which the page and the database have", "dim"))
+
+
+def nothing_solved(rows: Mapping[str, Any]) -> bool:
+    """Return whether no cell has an answer: a verified point, or the verified word that there is none."""
+    answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))
+    return not answers.any()
+
+
+def print_former(db: Path, study: str | None = None) -> None:
+    """Say how many rows are in the database that no report has."""
+    from optid.studies.storage.database import former
+
+    if count := former(db, study):
+        rows, stay = ("row", "is") if count == 1 else ("rows", "are")
+        say(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run again, "
+                 f"{stay} kept in {db} (table superseded) and in no report", "dim"))
