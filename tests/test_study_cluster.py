@@ -44,7 +44,7 @@ def by_key(found, todo):
 
 def test_rows_are_those_of_one_machine(client, two_processes):
     """Several formulations, a refused pair, systems of the catalogue: equal in every column but times and memory."""
-    study = Study(name="both", time_limit=60.0, seeds=(1, 2),
+    study = Study(name="both", time_limit=300.0, seeds=(1, 2),
                   data=(DataEntry("rig", system="dead_zone", samples=(200,), noise=(0.1,)),),
                   formulations=(FormulationEntry("exact", "hammerstein_arx.exact",
                                                  options={"na": 2, "nb": 2, "basis": "triangular:4"},
@@ -148,8 +148,15 @@ def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, two_processes, mo
     """It is not run for ever: Dask gives up a task after some workers."""
     monkeypatch.setattr(two_processes.scheduler, "allowed_failures", 0)
     monkeypatch.setattr(cluster, "TURNS", 1)
-    todo = [cell(0, seconds=60.0)]
-    killer = threading.Timer(4.0, lambda: [os.kill(pid, signal.SIGKILL) for pid in client.run(os.getpid).values()])
+    log, pids = tmp_path / "log", client.run(os.getpid)
+    todo = [cell(0, seconds=600.0, time_limit=900.0, log=str(log))]
+
+    def kill():
+        wait_for(log.exists, 300.0)
+        for pid in pids.values():
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
     killer.start()
     rows = by_key(list(cluster.execute(todo, behave, scheduler=client)), todo)
     killer.join()
@@ -173,7 +180,7 @@ def test_closing_ends_the_cells_under_way(client, tmp_path):
 
 def file_study(path, seeds=()):
     entry = DataEntry("rig", files=(str(path),), options={"inputs": ["u"], "outputs": ["y"], "dt": 0.1})
-    return Study(name="files", time_limit=60.0, data=(entry,), solvers=(SolverEntry("clarabel", "clarabel"),),
+    return Study(name="files", time_limit=300.0, data=(entry,), solvers=(SolverEntry("clarabel", "clarabel"),),
                  formulations=(FormulationEntry("linear", "arx", options={"na": 1, "nb": 1}),
                                FormulationEntry("linear 2", "arx", options={"na": 2, "nb": 2})))
 
@@ -188,14 +195,19 @@ def record_file(tmp_path):
     return path
 
 
-def test_data_files_that_a_worker_does_not_have_are_sent(client, record_file, tmp_path, monkeypatch):
-    """What a worker finds under the path has another content than here: pretended by a name that differs there."""
+@pytest.fixture
+def no_files(client, tmp_path):
+    """What lets the workers of the cluster find nothing in the folder of the test."""
+    yield lambda: client.run(pretend_no_files, str(tmp_path))
+    client.run(pretend_no_files, "")
+
+
+def test_data_files_that_a_worker_does_not_have_are_sent(client, record_file, no_files):
     todo = cells_of(file_study(record_file))
     here = {row["key"]: row for row in workers.execute(todo, workers=1)}
     seen = {row["key"]: row for row in cluster.execute(todo, scheduler=client)}
-    client.run(pretend_no_files, str(tmp_path))
+    no_files()
     sent = {row["key"]: row for row in cluster.execute(todo, scheduler=client)}
-    client.run(pretend_no_files, "")
     for key, row in here.items():
         for other in (seen[key], sent[key]):
             assert row["outcome"] == "done"
@@ -218,9 +230,9 @@ def pretend_no_files(folder):
         "not here" if folder and files[0].startswith(folder) and "optid-data" not in files[0] else real(files))
 
 
-def test_files_that_cannot_be_sent_are_rows(client, record_file, tmp_path, monkeypatch):
+def test_files_that_cannot_be_sent_are_rows(client, record_file, no_files, monkeypatch):
     todo = cells_of(file_study(record_file))[:1]
-    client.run(pretend_no_files, str(tmp_path))
+    no_files()
     monkeypatch.setattr(cluster, "SHIPPED", 10)
     (row,) = cluster.execute(todo, scheduler=client)
     assert row["outcome"] == "error" and "too large to be sent" in row["reason"]
@@ -230,7 +242,6 @@ def test_files_that_cannot_be_sent_are_rows(client, record_file, tmp_path, monke
     assert row["outcome"] == "error" and "changed while the study ran" in row["reason"]
     record_file.unlink()
     (row,) = cluster.execute(todo, scheduler=client)
-    client.run(pretend_no_files, "")
     assert row["outcome"] == "error" and "it cannot be sent there" in row["reason"]
 
 
