@@ -137,41 +137,67 @@ def test_errors_of_the_record_come_back_as_they_are(record, folders, client):
 
 
 def refused(scheduler):
-    started = time.monotonic()
     with pytest.raises(ClusterError) as caught, connected(scheduler):
         pass
-    assert time.monotonic() - started < 6
     return str(caught.value)
 
 
-def test_a_scheduler_that_cannot_be_reached_is_said_to_be_one_quickly(tmp_path, monkeypatch):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    assert "no scheduler can be reached at tcp://127.0.0.1" in refused(f"tcp://127.0.0.1:{port}")
+@pytest.fixture
+def closed_port():
+    """A port where nothing listens, and that nobody else takes meanwhile."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield taken.getsockname()[1]
+
+
+def test_a_scheduler_that_cannot_be_reached_is_said_to_be_one_quickly(tmp_path, closed_port):
+    started = time.monotonic()
+    assert "no scheduler can be reached at tcp://127.0.0.1" in refused(f"tcp://127.0.0.1:{closed_port}")
+    assert time.monotonic() - started < 6  # a Client alone tries for 30 s
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
-        optid.open_stream(da.zeros((100, 2)), columns=["u", "y"], scheduler=f"127.0.0.1:{port}")
-    assert "no scheduler can be reached at tcp://nowhere.invalid" in refused("nowhere.invalid:8786")
+        optid.open_stream(da.zeros((100, 2)), columns=["u", "y"], scheduler=f"127.0.0.1:{closed_port}")
+    (tmp_path / "scheduler.json").write_text(json.dumps({"address": f"tcp://127.0.0.1:{closed_port}"}))
+    assert "no scheduler can be reached" in refused(tmp_path / "scheduler.json")
+
+
+def test_a_machine_that_nobody_knows_cannot_be_reached(monkeypatch):
+    def unknown(host, *rest, real=socket.getaddrinfo, **more):
+        if host == "nowhere.invalid":
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        return real(host, *rest, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    words = refused("nowhere.invalid:8786")
+    assert "no scheduler can be reached at tcp://nowhere.invalid:8786 (Name or service not known)" in words
+
+
+def test_what_is_no_address_of_a_scheduler_is_refused(tmp_path):
     for text in ("somewhere", "tcp://127.0.0.1", "http://127.0.0.1:8787", "tcp://127.0.0.1:port"):
         assert "write tcp://host:8786" in refused(text)
     assert "scheduler=8786: give an address" in refused(8786)
     assert "not the scheduler file" in refused(tmp_path / "scheduler.json")
-    (tmp_path / "scheduler.json").write_text(json.dumps({"address": f"tcp://127.0.0.1:{port}"}))
-    assert "no scheduler can be reached" in refused(tmp_path / "scheduler.json")
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH\r\n"])
+def test_a_server_of_another_kind_is_no_scheduler(monkeypatch, greeting):
     monkeypatch.setattr(clusters, "ANSWER", 0.5)
-    for greeting in (b"", b"SSH-2.0-OpenSSH\r\n"):
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            thread = threading.Thread(target=greet_once, args=(server, greeting))
-            thread.start()
+    done = threading.Event()
+
+    def greet():
+        connection, _ = server.accept()
+        with connection:
+            connection.sendall(greeting)
+            done.wait()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(60.0)
+        thread = threading.Thread(target=greet)
+        thread.start()
+        try:
             assert "is no Dask scheduler" in refused(f"127.0.0.1:{server.getsockname()[1]}")
+        finally:
+            done.set()
             thread.join()
-
-
-def greet_once(server, greeting):
-    connection, _ = server.accept()
-    with connection:
-        connection.sendall(greeting)
-        time.sleep(1)
 
 
 def test_a_client_that_does_not_run_is_refused(two_processes):
