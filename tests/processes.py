@@ -23,7 +23,7 @@ def cell_workers(pid):
     return found
 
 
-def wait_for(condition, seconds=30.0):
+def wait_for(condition, seconds=180.0):
     """Wait until it holds; an AssertionError where it does not in time."""
     until = time.monotonic() + seconds
     while not condition() and time.monotonic() < until:

@@ -18,7 +18,7 @@ from optid.studies.storage.rows import as_json, complete, place
 FINE = "fine"
 
 
-def cell(number: int, do: str = FINE, *, time_limit: float = 60.0, memory_limit: float = 2000.0, repetition: int = 0,
+def cell(number: int, do: str = FINE, *, time_limit: float = 300.0, memory_limit: float = 2000.0, repetition: int = 0,
          **words: Any) -> Cell:
     """Return a cell that `behave` handles: ``do`` and ``words`` say how."""
     return Cell(key=f"{number:064x}", repetition=repetition, study="trouble", data="none", formulation=str(number),
@@ -95,9 +95,10 @@ def _stuck(cell: Cell, words: dict[str, Any]) -> None:
 
 
 def _hog(cell: Cell, words: dict[str, Any]) -> None:
-    held = []
-    while True:
-        held.append(np.ones(4_000_000))
+    """Take more and more memory, but not all that a slow parent would let it take."""
+    held = [np.ones(4_000_000) for _ in range(47)]  # 1.5 GB
+    while held:
+        time.sleep(1.0)
 
 
 _kept: list[Any] = []

@@ -74,9 +74,9 @@ def test_a_worker_that_dies_between_cells_is_no_fault_of_the_next_cell():
 
 
 @pytest.mark.parametrize("then, words", [("abort", "the worker died: signal SIGABRT"), ("raise", "no such thing"),
-                                         ("stuck", "the limit is 3 s"), ("hog", "the limit is 500 MB")])
+                                         ("stuck", "the limit is 10 s"), ("hog", "the limit is 500 MB")])
 def test_a_row_that_was_kept_stands_whatever_comes_after_it(then, words):
-    rows = by_key([cell(0, "keep_row", then=then, time_limit=3.0 if then == "stuck" else 60.0, memory_limit=500.0),
+    rows = by_key([cell(0, "keep_row", then=then, time_limit=10.0 if then == "stuck" else 300.0, memory_limit=500.0),
                    cell(1, "abort")], workers=1)
     assert (rows[0]["outcome"], rows[0]["objective"]) == ("done", 5.0)
     assert rows[0]["reason"].startswith("no warm solve: ") and words in rows[0]["reason"]
@@ -104,14 +104,14 @@ def test_a_memory_hog_is_stopped():
 
 
 def test_children_count_and_go_with_their_worker(tmp_path):
-    pids = tmp_path / "pids"
-    hog = "held = bytearray(400_000_000)\nimport time\ntime.sleep(60)"
-    sleeper = "import os, time\nos.setsid()\ntime.sleep(60)"  # left the session of the worker
+    pids, left = tmp_path / "pids", tmp_path / "left"
+    hog = "held = bytearray(400_000_000)\nimport time\ntime.sleep(600)"
+    sleeper = f"import os, time\nos.setsid()\nopen({str(left)!r}, 'w').close()\ntime.sleep(600)"
     rows = by_key([cell(0, "family", memory_limit=400.0, program=hog, pids=str(pids)),
-                   cell(1, "family", time_limit=1.0, program=sleeper, pids=str(pids))], workers=1)
+                   cell(1, "family", time_limit=10.0, program=sleeper, pids=str(pids))], workers=1)
     assert (rows[0]["outcome"], rows[1]["outcome"]) == ("memory limit", "time limit")
     children = [int(line) for line in pids.read_text().split()]
-    assert len(children) == 2
+    assert len(children) == 2 and left.exists()  # the second was out of the session of its worker
     wait_for(lambda: all(map(gone, children)))
 
 
@@ -129,8 +129,9 @@ def test_a_noisy_solver_disturbs_nobody(capfd):
 
 def test_a_worker_that_keeps_memory_is_replaced(monkeypatch):
     monkeypatch.setattr(workers, "KEPT_MB", 100.0)
-    cells = [cell(0, "keep", memory_limit=500.0, megabytes=300), cell(1, memory_limit=500.0), cell(2)]
+    cells = [cell(0, "keep", memory_limit=700.0, megabytes=300), cell(1, memory_limit=700.0), cell(2)]
     rows = by_key(cells, workers=1)
+    assert [row["outcome"] for row in rows.values()] == ["done"] * 3
     assert rows[0]["unknowns"] != rows[1]["unknowns"] == rows[2]["unknowns"]
 
 
@@ -147,7 +148,7 @@ def test_closing_ends_the_workers_at_once():
     assert pid in cell_workers(os.getpid())
     clock = time.monotonic()
     rows.close()
-    assert gone(pid) and time.monotonic() - clock < 2.0
+    assert gone(pid) and time.monotonic() - clock < 30.0
     assert not cell_workers(os.getpid())
 
 
@@ -179,7 +180,7 @@ from study_trouble import behave, cell
 from optid.studies.execution.workers import execute
 print("once", [row["outcome"] for row in execute([cell(0)], behave)])
 """)
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=600)
     assert done.stdout == "once ['done']\n", done.stderr
 
 
@@ -209,4 +210,4 @@ def test_a_path_object_in_the_search_path_is_no_obstacle(monkeypatch):
 def test_nothing_to_do_starts_nobody():
     before = set(psutil.Process().children())
     assert list(execute([], behave)) == []
-    assert set(psutil.Process().children()) == before
+    assert set(psutil.Process().children()) <= before
