@@ -118,6 +118,7 @@ def test_rows_in_the_journal_of_a_killed_run_are_taken_over_once(path, grid):
 
 def test_batches_are_readable_while_the_study_runs(path, grid, monkeypatch):
     monkeypatch.setattr(running, "BATCH", 3)
+    monkeypatch.setattr(running, "EVERY", 600.0)
     grid([cell(k) for k in range(8)])
     seen = []
     run(STUDY, path, execute=Hands(), progress=lambda done, total, found: seen.append(len(finished(path))))
@@ -135,6 +136,7 @@ def test_ctrl_c_while_a_batch_is_written_loses_nothing(path, grid, monkeypatch, 
     from optid.studies.storage import database
 
     monkeypatch.setattr(running, "BATCH", 4)
+    monkeypatch.setattr(running, "EVERY", 600.0)
     real, calls = database.append, []
 
     def interrupted(db, rows, patience):
@@ -499,7 +501,9 @@ from functools import partial
 from study_trouble import behave, cell
 from optid.studies.execution import running, workers
 from test_study_running import STUDY
-running.cells = lambda study: [cell(k, seconds=0.02, log={log!r}) for k in range({count})]
+slow = int(sys.argv[1])  # these last until the kill
+running.cells = lambda study: [cell(k, seconds=0.02 if k < slow else 600.0, time_limit=900.0, log={log!r})
+                               for k in range({count})]
 running.run(STUDY, {path!r}, execute=partial(workers.execute, function=behave, workers=2))
 """
 
@@ -513,10 +517,11 @@ def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_p
         return len(log.read_text().splitlines())
 
     for aim in (1, 15, 40):
-        driver = subprocess.Popen([sys.executable, "-c", program])
-        until = time.monotonic() + 120.0
-        while begun() < aim and time.monotonic() < until:
+        driver = subprocess.Popen([sys.executable, "-c", program, str(aim + 10)])
+        until = time.monotonic() + 300.0
+        while begun() < aim and driver.poll() is None and time.monotonic() < until:
             time.sleep(0.005)
+        assert begun() >= aim and driver.poll() is None
         driver.kill()
         driver.wait()
         if path.exists():
@@ -525,7 +530,6 @@ def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_p
     rows = run(STUDY, path, execute=partial(workers.execute, function=behave, workers=2))
     assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished(path)) == count
     assert begun() <= count + 3 * 4  # run twice: at most what three kills found in flight, with one waiting each
-
 
 
 @pytest.mark.parametrize("full", ["journal", "database"])
@@ -541,7 +545,7 @@ from test_study_running import STUDY, Hands
 grid = [cell(k) for k in range(3000)]
 running.cells = lambda study: grid[:10]
 running.run(STUDY, {str(path)!r}, execute=Hands())
-running.cells = lambda study: grid
+running.cells, running.EVERY = lambda study: grid, 600.0
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 room = {8_000 if full == "journal" else 1_000_000}
 resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
