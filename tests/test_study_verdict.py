@@ -8,7 +8,7 @@ import scipy.stats
 from study_rows import rows as synthetic
 from study_rows import run
 
-from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, TIE
+from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, TIE
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
@@ -108,6 +108,52 @@ def test_one_simulation_that_runs_away_does_not_decide():
     next(r for r in rows if r["formulation"] == "exact")["simulation_fit"] = -1e9
     figures = conclude(rows).quality.figures["simulation_fit"]
     assert figures["exact"].mean == pytest.approx((11 * 80 - 100) / 12, abs=5)
+
+
+def sets(losses, records, noise=0.05):
+    """Rows of one solver: losses {data set: {formulation: points}}, records {data set: how many}."""
+    rng = np.random.default_rng(1)
+    return [run("a", p, data=data, formulation=f, simulation_fit=80.0 - loss + noise * rng.normal())
+            for data, of_set in losses.items() for p in range(records[data]) for f, loss in of_set.items()]  # fmt: skip
+
+
+def test_records_of_one_system_do_not_outvote_another_data_set():
+    """Twelve seeds of a simulated system and one measured record are two data sets, not thirteen."""
+    rows = sets({"saturation": {"exact": 9, "oe": 0}, "valve": {"exact": 0, "oe": 2}}, {"saturation": 12, "valve": 1})
+    verdict = conclude(rows)
+    assert verdict.quality.choice.kind == DEPENDS and verdict.headline.word == "Models depend on the data"
+    assert "on saturation oe" in verdict.headline.text and "on valve exact so far" in verdict.headline.text
+    assert verdict.quality.figures["simulation_fit"]["oe"].mean == pytest.approx(79.0, abs=0.2)  # not of 13 records
+    agreeing = conclude(sets({"saturation": {"exact": 9, "oe": 0}, "valve": {"exact": 2, "oe": 0}},
+                             {"saturation": 12, "valve": 1}))  # fmt: skip
+    assert agreeing.quality.choice.kind == CANNOT_TELL
+    assert "at least 6 data sets, or 6 records of each" in str(agreeing)
+
+
+def test_of_few_data_sets_each_speaks_for_itself():
+    both = {"one": {"x": 0, "y": 3}, "two": {"x": 0, "y": 9}}
+    verdict = conclude(sets(both, {"one": 8, "two": 8}))
+    assert verdict.headline.word == "Best models: x" and verdict.quality.choice.tied == ()
+    assert "on each of 2 data sets: on one x" in verdict.headline.text and "; on two x" in verdict.headline.text
+    half = conclude(sets({**both, "two": {"x": 0, "y": 0}}, {"one": 8, "two": 8}))
+    assert half.headline.word == "Best models: x" and " tie, a fit of" in half.headline.text
+    against = conclude(sets({**both, "two": {"x": 9, "y": 0}}, {"one": 8, "two": 80}))
+    assert against.quality.choice.kind == DEPENDS and "Best models" not in str(against)
+
+
+def test_of_many_data_sets_each_counts_once():
+    losses = {f"set {d}": {"x": 0, "y": 3 + d / 10} for d in range(8)} | {"odd": {"x": 20, "y": 0}}
+    records = {name: 2 for name in losses}
+    few = conclude(sets(losses, records)).quality.choice
+    assert few.against["y"].n == 9
+    many = conclude(sets(losses, records | {"odd": 300})).quality.choice
+    assert many.kind == few.kind and many.against["y"].value == pytest.approx(few.against["y"].value, abs=0.1)
+    del losses["odd"]
+    verdict = conclude(sets(losses, records))
+    assert verdict.headline.word == "Best models: x" and "8 data sets)" in verdict.headline.text
+    reversed_one = conclude(sets(losses | {"set 7": {"x": 1, "y": 0}}, records | {"set 7": 9}))
+    assert reversed_one.headline.word == "Best models: x"
+    assert "On set 7 another one is ahead." in reversed_one.headline.text
 
 
 def test_an_unknown_truth_is_said():

@@ -15,16 +15,18 @@ from optid.showing.page import template, versions
 from optid.showing.wording import Table, number, seconds
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
-from optid.studies.verdicts.advice import Statement, choice_of_solver, evidence, model_evidence, plural
+from optid.studies.verdicts.advice import choice_of_solver, evidence
 from optid.studies.verdicts.choice import CANNOT_TELL
+from optid.studies.verdicts.model_advice import model_evidence
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
-from optid.studies.verdicts.quality import FIGURES, Quality
+from optid.studies.verdicts.quality import FIGURES, DataSet, Quality
+from optid.studies.verdicts.statement import Statement, plural
 from optid.studies.verdicts.verdict import Verdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
 FOLDED = 8  # formulations above which their list is folded away
-LISTED = 40  # false claims on the page; the database has them all
+LISTED = 40  # false claims, and rows of the models, on the page; the database has them all
 WIDEST = 120  # characters of a text in a table
 REASON = 400  # characters of a reason, which is broken into lines
 
@@ -172,18 +174,27 @@ def _claims(verdict: Verdict) -> Table | None:
 
 
 def _quality_table(quality: Quality) -> Table:
-    """Mean figures of the models of every formulation."""
-    head = ("formulation", "records solved", "simulation fit", "one-step fit", "parameter error", "nonlinearity error")
+    """Mean figures of the models of every formulation, and those on each data set where these are few."""
+    head = ("records solved", "simulation fit", "one-step fit", "parameter error", "nonlinearity error")
+    apart = len(quality.sets) > 1 and (len(quality.sets) + 1) * len(quality.formulations) <= LISTED
     rows = []
     for name in quality.formulations:
-        figures = [quality.figures[c][name].mean for c in FIGURES]
-        fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
-        errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]
-        rows.append((_short(name), f"{quality.solved[name]:,} of {quality.records:,}", *fits, *errors))
-    note = ("Means over the records that the formulation solved, of the model with the best verified objective; fits "
-            "on samples the fit did not see. Means over different records do not compare: the verdict pairs them."
-            )  # fmt: skip
-    return Table("Models", head, rows, note)
+        whole = f"all {len(quality.sets)}" if len(quality.sets) > 1 else _short("".join(s.name for s in quality.sets))
+        rows.append((_short(name), whole, *_models(quality, name)))
+        if apart:
+            rows += [(_short(name), _short(one.name), *_models(one, name)) for one in quality.sets]
+    note = ("Means over the records that the formulation solved, and of those over the data sets, of the model with "
+            "the best verified objective; fits on samples the fit did not see. Means over different records do not "
+            "compare: the verdict pairs them.")  # fmt: skip
+    return Table("Models", ("formulation", "data set", *head), rows, note)
+
+
+def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
+    """The figures of one formulation as words."""
+    figures = [quality.figures[c][name].mean for c in FIGURES]
+    fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
+    errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]
+    return (f"{quality.solved[name]:,} of {quality.records:,}", *fits, *errors)
 
 
 def _machines(verdict: Verdict) -> list[tuple[str, str]]:

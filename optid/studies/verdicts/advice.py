@@ -1,47 +1,17 @@
 """The verdict in words: recommendations with the numbers they rest on, warnings, and what cannot be told."""
 
-from dataclasses import dataclass
-
 from optid.showing.wording import seconds
 from optid.studies.verdicts.averages import Paired
-from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
+from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, listed
+from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
 from optid.studies.verdicts.quality import Quality
 from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, of, plural
 
-GOOD, FAIR, BAD = "good", "fair", "bad"
 RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
 LONGEST = 90  # characters of a headline
 NO_SOLVER = "No solver can be recommended"
-
-
-@dataclass(frozen=True)
-class Statement:
-    """One sentence or two.
-
-    Attributes:
-        tone: "good", "fair" or "bad".
-        word: the heading: what to do.
-        text: why, with the numbers.
-        about: "solver", "formulation", "data sets", "claims".
-    """
-
-    tone: str
-    word: str
-    text: str
-    about: str
-
-
-def plural(n: int, noun: str) -> str:
-    """Write "1 problem", "3 problems"."""
-    return f"{n:,} {noun}{'' if n == 1 else 's'}"
-
-
-def of(n: int, total: int, noun: str = "problem") -> str:
-    """Write "3 of 4 problems"; "all 4 problems" where nothing is missing."""
-    if n == total:
-        return f"the only {noun}" if total == 1 else f"all {plural(total, noun)}"
-    return f"{n:,} of {plural(total, noun)}"
 
 
 def choice_of_solver(section: Section) -> Statement:
@@ -120,28 +90,6 @@ def _next(section: Section) -> Standing | None:
         return section.standing(min(rivals, key=lambda rival: choice.against[rival].value))
     others = [s for s in section.standings if s.solver != choice.first and s.solved]
     return max(others, key=lambda s: s.solved, default=None)
-
-
-def model_evidence(quality: Quality, name: str) -> str:
-    """Say in a few words how far the models of a formulation stay behind the best."""
-    choice = quality.choice
-    if name == choice.first:
-        return {FIRST: "best", TIE: "tied for the best"}.get(choice.kind, "best so far")
-    pair = choice.against.get(name)
-    if pair is None or not pair.n:
-        return "no record in common with the best" if choice.first else choice.missing
-    tied = "tied: " if name in choice.tied and choice.kind == TIE else ""
-    if quality.measure == "parameter_error":
-        return f"{tied}{pair.value:.3g} × the error ({pair.low:.3g} to {pair.high:.3g})"
-    ahead = pair.value <= -0.005
-    value, low, high = (-pair.value, -pair.high, -pair.low) if ahead else (pair.value, pair.low, pair.high)
-    interval = f" ({_points(low)} to {_points(high)})" if pair.n > 1 else ""
-    return f"{tied}{_points(value)} points{interval} {'ahead where both were solved' if ahead else 'behind'}"
-
-
-def _points(value: float) -> str:
-    """Write points of fit with two decimals, zero without a sign."""
-    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def _times(pair: Paired) -> str:
@@ -252,48 +200,6 @@ def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     return Statement(GOOD, word, text, "data sets")
 
 
-def choice_of_formulation(quality: Quality) -> Statement | None:
-    """Say which formulation gives the best models, or why that cannot be told; None for a single formulation."""
-    choice, n = quality.choice, quality.records
-    if len(quality.formulations) < 2 or not any(quality.solved.values()):
-        return None
-    if choice.kind == NOBODY:
-        text = "No model has a simulation fit on samples it has not seen (keep a hold-out share) or a known truth."
-        return Statement(FAIR, "Models: cannot tell", text, "formulation")
-    if not choice.first:
-        return Statement(FAIR, "Models: cannot tell", f"The comparison {choice.missing}.", "formulation")
-    lead = f"{choice.first} has {_model_figure(quality)} {of(choice.solved[choice.first], n, 'record')}"
-    if choice.kind == CANNOT_TELL:
-        text = f"The comparison {choice.missing}. So far {lead}."
-        return Statement(FAIR, "Models: cannot tell yet", text, "formulation")
-    if choice.kind == TIE:
-        each = "; ".join(f"{name} {_behind(quality, choice.against[name])}" for name in choice.tied[:3])
-        trifle = "10 %" if quality.measure == "parameter_error" else "0.1 points"
-        text = f"{lead}. No difference beyond chance or {trifle}: {each}."
-        return Statement(GOOD, f"Equal models: {listed((choice.first, *choice.tied))}", text, "formulation")
-    rivals = [name for name in choice.candidates if name != choice.first]
-    if not rivals:
-        text = f"{lead}; no other has a {quality.measure.replace('_', ' ')} on half as many records."
-        return Statement(FAIR, "Models: cannot tell", text, "formulation")
-    name = min(rivals, key=lambda rival: choice.against[rival].value)
-    text = f"{lead}; the next, {name}, {_behind(quality, choice.against[name])}."
-    return Statement(GOOD, f"Best models: {choice.first}", text, "formulation")
-
-
-def _model_figure(quality: Quality) -> str:
-    mean = quality.figures[quality.measure][quality.choice.first].mean
-    if quality.measure == "parameter_error":
-        return f"a mean parameter error of {100 * mean:.3g} % on"
-    return f"a mean simulation fit of {mean:.2f} % on unseen samples of"
-
-
-def _behind(quality: Quality, pair: Paired) -> str:
-    if quality.measure == "parameter_error":
-        return f"has {pair.value:.3g} times the error (95 %: {pair.low:.3g} to {pair.high:.3g}, {pair.n:,} records)"
-    interval = f"(95 %: {_points(pair.low)} to {_points(pair.high)}, {pair.n:,} records)"
-    return f"stays {_points(pair.value)} points behind {interval}"
-
-
 def headline(overall: Section, sections: list[Section], quality: Quality) -> Statement:
     """Say the verdict in one line: one solver for everything, or that it depends on the formulation.
 
@@ -305,7 +211,7 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
     choice, n = overall.choice, len(overall.found.data)
     if len(overall.standings) == 1:
         models = choice_of_formulation(quality)
-        decided = models is not None and quality.choice.kind in (FIRST, TIE) and models.tone == GOOD
+        decided = quality.choice.kind in (FIRST, TIE, DEPENDS) and models is not None and models.word != UNDECIDED
         return models if models is not None and decided else choice_of_solver(overall)
     if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)

@@ -27,7 +27,7 @@ class Paired:
     Attributes:
         value: geometric mean of the ratios, or mean of the differences; ``nan`` without a common problem.
         low, high: its 95 % interval; infinite with fewer than two problems.
-        n: problems that both solved.
+        n: problems that both solved, or groups of them.
     """
 
     value: float
@@ -41,14 +41,18 @@ class Paired:
         return self.n >= MINIMUM_PAIRS
 
 
-def paired_difference(values: np.ndarray, reference: np.ndarray) -> Paired:
+def paired_difference(values: np.ndarray, reference: np.ndarray, groups: np.ndarray | None = None) -> Paired:
     """Return the mean of ``values - reference`` with its 95 % interval from Student's distribution.
 
     Args:
         values: (P,), ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
+        groups: (P,) labels; where given, the mean of each group counts as one difference.
     """
-    d = (values - reference)[np.isfinite(values) & np.isfinite(reference)]
+    both = np.isfinite(values) & np.isfinite(reference)
+    d = (values - reference)[both]
+    if groups is not None:
+        d = means_of_groups(d, groups[both])
     mean = float(np.mean(d)) if d.size else float("nan")
     if d.size < 2:
         return Paired(mean, float("-inf"), float("inf"), int(d.size))
@@ -56,13 +60,24 @@ def paired_difference(values: np.ndarray, reference: np.ndarray) -> Paired:
     return Paired(mean, mean - half, mean + half, int(d.size))
 
 
-def paired_ratio(times: np.ndarray, reference: np.ndarray) -> Paired:
+def means_of_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Return the mean of every group, in order of first appearance.
+
+    Args:
+        values: (P,) finite.
+        groups: (P,) labels.
+    """
+    return np.array([np.mean(values[groups == label]) for label in dict.fromkeys(groups)])
+
+
+def paired_ratio(times: np.ndarray, reference: np.ndarray, groups: np.ndarray | None = None) -> Paired:
     """Return the geometric mean of ``times / reference`` with its 95 % interval.
 
     Args:
         times: (P,) positive, ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
+        groups: (P,) labels; where given, the mean of each group counts as one ratio.
     """
-    logs = paired_difference(np.log(times), np.log(reference))
+    logs = paired_difference(np.log(times), np.log(reference), groups)
     value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
     return Paired(value, low, high, logs.n)

@@ -9,6 +9,7 @@ from scipy.stats import binom
 from optid.studies.verdicts.averages import MINIMUM_PAIRS, Paired
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
+DEPENDS = "depends"
 VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2
 RELIABLE = 0.01  # share of the problems by which the number solved may stay behind the most reliable
 LEVEL = 0.05  # of the test whether it stays behind by more than chance
@@ -21,7 +22,7 @@ class Choice:
     Attributes:
         kind: "first" (one is ahead), "tie" (those named are known to be close), "cannot tell" (too few data, or an
             order that depends on the problems; `missing` says which), "only one" (nothing to compare with), "nobody"
-            (not one problem solved).
+            (not one problem solved), "depends" (everybody is behind on one of the data sets).
         first: who is ahead, of a tie the one that solved most, then the one with the best mean; "" where there is
             nobody.
         tied: the others that cannot be told apart from it.
@@ -44,7 +45,7 @@ class Choice:
 
 def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
            compare: Callable[[np.ndarray, np.ndarray], Paired], none: float = 0.0, slack: float = RELIABLE,
-           noun: str = "problem") -> Choice:
+           noun: str = "problem", units: int | None = None) -> Choice:
     """Choose the least costly of the most reliable.
 
     Args:
@@ -53,7 +54,8 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
         minor: a mean comparison closer to ``none`` than this is of no practical meaning.
         compare: one column of costs against another, such as `paired_ratio`.
         none: the comparison of equals (1 for ratios, 0 for differences).
-        noun: what a row of the costs is called.
+        noun: what the comparison counts as one is called.
+        units: how many of those there are, where that is not a row of the costs but a group of them.
         slack: share of the problems by which the number solved may stay behind the most reliable.
 
     Returns:
@@ -66,6 +68,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     known = np.isfinite(costs)
     counts = known.sum(axis=0)
     solved, problems = {name: int(c) for name, c in zip(names, counts)}, len(costs)
+    units = problems if units is None else units
     if not counts.any():
         return Choice(NOBODY, solved=solved, problems=problems, missing="needs a solver that reaches the accuracy")
     allowed = int(slack * problems)
@@ -81,15 +84,15 @@ def choose(costs: np.ndarray, names: tuple[str, ...], minor: float,
     if not common.any():
         missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve"
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, problems, missing)
-    lead = min(leaders, key=lambda s: _mean(costs[common, s], compare))
+    lead = min(leaders, key=lambda s: _mean(np.where(common, costs[:, s], np.nan), compare))
     against = {names[s]: compare(costs[:, s], costs[:, lead]) for s in np.flatnonzero(counts) if s != lead}
     tied = tuple(name for name in candidates if name in against and not _apart(against[name], minor, none))
     kind, missing = (TIE if tied else FIRST), ""
     if len(names) == 1:
         kind = ONLY_ONE
-    elif problems < MINIMUM_PAIRS:
+    elif units < MINIMUM_PAIRS:
         kind = CANNOT_TELL
-        missing = f"needs at least {MINIMUM_PAIRS} {noun}s; there {'is' if problems == 1 else 'are'} {problems}"
+        missing = f"needs at least {MINIMUM_PAIRS} {noun}s; there {'is' if units == 1 else 'are'} {units}"
     elif any(not against[name].enough for name in tied):
         kind = CANNOT_TELL
         few = next(name for name in tied if not against[name].enough)

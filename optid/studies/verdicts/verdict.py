@@ -10,16 +10,9 @@ import numpy as np
 
 from optid.errors import DataError
 from optid.studies.storage.rows import REFUSED
-from optid.studies.verdicts.advice import (
-    Statement,
-    carries_over,
-    choice_of_formulation,
-    choice_of_solver,
-    headline,
-    no_solution,
-    plural,
-)
+from optid.studies.verdicts.advice import carries_over, choice_of_solver, headline, no_solution
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
+from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.outcomes import (
     CONTRADICTED,
     OTHER_ACCURACY,
@@ -33,6 +26,7 @@ from optid.studies.verdicts.outcomes import (
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import Section, compare_solvers
+from optid.studies.verdicts.statement import Statement, plural
 from optid.studies.verdicts.table import columns
 
 

@@ -1,0 +1,34 @@
+"""One sentence of a verdict, and how its numbers are written."""
+
+from dataclasses import dataclass
+
+GOOD, FAIR, BAD = "good", "fair", "bad"
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One sentence or two.
+
+    Attributes:
+        tone: "good", "fair" or "bad".
+        word: the heading: what to do.
+        text: why, with the numbers.
+        about: "solver", "formulation", "data sets", "claims".
+    """
+
+    tone: str
+    word: str
+    text: str
+    about: str
+
+
+def plural(n: int, noun: str) -> str:
+    """Write "1 problem", "3 problems"."""
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def of(n: int, total: int, noun: str = "problem") -> str:
+    """Write "3 of 4 problems"; "all 4 problems" where nothing is missing."""
+    if n == total:
+        return f"the only {noun}" if total == 1 else f"all {plural(total, noun)}"
+    return f"{n:,} of {plural(total, noun)}"
