@@ -4,6 +4,7 @@ import csv as comma
 from pathlib import Path
 
 import pytest
+from study_rows import FAILED, row
 from typer.testing import CliRunner
 
 from optid.cli.app import app
@@ -13,8 +14,7 @@ from optid.studies.definition.description import Study
 from optid.studies.execution.cell import lost_row
 from optid.studies.grid import cells
 from optid.studies.storage.database import read_rows
-from optid.studies.storage.rows import complete
-from optid.studies.verdicts.comparison import compare
+from optid.studies.storage.one_study import rows_of_one
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
 STUDY = """
@@ -160,8 +160,34 @@ def test_every_reason_is_told_once_and_a_run_without_an_answer_ends_with_4(folde
     for found in first, run("study", "report", "rigs.duckdb"):
         told = [line for line in found.stdout.splitlines() if line.startswith("clarabel: refused 3: ")]
         assert len(told) == 1 and ".exact' is not convex" in told[0] and found.stdout.count("scs: refused 3: ") == 1
+    for accuracy in (-1, "nan", 1):
+        refused = run("study", "report", "rigs.duckdb", "--accuracy", accuracy)
+        assert refused.exit_code == 2 and f"between 0 and 1; {accuracy} is not" in refused.stderr
     Path("rigs.toml").write_text(exact.format(solvers='["clarabel", "gauss_newton"]'))
     assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
+
+
+def test_two_studies_of_one_database_are_never_one(folder):
+    text = STUDY.partition("[[data]]\nfile")[0] + STUDY[STUDY.index('[[formulation]]\nformulation = "arx"'):]
+    for name in ("first rig", "other_rig"):
+        Path("rigs.toml").write_text(text.format(solvers='["clarabel"]').replace('"rigs"', f'"{name}"'))
+        told = run("study", "run", "rigs.toml", "-w", 1, "--export", "one.csv")
+        assert told.exit_code == 0 and "2 rows written to one.csv" in told.stdout
+        said = "optid study report rigs.duckdb -o rigs.html" + (" --study other_rig" if name == "other_rig" else "")
+        assert said in told.stdout.splitlines()
+    refused = run("study", "report", "rigs.duckdb", "-o", "page.html")
+    assert refused.exit_code == 2 and not Path("page.html").exists()
+    assert "holds 2 studies: 'first rig' (2 rows), 'other_rig' (2 rows). Name one: --study TITLE" in refused.stderr
+    one = run("study", "report", "rigs.duckdb", "--study", "first rig", "-o", "page.html")
+    assert one.exit_code == 0 and "other_rig" not in Path("page.html").read_text()
+    assert "Did you mean 'other_rig'?" in run("study", "report", "rigs.duckdb", "--study", "othr_rig").stderr
+    assert run("study", "export", "rigs.duckdb", "all.csv").stdout == "4 rows of 2 studies written to all.csv\n"
+    assert run("study", "export", "rigs.duckdb", "1.csv", "--study", "other_rig").stdout == "2 rows written to 1.csv\n"
+    with open("1.csv", newline="") as file:
+        assert {line["study"] for line in comma.DictReader(file)} == {"other_rig"}
+    assert run("study", "export", "rigs.duckdb", "2.csv", "--study", "third").exit_code == 2
+    with pytest.raises(StudyError, match="holds 2 studies"):
+        rows_of_one("rigs.duckdb")
 
 
 def test_reasons_that_differ_in_their_numbers_are_one(capsys):
@@ -254,54 +280,6 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     assert found.exit_code == 2 and found.stderr.count("is binary") == 1 and "no solver could be tried" in found.stderr
 
 
-def row(solver, **values):
-    given = {"key": solver, "repetition": 0, "place": solver, "study": "s", "data": "d", "formulation": "f",
-             "solver": solver, "formulation_name": "f", "options": "{}", "constraints": "[]", "solver_name": solver,
-             "solver_options": "{}", "accuracy": 1e-8, "holdout": 0.3, "time_limit": 60.0, "memory_limit": 2e3,
-             "outcome": "done", "status_verified": "optimal", "proved": True, "reached": True, "objective": 1.0,
-             "scale": 10.0, "violation": 1e-12, "stationarity": 1e-12, "solve_s": 0.01,
-             "started": "2026-01-01T00:00:00",
-             "machine": "m", "versions": "{}", "warm": True, "warm_s": 0.005}
-    return complete({**given, **values})
-
-
-LOCAL = {"status_verified": "locally optimal", "proved": False}
-FAILED = {"status_verified": "failed", "reached": False, "proved": False, "objective": None, "reason": "it broke"}
-
-
-@pytest.mark.parametrize("rows, words", [
-    ([row("a"), row("b", solve_s=0.03), row("c", solve_s=0.05)],
-     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; next is b with 30 ms."),
-    ([row("a"), row("b", solve_s=0.0105)], "Use a or b: they reached the verified accuracy of 1e-08 in 10 ms, equal "
-     "within 10%, proved globally optimal."),
-    ([row("a", **LOCAL), row("b", solve_s=0.03)],
-     "Use b: it reached the verified accuracy of 1e-08 in 30 ms, proved globally optimal; next is a with 10 ms "
-     "(without a proof)."),
-    ([row("a", **LOCAL), row("b", solve_s=0.03, **LOCAL)],
-     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, not proved globally optimal; next is b with 30 ms."),
-    ([row("a", objective=1.01, **LOCAL), row("b", solve_s=3.0)],
-     "Use b: it reached the verified accuracy of 1e-08 in 3 s, proved globally optimal; a did not."),
-    ([row("a", **FAILED), row("b", **FAILED)], "No solver reached the verified accuracy of 1e-08: failed: a and b."),
-    ([row("a")], "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; there is no "
-     "other to compare it with."),
-    ([row("a", outcome="refused", status_verified=None, reached=False, proved=False, reason="not its class")],
-     "No solver takes this formulation: choose others (optid solvers)."),
-    ([row("a", false_claim=True), row("b", solve_s=9.0)],
-     "Use b: it reached the verified accuracy of 1e-08 in 9 s, proved globally optimal; a did not."),
-])
-def test_recommendations(rows, words):
-    assert compare(rows).recommendation == words
-
-
-def test_lines_have_the_numbers_of_the_rows():
-    rows = [row("a", compile_s=0.02, repetition=k, solve_s=s, place=f"a{k}") for k, s in enumerate((0.01, 0.03, 0.02))]
-    found = compare([*rows, row("b", objective=1.5, one_step_fit=90.0), row("c", **FAILED), row("d", **FAILED)])
-    a, b = (next(line for line in found.lines if line.solver == name) for name in "ab")
-    assert a.cold == pytest.approx(0.04) and a.above == 0 and a.warm == 0.005
-    assert b.above == pytest.approx(0.5) and b.state == "worse minimum" and b.one_step == 90.0
-    assert found.reasons == {"it broke": ["c", "d"]}
-
-
 # -- what a new user gets wrong ----------------------------------------------------------------------------------------
 
 
@@ -317,8 +295,6 @@ def test_lines_have_the_numbers_of_the_rows():
     (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
     (("study", "report", "none.duckdb"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),
-    (("study", "report", "none.duckdb", "--accuracy", -1), "accuracy is a number between 0 and 1; -1 is not"),
-    (("study", "report", "none.duckdb", "--accuracy", "nan"), "accuracy is a number between 0 and 1; nan is not"),
     (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
     (("compare",), "give a data file, or --example"),
     (("compare", "none.csv"), "no file 'none.csv'"),

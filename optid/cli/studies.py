@@ -32,6 +32,9 @@ Accept = Annotated[
     typer.Option("--accept-changed-data", help="Run cells again whose data file is not what it was at the last run."),
 ]
 Database = Annotated[Path, typer.Argument(metavar="DATABASE", help="Written by optid study run.", show_default=False)]
+OneStudy = Annotated[
+    str | None, typer.Option("--study", metavar="TITLE", help="Of a database that holds several: this study.")
+]
 Accuracy = Annotated[
     float | None, typer.Option("--accuracy", help="Compare at this accuracy; that of most cells if not given.")
 ]
@@ -88,7 +91,7 @@ def run(
                     accept_changed_data=accept_changed_data, retry=retry or ())
     solved = _summary(db, described.name)
     if export is not None:
-        count = database.export(db, export)
+        count = database.export(db, export, described.name)
         say(f"{count} rows written to {export}")
     if not solved:
         raise typer.Exit(NOTHING_SOLVED)
@@ -100,6 +103,7 @@ def report(
     page: Annotated[
         Path | None, typer.Option("--report", "-o", metavar="FILE", help="Write a self-contained HTML page.")
     ] = None,
+    title: OneStudy = None,
     accuracy: Accuracy = None,
     clock: Clock = "solve",
 ) -> None:
@@ -110,13 +114,14 @@ def report(
     from optid.cli.arguments import check_folders
     from optid.cli.study_summary import print_former, print_reasons
     from optid.studies.page import write_page
+    from optid.studies.storage.one_study import rows_of_one
     from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
-    verdict = conclude(db, accuracy=accuracy, time=clock)
+    verdict = conclude(rows_of_one(db, title), accuracy=accuracy, time=clock)
     say(str(verdict))
     print_reasons(verdict.table)
-    print_former(db)
+    print_former(db, title)
     if page is not None:
         write_page(verdict, page, command=command_line())
         say(f"report written to {page}")
@@ -126,16 +131,21 @@ def report(
 def export(
     db: Database,
     target: Annotated[Path, typer.Argument(metavar="FILE", help="A .parquet or .csv file.", show_default=False)],
+    title: OneStudy = None,
 ) -> None:
-    """Write the rows of a database to a Parquet or CSV file.
+    """Write the rows of a database, of one study or of all, to a Parquet or CSV file.
 
     Example: optid study export study.duckdb rows.parquet
     """
     from optid.cli.arguments import check_folders
     from optid.studies.storage import database
+    from optid.studies.storage.one_study import rows_of_one
 
     check_folders(target)
-    say(f"{database.export(db, target)} rows written to {target}")
+    rows = rows_of_one(db, title) if title is not None else database.read_rows(db)
+    count = database.export(db, target, title)
+    studies = len(set(rows["study"]))
+    say(f"{count} rows{f' of {studies} studies' if studies > 1 else ''} written to {target}")
 
 
 @study.command(cls=Command)
@@ -249,15 +259,20 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
 
 def _summary(db: Path, name: str) -> bool:
     """Print how the cells ended, by solver, why, and the verdict in one line; return whether anything was solved."""
+    import shlex
+
     from optid.cli import study_summary as summary
     from optid.studies.storage.database import read_rows
     from optid.studies.verdicts.verdict import conclude
 
-    rows = read_rows(db, study=name)
+    every = read_rows(db)
+    rows = {column: values[every["study"] == name] for column, values in every.items()}
     summary.print_outcomes(name, rows)
     summary.print_reasons(rows)
     headline = conclude(rows).headline
     say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
     summary.print_former(db, name)
-    say(Text(f"optid study report {db} -o {db.stem}.html", "dim"))
+    words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
+    words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
+    say(Text(shlex.join(words), "dim"))
     return not summary.nothing_solved(rows)

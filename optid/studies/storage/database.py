@@ -369,25 +369,28 @@ def check_target(target: str | Path) -> Path:
     return target
 
 
-def export(path: str | Path, target: str | Path) -> int:
+def export(path: str | Path, target: str | Path, study: str | None = None) -> int:
     """Write the rows to a Parquet or CSV file and return how many there are.
 
     Args:
         path: the database.
         target: file that ends in .parquet or .csv; replaced when it is there.
+        study: only rows of this study.
 
     Raises:
         DatabaseError: another ending, the target cannot be written, or as in `opened`.
     """
     target = check_target(target)
+    condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
     names = ", ".join(f'"{name}"' for name in NAMES)
     with opened(path) as connection:
         import duckdb
 
         try:
             count = connection.execute(
-                f"COPY (SELECT {names} FROM rows ORDER BY started, key, repetition) "
-                f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({FORMATS[target.suffix.lower()]})").fetchone()
+                f"COPY (SELECT {names} FROM rows {condition} ORDER BY started, key, repetition) "
+                f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({FORMATS[target.suffix.lower()]})", values
+            ).fetchone()
         except duckdb.Error as error:
             raise DatabaseError(f"{target} cannot be written: {str(error).splitlines()[0]}") from None
     return int(count[0]) if count else 0
