@@ -13,8 +13,9 @@ from optid.examples import example
 from optid.studies.definition.description import Study
 from optid.studies.execution.cell import lost_row
 from optid.studies.grid import cells
+from optid.studies.page import write_page
 from optid.studies.storage.database import read_rows
-from optid.studies.storage.one_study import rows_of_one
+from optid.studies.verdicts.verdict import conclude
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
 STUDY = """
@@ -187,7 +188,11 @@ def test_two_studies_of_one_database_are_never_one(folder):
         assert {line["study"] for line in comma.DictReader(file)} == {"other_rig"}
     assert run("study", "export", "rigs.duckdb", "2.csv", "--study", "third").exit_code == 2
     with pytest.raises(StudyError, match="holds 2 studies"):
-        rows_of_one("rigs.duckdb")
+        conclude("rigs.duckdb")
+    with pytest.raises(StudyError, match="holds 2 studies"):
+        write_page("rigs.duckdb", "page.html")
+    assert set(conclude("rigs.duckdb", study="first rig").table["study"]) == {"first rig"}
+    assert "other_rig" not in write_page("rigs.duckdb", "page.html", study="first rig").read_text()
 
 
 def test_reasons_that_differ_in_their_numbers_are_one(capsys):

@@ -32,7 +32,7 @@ REASON = 400  # characters of a reason, which is broken into lines
 
 
 def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: str = "",
-               accuracy: float | None = None, time: str = "solve") -> Path:
+               study: str | None = None, accuracy: float | None = None, time: str = "solve") -> Path:
     """Write the page of a study: verdict, tables, figures and all runs in one file that makes no request.
 
     Args:
@@ -40,6 +40,7 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
         path: the file, replaced when it exists.
         title: heading; unless given, the title of the study.
         command: the command line behind it, for the section that says how to reproduce it.
+        study: its title, for a database that holds several.
         accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
 
@@ -48,11 +49,12 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
 
     Raises:
         DataError: these are no rows of a study, or an unknown measure of time.
+        StudyError: the database holds several studies, and none is named.
         DatabaseError: the database cannot be read.
         OSError: the file cannot be written.
     """  # fmt: skip
     given = isinstance(rows_or_db, Verdict)
-    verdict = rows_or_db if given else conclude(rows_or_db, accuracy=accuracy, time=time)
+    verdict = rows_or_db if given else conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
     path = Path(path)
     path.write_text(render(verdict, title=title, command=command), encoding="utf-8", errors="replace")
     return path

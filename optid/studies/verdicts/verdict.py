@@ -107,11 +107,13 @@ class Verdict:
         return "\n".join(f"{s.word}: {s.text}" for s in (self.headline, *self.statements))
 
 
-def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", level: float = 0.05) -> Verdict:
+def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve",
+             level: float = 0.05) -> Verdict:
     """Draw the conclusions from the rows of a study.
 
     Args:
         rows: a mapping of columns, a frame, dict rows, or the path of a database.
+        study: its title, for a database that holds several.
         accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
         level: significance level of the test over data sets.
@@ -121,14 +123,15 @@ def conclude(rows: Any, *, accuracy: float | None = None, time: str = "solve", l
 
     Raises:
         DataError: these are no rows of a study, an unknown measure of time, or an accuracy that is none.
+        StudyError: the database holds several studies, and none is named.
         DatabaseError: the database cannot be read.
     """
     if accuracy is not None and not 0 < accuracy < 1:
         raise DataError(f"accuracy is a number between 0 and 1; {accuracy:g} is not")
     if isinstance(rows, str | Path):
-        from optid.studies.storage.database import read_rows
+        from optid.studies.storage.one_study import rows_of_one
 
-        rows = read_rows(rows)
+        rows = rows_of_one(rows, study)
     table = columns(rows)
     at = usual_accuracy(table) if accuracy is None else accuracy
     found = tabulate(table, at, time)
