@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -115,6 +116,10 @@ def _family(cell: Cell, words: dict[str, Any]) -> None:
     with open(words["pids"], "a") as file:
         file.write(f"{child.pid}\n")
     child.wait()
+
+
+def _cores(cell: Cell, words: dict[str, Any]) -> Any:
+    return row(cell, iterations=resource.getrlimit(resource.RLIMIT_CORE)[0])
 
 
 def _raise(cell: Cell, words: dict[str, Any]) -> None:

@@ -1,7 +1,9 @@
 """Workers: whatever a cell does to its process is a row, and the others go on."""
 
 import os
+import pickle
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from study_trouble import behave, cell
 
 from optid.errors import StudyError
 from optid.studies.execution import workers
+from optid.studies.execution.worker_process import WorkerProcess
 from optid.studies.execution.workers import Pool, execute
 from optid.studies.storage.rows import NAMES
 
@@ -115,6 +118,59 @@ def test_children_count_and_go_with_their_worker(tmp_path):
     wait_for(lambda: all(map(gone, children)))
 
 
+@pytest.fixture
+def with_child(tmp_path):
+    """Give a worker a cell whose child runs a program, and wait until that has made a file."""
+    started = []
+
+    def start(program):
+        worker = WorkerProcess(pickle.dumps((behave, None)))
+        started.append(worker)
+        assert worker.connection.recv()[0] == "ready"
+        ready = tmp_path / "ready"
+        program = f"{program}\nopen({str(ready)!r}, 'w').close()\nimport time\ntime.sleep(600)"
+        assert worker.give(cell(0, "family", program=program, pids=str(tmp_path / "pids")))
+        wait_for(ready.exists)
+        return worker
+
+    yield start
+    for worker in started:
+        worker.end()
+
+
+def test_memory_that_a_process_shares_with_its_forks_counts_once(with_child):
+    if not hasattr(psutil.Process().memory_full_info(), "pss"):
+        pytest.skip("this system does not tell which memory processes share")
+    worker = with_child("import os\nheld = bytearray(400_000_000)\nos.fork()")
+    family = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
+    assert len(family) == 3 and sum(member.memory_info().rss for member in family) > 800e6
+    assert 400.0 < worker.resident_mb(family=True) < 800.0
+
+
+def test_a_child_that_ends_while_a_family_is_looked_at_hides_none_of_it(with_child, monkeypatch):
+    worker = with_child("held = bytearray(400_000_000)")
+    with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as short:
+        ended = psutil.Process(short.pid)
+        short.communicate()
+    with pytest.raises(psutil.NoSuchProcess):
+        ended.memory_info()
+    real = psutil.Process.children
+    monkeypatch.setattr(psutil.Process, "children", lambda self, recursive: [ended, *real(self, recursive=recursive)])
+    assert worker.resident_mb(family=True) > 400.0
+
+
+def test_a_worker_that_crashes_leaves_no_core_file():
+    before, largest = resource.getrlimit(resource.RLIMIT_CORE)
+    if largest == 0:
+        pytest.skip("this process may not leave core files in the first place")
+    resource.setrlimit(resource.RLIMIT_CORE, (largest, largest))
+    try:
+        (row,) = execute([cell(0, "cores")], behave)
+    finally:
+        resource.setrlimit(resource.RLIMIT_CORE, (before, largest))
+    assert row["iterations"] == 0
+
+
 def test_nan_of_a_function_is_empty_in_its_row():
     row = by_key([cell(0, "nan")])[0]
     assert row["objective"] is None and row["gap"] is None
@@ -169,6 +225,15 @@ for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behav
         time.sleep(0.2)
         parent.kill()
     wait_for(lambda: all(gone(child.pid) for child in children))
+
+
+@pytest.mark.parametrize("missing, error, words", [("psutil", StudyError, "pip install 'optid"),
+                                                   ("optid.isolated", ModuleNotFoundError, "optid.isolated")])
+def test_only_a_missing_psutil_is_said_to_be_missing(monkeypatch, missing, error, words):
+    monkeypatch.delitem(sys.modules, "optid.studies.execution.worker_process")
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(error, match=words):
+        Pool(behave, 1)
 
 
 def test_no_guard_of_the_main_module_is_needed(tmp_path):

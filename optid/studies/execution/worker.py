@@ -8,6 +8,7 @@ import ctypes
 import faulthandler
 import os
 import pickle
+import resource
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -30,6 +31,7 @@ def main(descriptor: int, parent: int) -> None:
     """
     global _parent
     faulthandler.enable()  # a segmentation fault then says where
+    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))  # no files of crashes
     _die_with(parent)
     connection = Connection(descriptor)
     function, prepare = pickle.loads(connection.recv_bytes())

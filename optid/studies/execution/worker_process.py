@@ -102,9 +102,9 @@ class WorkerProcess:
         try:
             process = psutil.Process(self.pid)
             members = [process, *process.children(recursive=True)] if family else [process]
-            return sum(member.memory_info().rss for member in members) / MB
         except psutil.Error:
             return 0.0
+        return sum(_resident(member, shared=len(members) > 1) for member in members) / MB
 
     def shorten_words(self) -> None:
         """Forget what it wrote when that fills the disk."""
@@ -160,3 +160,16 @@ class WorkerProcess:
             places = [line for line in lines[fatal[-1]:] if line.startswith("File ")]
             return f"at {places[0]}" if places else ""
         return lines[-1][-LONGEST:] if lines else ""
+
+
+def _resident(process: psutil.Process, shared: bool) -> int:
+    """Bytes that a process holds, 0 when it is gone; of what others hold as well its share where the system tells.
+
+    A process that was only just forked shares all it has with its parent.
+    """
+    with suppress(psutil.Error):
+        if shared:
+            with suppress(psutil.AccessDenied, AttributeError):
+                return process.memory_full_info().pss
+        return process.memory_info().rss
+    return 0

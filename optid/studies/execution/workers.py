@@ -81,7 +81,9 @@ class Pool:
     def __init__(self, function: Callable[..., Any], size: int) -> None:
         try:
             from optid.studies.execution.worker_process import WorkerProcess
-        except ImportError:
+        except ModuleNotFoundError as error:
+            if error.name != "psutil":
+                raise
             raise StudyError("workers are watched with psutil: pip install 'optid[study]'") from None
         try:
             self._function = pickle.dumps((function, prepare if function is run_cell else None))
