@@ -124,3 +124,22 @@ def times_of(*factors, problems=20, spread=0.1, seed=0):
     rng = np.random.default_rng(seed)
     base = np.exp(rng.normal(size=(problems, 1)))
     return base * np.array(factors) * np.exp(spread * rng.normal(size=(problems, len(factors))))
+
+
+# ---- complete rows by hand, for the tests of comparisons
+
+
+def row(solver, **values):
+    """One complete row of a comparison on one record: solved unless said otherwise."""
+    given = {"key": solver, "repetition": 0, "place": solver, "study": "s", "data": "d", "formulation": "f",
+             "solver": solver, "formulation_name": "f", "options": "{}", "constraints": "[]", "solver_name": solver,
+             "solver_options": "{}", "accuracy": 1e-8, "holdout": 0.3, "time_limit": 60.0, "memory_limit": 2e3,
+             "outcome": "done", "status_verified": "optimal", "proved": True, "reached": True, "objective": 1.0,
+             "scale": 10.0, "violation": 1e-12, "stationarity": 1e-12, "solve_s": 0.01,
+             "started": "2026-01-01T00:00:00",
+             "machine": "m", "versions": "{}", "warm": True, "warm_s": 0.005}
+    return complete({**given, **values})
+
+
+LOCAL = {"status_verified": "locally optimal", "proved": False}
+FAILED = {"status_verified": "failed", "reached": False, "proved": False, "objective": None, "reason": "it broke"}

@@ -88,6 +88,7 @@ def compare(
     from optid.studies.definition.description import Study
     from optid.studies.execution import running
     from optid.studies.verdicts.comparison import compare as side_by_side
+    from optid.studies.verdicts.comparison import verdict_on_one_record
 
     words.check_folders(report, db)
     entry, suggestion = _entry(data, how, example, seed)
@@ -118,7 +119,7 @@ def compare(
         from optid.cli.results import command_line
         from optid.studies.page import write_page
 
-        write_page(rows, report, command=command_line())
+        write_page(verdict_on_one_record(rows), report, command=command_line())
         say(f"report written to {report}")
 
 

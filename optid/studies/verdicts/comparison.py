@@ -1,7 +1,7 @@
 """Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,9 @@ from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.choice import listed
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
 from optid.studies.verdicts.standings import MINOR
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement
 from optid.studies.verdicts.table import columns
+from optid.studies.verdicts.verdict import Verdict, conclude
 
 
 @dataclass(frozen=True)
@@ -77,31 +79,34 @@ class Comparison:
         return None
 
     @property
-    def recommendation(self) -> str:
-        """One sentence: which solver, with the evidence."""
+    def headline(self) -> Statement:
+        """Which solver to use on this record, with the evidence."""
         solved = [line for line in self.lines if line.state == SOLVED]
+        if not solved and not self.lines:
+            return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).", "solver")
         if not solved:
-            if not self.lines:
-                return "No solver takes this formulation: choose others (optid solvers)."
-            return f"No solver reached the verified accuracy of {self.accuracy:.0e}: {self._why_not()}."
+            word = f"No solver reached the verified accuracy of {self.accuracy:.0e}"
+            return Statement(BAD, word, f"{self._why_not()}.", "solver")
         first, *others = solved
         proof = f", {'' if first.proved else 'not '}proved globally optimal"
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
-        if close:
-            names = [line.solver for line in (first, *close)]
-            sentence = (f"Use {_either(names)}: they reached the verified accuracy of {self.accuracy:.0e} in "
-                        f"{seconds(first.cold)}, equal within {MINOR:.0%}{proof}")
-        else:
-            sentence = (f"Use {first.solver}: it reached the verified accuracy of {self.accuracy:.0e} in "
-                        f"{seconds(first.cold)}{proof}")
+        names = [line.solver for line in (first, *close)]
+        text = f"{'they' if close else 'it'} reached the verified accuracy of {self.accuracy:.0e} in "
+        text += seconds(first.cold)
+        text += f", equal within {MINOR:.0%}{proof}" if close else proof
         rest = [line for line in others if line not in close]
         if rest:
-            sentence += f"; next is {rest[0].solver} with {seconds(rest[0].cold)}"
-            sentence += " (without a proof)" if first.proved and not rest[0].proved else ""
+            text += f"; next is {rest[0].solver} with {seconds(rest[0].cold)}"
+            text += " (without a proof)" if first.proved and not rest[0].proved else ""
         elif not others:
             failed = [line.solver for line in self.lines if line is not first]
-            sentence += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
-        return sentence + "."
+            text += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
+        return Statement(GOOD, f"Use {_either(names)}", f"{text}.", "solver")
+
+    @property
+    def recommendation(self) -> str:
+        """One sentence: which solver, with the evidence."""
+        return f"{self.headline.word}: {self.headline.text}"
 
     def _why_not(self) -> str:
         counts: dict[str, list[str]] = {}
@@ -140,6 +145,22 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
             _median(table["warm_s"][mine]), float(table["one_step_fit"][row]), float(table["simulation_fit"][row]),
             str(table["reason"][row])))
     return Comparison(tuple(sorted(lines, key=_order)), refused, accuracy)
+
+
+def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
+    """Return the verdict of a study of one record and one formulation, headed by what the comparison says.
+
+    Args:
+        rows: of a study with one record, one formulation and one accuracy.
+
+    Raises:
+        DataError: there are no rows, or these are none of a study.
+    """
+    found, verdict = compare(rows), conclude(rows)
+    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
+                       "told by a study of at least 6 problems (optid study run).", "data sets")  # fmt: skip
+    said = [statement for statement in verdict.statements if statement.about != "data sets"]
+    return replace(verdict, headline=found.headline, statements=(caveat, *said))
 
 
 def _order(line: Line) -> tuple[Any, ...]:

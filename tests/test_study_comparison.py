@@ -1,0 +1,50 @@
+"""Solvers side by side on one record: the sentence, the lines, and the page that says the same."""
+
+import pytest
+from study_rows import FAILED, LOCAL, row
+
+from optid.studies.page import render
+from optid.studies.verdicts.comparison import compare, verdict_on_one_record
+
+
+@pytest.mark.parametrize("rows, words", [
+    ([row("a"), row("b", solve_s=0.03), row("c", solve_s=0.05)],
+     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; next is b with 30 ms."),
+    ([row("a"), row("b", solve_s=0.0105)], "Use a or b: they reached the verified accuracy of 1e-08 in 10 ms, equal "
+     "within 10%, proved globally optimal."),
+    ([row("a", **LOCAL), row("b", solve_s=0.03)],
+     "Use b: it reached the verified accuracy of 1e-08 in 30 ms, proved globally optimal; next is a with 10 ms "
+     "(without a proof)."),
+    ([row("a", **LOCAL), row("b", solve_s=0.03, **LOCAL)],
+     "Use a: it reached the verified accuracy of 1e-08 in 10 ms, not proved globally optimal; next is b with 30 ms."),
+    ([row("a", objective=1.01, **LOCAL), row("b", solve_s=3.0)],
+     "Use b: it reached the verified accuracy of 1e-08 in 3 s, proved globally optimal; a did not."),
+    ([row("a", **FAILED), row("b", **FAILED)], "No solver reached the verified accuracy of 1e-08: failed: a and b."),
+    ([row("a")], "Use a: it reached the verified accuracy of 1e-08 in 10 ms, proved globally optimal; there is no "
+     "other to compare it with."),
+    ([row("a", outcome="refused", status_verified=None, reached=False, proved=False, reason="not its class")],
+     "No solver takes this formulation: choose others (optid solvers)."),
+    ([row("a", false_claim=True), row("b", solve_s=9.0)],
+     "Use b: it reached the verified accuracy of 1e-08 in 9 s, proved globally optimal; a did not."),
+])
+def test_recommendations(rows, words):
+    assert compare(rows).recommendation == words
+
+
+def test_lines_have_the_numbers_of_the_rows():
+    rows = [row("a", compile_s=0.02, repetition=k, solve_s=s, place=f"a{k}") for k, s in enumerate((0.01, 0.03, 0.02))]
+    found = compare([*rows, row("b", objective=1.5, one_step_fit=90.0), row("c", **FAILED), row("d", **FAILED)])
+    a, b = (next(line for line in found.lines if line.solver == name) for name in "ab")
+    assert a.cold == pytest.approx(0.04) and a.above == 0 and a.warm == 0.005
+    assert b.above == pytest.approx(0.5) and b.state == "worse minimum" and b.one_step == 90.0
+    assert found.reasons == {"it broke": ["c", "d"]}
+
+
+def test_the_page_heads_with_the_sentence_of_the_command():
+    rows = [row("a", **LOCAL), row("b", solve_s=0.03)]  # the page's own order is by time alone
+    verdict, said = verdict_on_one_record(rows), compare(rows)
+    assert f"{verdict.headline.word}: {verdict.headline.text}" == said.recommendation
+    page = render(verdict)
+    assert '<p class="word">Use b</p>' in page and said.headline.text in page and '"verdict good"' in page
+    assert "Cannot tell yet" not in page.split("<noscript>")[0] and "at least 6 problems" in page
+    assert [s.about for s in verdict.statements].count("data sets") == 1
