@@ -25,6 +25,7 @@ from optid.studies.storage.rows import NAMES
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
+CommClosedError = pytest.importorskip("distributed.comm").CommClosedError
 
 TIMES = {"load_s", "build_s", "compile_s", "judge_s", "prove_s", "fit_s", "solve_s", "warm_s", "total_s", "peak_mb",
          "base_mb", "started"}
@@ -298,7 +299,22 @@ def test_a_scheduler_that_goes_away_is_an_error_in_words():
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as short:
         under_way = cluster.execute([cell(k, seconds=0.2) for k in range(50)], behave,
                                     scheduler=short.scheduler_address)
-        next(under_way)
+        rows = [next(under_way)]
         short.close()
-        with pytest.raises(ClusterError, match="scheduler went away"):
-            list(under_way)
+        with pytest.raises(ClusterError, match="Rows so far are kept|scheduler went away"):
+            for row in under_way:
+                rows.append(row)
+        assert len(rows) < 50 and {row["outcome"] for row in rows} == {"done"}
+
+
+@pytest.mark.parametrize("error", [OSError("no route to the host"), CommClosedError("Stream is closed")])
+def test_a_row_that_cannot_be_fetched_is_no_fault_of_its_cell(client, monkeypatch, error):
+    """It has no row then, so that the next run runs it."""
+
+    def broken(self, timeout=None):
+        raise error
+
+    with monkeypatch.context() as severed:
+        severed.setattr(distributed.Future, "result", broken)
+        with pytest.raises(ClusterError, match="a row did not come back .*Rows so far are kept"):
+            next(cluster.execute([cell(0)], behave, scheduler=client))
