@@ -14,7 +14,7 @@ from optid.studies.definition.description import Study
 from optid.studies.execution.cell import lost_row
 from optid.studies.grid import cells
 from optid.studies.page import write_page
-from optid.studies.storage.database import read_rows
+from optid.studies.storage.database import append, read_rows
 from optid.studies.verdicts.verdict import conclude
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
@@ -211,10 +211,32 @@ def test_what_is_taken_out_of_a_study_leaves_its_reports_which_say_so(folder):
     first = run("study", "run", "rigs.toml", "-w", 1)
     assert first.exit_code == 0 and "superseded" not in first.stdout
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
-    told = run("study", "run", "rigs.toml", "-w", 1), run("study", "report", "rigs.duckdb")
-    for found in told:
-        assert "gauss_newton" not in found.stdout
-        assert "6 rows of former entries" in found.stdout and "kept in rigs.duckdb (table superseded)" in found.stdout
+    before = Path("rigs.duckdb").read_bytes()
+    said = "6 rows are set aside: solver gauss_newton is no longer in the study (6)"
+    assert said in run("study", "run", "rigs.toml", "--dry-run").stdout and Path("rigs.duckdb").read_bytes() == before
+    assert said in run("study", "run", "rigs.toml", "-w", 1).stdout.splitlines()
+    report = run("study", "report", "rigs.duckdb").stdout
+    assert "gauss_newton" not in report
+    assert "6 rows of former entries" in report and "kept in rigs.duckdb (table superseded)" in report
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto", "gauss_newton"]'))
+    assert "set aside" not in run("study", "run", "rigs.toml", "-w", 1).stdout  # they are back
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("0.1", "0.2"))
+    changed = run("study", "run", "rigs.toml", "-w", 1).stdout
+    assert "former data, settings or versions, or run again (2); solver gauss" not in changed
+    assert "solver gauss_newton is no longer in the study (6); former data" in changed and "run again (2)" in changed
+
+
+def test_a_dry_run_names_the_solvers_that_are_not_installed(folder, monkeypatch):
+    from optid.errors import SolverMissing
+    from optid.studies import grid
+
+    def missing(name):
+        raise SolverMissing(f"solver {name!r} is not installed: pip install {name}")
+
+    monkeypatch.setattr(grid, "find", missing)
+    Path("rigs.toml").write_text(STUDY.format(solvers='["clarabel"]'))
+    told = run("study", "run", "rigs.toml", "--dry-run").stdout
+    assert "6 cells that cannot be run here: solver 'clarabel' is not installed: pip install clarabel" in told
 
 
 def test_the_database_is_called_as_the_study_file(folder):
@@ -230,6 +252,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
     from optid.studies.execution import running
 
     def interrupted(study, db, *, progress, **settings):
+        append(db, [])
         progress(0, 18, None)
         progress(1, 18, {"formulation": "exact", "solver": "auto", "status_verified": None, "outcome": "crashed"})
         raise KeyboardInterrupt
@@ -264,7 +287,7 @@ def test_compare_says_which_solver_to_use(folder):
     lines = found.stdout.splitlines()
     assert lines[0].startswith("6 cells to run") and Path("page.html").stat().st_size > 20_000
     sentence = next(line for line in lines if line.startswith("Use "))
-    assert "it reached the verified accuracy of 1e-08 in" in sentence or "they reached" in sentence
+    assert "reached the accuracy of 1e-08 (verified residuals up to 1e-06 count) in" in sentence
     assert "proved globally optimal" in sentence and "not for hammerstein_arx.exact: clarabel" in found.stdout
     assert read_rows("kept.duckdb")["warm_s"].size == 6
     again = run(*words, "--db", "kept.duckdb")

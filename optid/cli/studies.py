@@ -86,7 +86,7 @@ def run(
     if dry_run:
         _plan(described, db, accept_changed_data=accept_changed_data, retry=retry or ())
         return
-    with follow_progress(db) as follow:
+    with follow_progress(db, described) as follow:
         running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
                     accept_changed_data=accept_changed_data, retry=retry or ())
     solved = _summary(db, described.name)
@@ -175,10 +175,17 @@ def schema() -> None:
 
 
 @contextmanager
-def follow_progress(db: Path | None) -> Iterator[Any]:
-    """A bar on the error stream, and a message where a study goes on; Ctrl-C keeps what is done."""
+def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
+    """A bar on the error stream, and a message where a study goes on; Ctrl-C keeps what is done.
+
+    Args:
+        db: the database, if the user named one.
+        described: the study, to say which of its former rows are set aside.
+    """
     from rich import progress
     from rich.console import Console
+
+    from optid.studies.storage.former import told_former
 
     console = Console(stderr=True)
     bar = progress.Progress(
@@ -195,6 +202,8 @@ def follow_progress(db: Path | None) -> Iterator[Any]:
             say(f"{done:,} of {total:,} cells are in {db} already; {left}")
         elif row is None and db is not None:
             say(f"{total:,} cells to run")
+        if row is None and db is not None and described is not None and (former := told_former(db, described)):
+            say(former)
         bar.update(task, completed=done, total=total, description=_now(row))
 
     try:
@@ -231,12 +240,14 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
     from optid.errors import DatabaseError
     from optid.studies import grid
     from optid.studies.execution import running
+    from optid.studies.storage.former import told_former
     from optid.studies.storage.journal import locked
 
-    counts = [0, 0]
+    counts, former = [0, 0], ""
 
     def stop(done: int, total: int, _: Any) -> None:
-        counts[:] = done, total
+        nonlocal former
+        counts[:], former = (done, total), told_former(copy, described)
         raise _Planned
 
     source = db.resolve()
@@ -251,10 +262,16 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
             pass
         except DatabaseError as error:
             raise DatabaseError(str(error).replace(str(copy), str(db))) from None
-    refused = sum(1 for cell in grid.cells(described) if cell.refusal)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
-        f"{len(described.solvers)} solvers; {counts[1]:,} cells, {counts[1] - counts[0]:,} of them to run"
-        + (f", {refused:,} with a solver that is not installed" if refused else ""))
+        f"{len(described.solvers)} solvers; {counts[1]:,} cells, {counts[1] - counts[0]:,} of them to run")
+    refusals: dict[str, int] = {}
+    for cell in grid.cells(described):
+        if cell.refusal:
+            refusals[cell.refusal] = refusals.get(cell.refusal, 0) + 1
+    for refusal, count in refusals.items():
+        say(f"{count:,} cells that cannot be run here: {refusal}")
+    if former:
+        say(former)
 
 
 def _summary(db: Path, name: str) -> bool:
@@ -271,7 +288,6 @@ def _summary(db: Path, name: str) -> bool:
     summary.print_reasons(rows)
     headline = conclude(rows).headline
     say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
-    summary.print_former(db, name)
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
     say(Text(shlex.join(words), "dim"))
