@@ -36,7 +36,7 @@ def test_one_failure_more_is_no_lack_of_reliability():
     times = times_of(1.0, 0.002)
     times[0, 1] = NAN
     headline = conclude(table_of(times)).headline
-    assert headline.word == "Use b" and "b reached the accuracy on 19 of 20 problems" in headline.text
+    assert headline.word == "Use b" and "b reached the accuracy of 1e-08 on 19 of 20 problems" in headline.text
     assert "The next, a, solved 20, no difference beyond chance or 1 %, and takes" in headline.text
     third = np.column_stack([0.004 * times[:, 0], times[:, 1], times[:, 0]])
     third[:2, 0] = NAN

@@ -164,6 +164,7 @@ def _as_options(text: str) -> str:
 
 def _show(found: Any, posed: str, record: str) -> None:
     from optid.showing.wording import number, seconds
+    from optid.solution import GRADIENT
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.outcomes import SOLVED
 
@@ -192,7 +193,7 @@ def _show(found: Any, posed: str, record: str) -> None:
         say(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
     if found.refused:
         say(Text(f"not for {posed}: {', '.join(found.refused)}", "dim"))
-    say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: the largest of "
-             "violation, complementarity and a tenth of the stationarity. 1-step, simul.: fit in % on held-out "
-             "samples.", "dim"))
+    say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: how far the "
+             "point is from optimal, measured by optid (constraints, complementarity, and gradient / "
+             f"{GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.", "dim"))
     say(Text(found.recommendation, "bold"))

@@ -20,7 +20,7 @@ from optid.studies.verdicts.choice import CANNOT_TELL
 from optid.studies.verdicts.model_advice import model_evidence
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.verdicts.quality import FIGURES, DataSet, Quality
-from optid.studies.verdicts.statement import Statement, plural
+from optid.studies.verdicts.statement import Statement, counting, plural
 from optid.studies.verdicts.verdict import Verdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
@@ -118,7 +118,8 @@ def _lead(verdict: Verdict) -> str:
     runs, found = len(verdict.table["solver"]), verdict.found
     parts = [(runs, "run"), (len(found.data), "problem"), (len(found.solvers), "solver"),
              (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]  # fmt: skip
-    return " · ".join(plural(count, noun) for count, noun in parts)
+    counts = [plural(count, noun) for count, noun in parts]
+    return " · ".join([*counts, f"accuracy {found.accuracy:.0e}: {counting(found.accuracy)}"])
 
 
 def _cards(verdict: Verdict) -> list[dict[str, str]]:

@@ -7,7 +7,7 @@ from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
 from optid.studies.verdicts.quality import Quality
 from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, of, plural
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, of, plural
 
 RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
 LONGEST = 90  # characters of a headline
@@ -29,12 +29,14 @@ def choice_of_solver(section: Section) -> Statement:
     if choice.kind == NOBODY:
         common = ", ".join(f"{word} {count:,}" for word, count in _failures(section).items())
         where = "the only problem" if n == 1 else f"any of {n:,} problems"
-        text = f"No solver reached the accuracy on {where} ({common})."
+        at = section.found.accuracy
+        text = f"No solver reached the accuracy of {at:.0e} on {where} ({common}); {counting(at)}."
         return Statement(BAD, NO_SOLVER, text, "solver")
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
     lead = section.standing(choice.first)
-    solved = f"{lead.solver} reached the accuracy on {of(lead.solved, n)}{_average(lead)}"
+    at = section.found.accuracy
+    solved = f"{lead.solver} reached the accuracy of {at:.0e} on {of(lead.solved, n)}{_average(lead)} ({counting(at)})"
     if choice.kind == ONLY_ONE:
         return Statement(_tone(lead, n), "Only one solver", f"{solved}. There is nothing to compare it with.", "solver")
     if choice.kind == CANNOT_TELL:
@@ -225,12 +227,14 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
     if len(firsts) == 1 and len(decided) == len(sections):
         lead = overall.standing(firsts[0])
         text = f"{lead.solver} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}, and "
-        text += f"reached the accuracy on {of(lead.solved, n)}."
+        at = overall.found.accuracy
+        text += f"reached the accuracy of {at:.0e} on {of(lead.solved, n)} ({counting(at)})."
         return Statement(_tone(lead, n), f"Use {lead.solver}", text, "solver")
     named = {first: [section.name for section in decided if section.choice.first == first] for first in firsts}
     best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
     most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    text = f"{most.solver} solved most, {of(most.solved, n)}."
+    at = overall.found.accuracy
+    text = f"{most.solver} solved most, {of(most.solved, n)} at an accuracy of {at:.0e} ({counting(at)})."
     if most.solved < 0.99 * n:
         text = f"No solver does everything: {text}"
     if len(decided) < len(sections):

@@ -12,7 +12,7 @@ from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.choice import listed
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
 from optid.studies.verdicts.standings import MINOR
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting
 from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import Verdict, conclude
 
@@ -85,14 +85,14 @@ class Comparison:
         if not solved and not self.lines:
             return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).", "solver")
         if not solved:
-            word = f"No solver reached the verified accuracy of {self.accuracy:.0e}"
-            return Statement(BAD, word, f"{self._why_not()}.", "solver")
+            word = f"No solver reached the accuracy of {self.accuracy:.0e}"
+            return Statement(BAD, word, f"{counting(self.accuracy)}; {self._why_not()}.", "solver")
         first, *others = solved
         proof = f", {'' if first.proved else 'not '}proved globally optimal"
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
         names = [line.solver for line in (first, *close)]
-        text = f"{'they' if close else 'it'} reached the verified accuracy of {self.accuracy:.0e} in "
-        text += seconds(first.cold)
+        text = f"{'they' if close else 'it'} reached the accuracy of {self.accuracy:.0e} ({counting(self.accuracy)}) "
+        text += f"in {seconds(first.cold)}"
         text += f", equal within {MINOR:.0%}{proof}" if close else proof
         rest = [line for line in others if line not in close]
         if rest:

@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 
+from optid.solution import tolerance
+
 GOOD, FAIR, BAD = "good", "fair", "bad"
+FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,12 @@ class Statement:
 def plural(n: int, noun: str) -> str:
     """Write "1 problem", "3 problems"."""
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def counting(accuracy: float) -> str:
+    """Say which residuals count as a requested accuracy reached, and that a stricter request changes nothing below."""
+    most = f"verified residuals up to {tolerance(accuracy):.0e} count"
+    return f"{most}; asking for less than {FINEST:.0e} changes nothing" if accuracy < FINEST else most
 
 
 def of(n: int, total: int, noun: str = "problem") -> str:
