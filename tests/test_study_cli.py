@@ -321,6 +321,7 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),
     (("study", "run", "rigs.toml", "--retry", "crshed"), "Did you mean 'crashed'"),
     (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
+    (("study", "report", "none.duckdb", "-o", "."), "it is a folder; name a file in it"),
     (("study", "report", "none.duckdb"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),
     (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
@@ -342,3 +343,12 @@ def test_what_a_new_user_gets_wrong(folder, words, told):
     assert found.exit_code == 2 and not isinstance(found.exception, StudyError)
     assert told in " ".join(found.stderr.replace("│", " ").split()), found.stderr
     assert "Traceback" not in found.stderr and not list(folder.glob("rigs.duckdb"))
+
+
+def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch):
+    from optid.cli import arguments
+
+    monkeypatch.setattr(arguments.os, "access", lambda path, mode: Path(path) == folder / "rig.csv")
+    told = run("study", "report", "none.duckdb", "-o", "page.html").stderr
+    assert f"page.html cannot be written: folder {folder} is read-only here; give a file in another folder" in told
+    arguments.check_folders(folder / "rig.csv")

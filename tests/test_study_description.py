@@ -92,6 +92,7 @@ BAD = [
     ("seeds = []", 1, 9, "seeds is empty"),
     ("holdout = 1", 1, 11, "below 1"),
     ("name = ''", 1, 8, "name is a text"),
+    ("solvers = 'al'", 1, 11, "Did you mean 'all'"),
     ("solvers = ['clarabel', 'gausnewton']", 1, 24, "Did you mean 'gauss_newton'"),
     ("[[solver]]\nname = 'x'", 1, 1, "needs solver"),
     ("[[solver]]\nsolver = 'scs'\nmax_iter = 3", 3, 1, "options = { ... }"),
@@ -154,6 +155,24 @@ def test_what_is_missing_altogether():
 ])
 def test_what_is_not_toml_has_its_place(text, place):
     assert problems(text)[0].startswith(place)
+
+
+@pytest.mark.parametrize("text, told", [
+    ('name = "x\nseeds = 2\n', "line 1, column 10: the quotation mark that ends this text is missing"),
+    ("seeds = # two\n", "line 1, column 9: the value is missing"),
+    ("solvers = auto\n", "line 1, column 11: 'auto' is no value: a text stands in quotation marks"),
+    ("warm = True\n", "line 1, column 8: 'True' is no value"),
+    ("noise = 0,1 # percent\n", "line 1, column 10: what stands here is too much: a line holds one key = value"),
+    ("time_limit = 60s\n", "line 1, column 16: 's' is too much"),
+    ("seeds = [1, 2\n", "line 1, column 14: the list does not end: a comma or ] is missing before this place, at the"),
+    ("seeds = 1\nseeds = 2\n", "this key has a value already"),
+    ('file = "C:\\users"\n', "a backslash is written twice"), ('file = "C:\\data"\n', "a backslash is written twice"),
+    ('name = """x\n', "the quotation marks that end a text are missing"),
+    ("[[data]\n", "expected ']]' at the end of an array declaration"),
+])
+def test_what_is_not_toml_is_told_in_words(text, told):
+    (found,) = problems(text)
+    assert told in found
 
 
 def test_a_number_that_python_does_not_read_is_told():
@@ -285,6 +304,20 @@ def test_python_hears_all_problems_with_their_places():
     lines = [line.strip().split(":")[0] for line in str(caught.value).splitlines()]
     assert set(lines[1:]) == {"warm", "seeds", "data[1].system", "formulations[0]", "formulations[1]",
                               "solvers[1].acuracy"}
+
+
+@pytest.mark.parametrize("change, words", [
+    ({"data": {"rig": (np.zeros(9), np.zeros(9))}}, "is none of what is taken here: a record, optid.Data(u, y, dt)"),
+    ({"formulations": [3]}, "formulations[0]: 3 is none of what is taken here: the name of a formulation"),
+    ({"solvers": 3}, "solvers[0]: 3 is none of what is taken here: the name of a solver"),
+    ({"solvers": "al"}, "no solver is called 'al'. Did you mean 'all'?"), ({"data": []}, "there is no [[data]]"),
+    ({"solvers": []}, "there is no solver"),
+])
+def test_python_hears_what_an_axis_takes_and_nothing_besides(change, words):
+    with pytest.raises(StudyError) as caught:
+        Study("t", **{"data": "thruster", "formulations": {"formulation": "arx", "na": 2, "nb": 1}, "solvers": "auto",
+                      **change})
+    assert words in str(caught.value) and str(caught.value).count("\n") == 1
 
 
 @pytest.mark.parametrize("value, words", [

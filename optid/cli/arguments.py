@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -149,14 +150,20 @@ def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
 
 
 def check_folders(*paths: Path | None) -> None:
-    """Refuse a file to be written into a folder that does not exist, before any work is done.
+    """Refuse a file that cannot be written, before any work is done.
 
     Raises:
-        DataError: naming the folder.
+        DataError: its folder is not there or takes no files, or it is a folder itself.
     """
-    for path in paths:
-        if path is not None and not path.absolute().parent.is_dir():
-            raise DataError(f"{path} cannot be written: there is no folder {path.absolute().parent}")
+    for path in (path for path in paths if path is not None):
+        folder = path.absolute().parent
+        if not folder.is_dir():
+            raise DataError(f"{path} cannot be written: there is no folder {folder}")
+        if path.is_dir():
+            raise DataError(f"{path} cannot be written: it is a folder; name a file in it")
+        if not os.access(path if path.exists() else folder, os.W_OK):
+            raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is read-only "
+                            "here; give a file in another folder")
 
 
 def listed(words: Sequence[str] | None) -> list[str] | None:

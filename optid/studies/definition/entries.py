@@ -81,7 +81,8 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
 def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mapping[str, Any]]:
     entries = raw.get(key, [])
     if not entries and key != "solver":
-        problems.add((), f"there is no [[{key}]]: a study needs at least one", value=False)
+        if not problems.concern(key):
+            problems.add((), f"there is no [[{key}]]: a study needs at least one", value=False)
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
@@ -236,10 +237,10 @@ def _solvers(raw: Mapping[str, Any], problems: Problems) -> list[SolverEntry]:
         if words == (ALL,):
             words = tuple(name for name, back_end in sorted(back_ends().items()) if back_end.installed)
         for i, word in enumerate(words):
-            found.append(SolverEntry(word, _solver(("solvers", i), word, problems)))
+            found.append(SolverEntry(word, _solver(("solvers", i), word, problems, *[ALL] * (len(words) == 1))))
     for i, entry in enumerate(_tables("solver", raw, problems)):
         found.append(_solver_entry(("solver", i), entry, problems))
-    if "solvers" not in raw and not raw.get("solver"):
+    if "solvers" not in raw and not raw.get("solver") and not problems.concern("solver"):
         problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]",
                      value=False)
     return found
@@ -269,10 +270,11 @@ def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> Sol
     return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
 
 
-def _solver(path: Path, word: str, problems: Problems) -> str:
+def _solver(path: Path, word: str, problems: Problems, *more: str) -> str:
+    """Look a solver up; `more` are words that could be meant besides."""
     known = [AUTO, *back_ends()]
     if word.lower() not in known:
-        problems.add(path, f"no solver is called {word!r}. {nearest(word.lower(), known)}")
+        problems.add(path, f"no solver is called {word!r}. {nearest(word.lower(), [*known, *more])}")
     return word.lower()
 
 

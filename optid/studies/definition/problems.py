@@ -39,6 +39,10 @@ class Problems(list[Problem]):
         """Note one problem."""
         self.append(Problem(path, text, value))
 
+    def concern(self, key: str) -> bool:
+        """Return whether something is wrong below a key at the top."""
+        return any(problem.path[:1] == (key,) for problem in self)
+
     def told(self, label: str, positions: Positions | None = None) -> None:
         """Raise what was found, with line and column where the text is known.
 
@@ -143,7 +147,7 @@ def shown(value: Any) -> str:
         return "a table"
     if isinstance(value, int) and value.bit_length() > 200:  # Python does not even write one of 5000 digits
         return "a number of more than 60 digits"
-    text = repr(list(value) if isinstance(value, tuple) else value)
+    text = " ".join(repr(list(value) if isinstance(value, tuple) else value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 

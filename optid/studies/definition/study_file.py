@@ -13,6 +13,20 @@ from optid.studies.definition.trial import Records, note_impossible, note_unread
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 _END = " (at end of document)"
+_WORD = re.compile(r"[^\s,\]}#]+")
+_MEANT = {
+    r"Illegal character '\n'": "the quotation mark that ends this text is missing",
+    "Invalid value": "{there} is no value: a text stands in quotation marks; others are numbers, true, false, lists in "
+                     "[ ]",
+    "Expected newline or end of document": "{there} is too much: a line holds one key = value; several values stand in "
+                                           "[ ]",
+    "Unclosed array": "the list does not end: a comma or ] is missing before this place",
+    "Unterminated string": "the quotation marks that end a text are missing",
+    "Cannot overwrite a value": "this key has a value already",
+    "Invalid hex value": "a backslash is written twice, or the text stands in single quotation marks: '...'",
+    r"Unescaped '\' in a string": "a backslash is written twice, or the text stands in single quotation marks: '...'",
+}
+"""Beginnings of messages of the parser, and what they mean for somebody who does not know its words."""
 
 
 def read_study(path: Path) -> Study:
@@ -57,13 +71,19 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
 
 
 def _syntax(message: str, text: str) -> str:
-    """Put the place in front of a message of the parser."""
+    """Put the place in front of a message of the parser, and say what is meant where its words do not."""
     found = _PLACE.fullmatch(message)
     if found:
-        return f"line {found[2]}, column {found[3]}: {found[1][:1].lower()}{found[1][1:]}"
-    if not message.endswith(_END):
+        words, line, column = found[1], int(found[2]), int(found[3])
+    elif message.endswith(_END):
+        last = text.rstrip("\n")
+        words, line, column = message.removesuffix(_END), last.count("\n") + 1, len(last) - last.rfind("\n")
+    else:
         return message
-    last = text.rstrip("\n")
-    line = last.count("\n") + 1
-    column = len(last) - last.rfind("\n")
-    return f"line {line}, column {column}: {message.removesuffix(_END)}, at the end of the file"
+    rest = text.split("\n")[line - 1][column - 1 :]
+    there = repr(match[0]) if (match := _WORD.match(rest)) else "what stands here"
+    told = next((meant for begin, meant in _MEANT.items() if words.startswith(begin)), words[:1].lower() + words[1:])
+    if words == "Invalid value" and (not rest.strip() or rest.lstrip().startswith("#")):
+        told = "the value is missing"
+    told = told.format(there=there) if told in _MEANT.values() else told
+    return f"line {line}, column {column}: {told}" + ("" if found else ", at the end of the file")

@@ -38,20 +38,23 @@ def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
         entry = {"formulation": entry} if isinstance(entry, str) else entry
         raw["formulation"].append(_with_label(entry, label))
     solvers = given["solvers"]
-    if solvers == ALL or plain(solvers) == [ALL]:
-        raw["solvers"] = ALL
+    if isinstance(solvers, str) or plain(solvers) == [ALL]:
+        raw["solvers"] = solvers
     else:
         raw["solver"] = []
         for label, entry in _labelled(solvers, _SOLVER_KEYS):
             raw["solver"].append(_with_label({"solver": entry} if isinstance(entry, str) else entry, label))
-    for axis, key in (("data", "data"), ("formulations", "formulation"), ("solvers", "solver")):
+    for key, takes in _TAKES.items():
         for i, entry in enumerate(raw.get(key, [])):
             if not isinstance(entry, Mapping):
-                problems.add((axis, i), f"{shown(entry)} is no entry of {axis}")
+                problems.add((key, i), f"{shown(entry)} is none of what is taken here: {takes}, or a mapping with the "
+                             f"keys of [[{key}]]")
         raw.update({key: [plain(entry) for entry in raw[key] if isinstance(entry, Mapping)]} if key in raw else {})
     return raw
 
 
+_TAKES = {"data": "a record, optid.Data(u, y, dt), the name of a file or of a simulated system",
+          "formulation": "the name of a formulation", "solver": "the name of a solver"}
 _DATA_KEYS, _FORMULATION_KEYS, _SOLVER_KEYS = ("file", "system", "name"), ("formulation",), ("solver",)
 
 
