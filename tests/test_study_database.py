@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from study_rows import rows
 
-from optid.studies.storage import database
-from optid.studies.storage.database import DatabaseError, append, data_hashes, export, finished, opened, read_rows
+from optid.errors import DatabaseError
+from optid.studies.storage import database, opening
+from optid.studies.storage.database import append, data_hashes, export, finished, read_rows
+from optid.studies.storage.journal import Journal
+from optid.studies.storage.opening import opened
 from optid.studies.storage.rows import COLUMNS, NAMES
 
 duckdb = pytest.importorskip("duckdb")
@@ -51,7 +54,7 @@ def test_hashes_of_data_files_by_study_and_label(path):
     assert expected and data_hashes(path) == expected
 
 
-def test_ten_thousand_rows_are_written_and_read_quickly(path):
+def test_ten_thousand_rows_are_written_and_read(path):
     append(path, rows(10_000))
     assert read_rows(path)["key"].size == 10_000
 
@@ -132,6 +135,52 @@ def test_export_has_every_row_and_column(path, tmp_path, ending):
     assert frame["objective"].isna().sum() == sum(row["objective"] is None for row in made)
 
 
+def test_rows_that_are_only_in_the_journal_are_read_and_exported_and_nothing_is_written(path, tmp_path):
+    """One of them is in the database too, one takes the place of a row there, one is half written."""
+    import pandas as pd
+
+    made = rows(10)
+    append(path, made[:7])
+    journal = Journal(path)
+    newer = {**made[3], "key": "f" * 64, "objective": 5.0}
+    for row in (made[6], *made[7:], newer):
+        journal.add(row)
+    with open(journal.path, "a") as file:
+        file.write('{"key": "half a ro')
+    link = tmp_path / "link.duckdb"
+    link.symlink_to(path)
+    before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    want = {row["key"]: row["objective"] for row in (*made[:3], newer, *made[4:])}
+    for name in (path, link):
+        found = read_rows(name)
+        assert found["key"].size == 10 == read_rows(name, "synthetic")["key"].size
+        assert tuple(found) == NAMES and list(found["started"]) == sorted(found["started"])
+        assert set(found["key"]) == set(want)
+    np.testing.assert_array_equal(found["objective"], [np.nan if want[k] is None else want[k] for k in found["key"]])
+    assert read_rows(path, "another")["key"].size == 0
+    assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
+    assert export(path, tmp_path / "rows.csv") == 10 == export(path, tmp_path / "rows.csv", "synthetic")
+    assert set(pd.read_csv(tmp_path / "rows.csv")["key"]) == set(want)
+
+
+def test_a_journal_of_another_version_is_told_to_readers_too(path, tmp_path):
+    append(path, rows(1))
+    path.with_name("study.duckdb.journal").write_text('{"sover": 1}\n')
+    for attempt in (lambda: read_rows(path), lambda: export(path, tmp_path / "rows.csv")):
+        with pytest.raises(DatabaseError, match="journal holds what is no row of this version.*Remove it"):
+            attempt()
+
+
+def test_no_rows_are_not_exported(path, tmp_path):
+    append(path, rows(1))
+    with pytest.raises(DatabaseError, match="has no rows of a study 'another' to export"):
+        export(path, tmp_path / "rows.csv", "another")
+    database.keep(path, "synthetic", [])
+    with pytest.raises(DatabaseError, match="has no rows to export: `optid study run`"):
+        export(path, tmp_path / "rows.csv")
+    assert not (tmp_path / "rows.csv").exists()
+
+
 def test_no_rows_yet(path):
     assert finished(path) == set()
     append(path, [])
@@ -176,7 +225,7 @@ def test_a_database_in_use_is_waited_for_then_refused(path, monkeypatch):
     import sys
 
     append(path, rows(1))
-    monkeypatch.setattr(database, "PATIENCE", 0.1)
+    monkeypatch.setattr(opening, "PATIENCE", 0.1)
     hold = f"import duckdb, sys; c = duckdb.connect({str(path)!r}); print('open', flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None and other.stdout.readline() == b"open\n"

@@ -15,8 +15,10 @@ from optid.errors import DatabaseError, StudyError
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import running, workers
 from optid.studies.execution.running import run, run_to_frame
-from optid.studies.storage.database import finished, opened, read_rows
+from optid.studies.storage import opening
+from optid.studies.storage.database import finished, read_rows
 from optid.studies.storage.journal import Journal, locked
+from optid.studies.storage.opening import opened
 from optid.studies.storage.rows import NAMES
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
@@ -249,11 +251,9 @@ HOLD = "import duckdb, sys; c = duckdb.connect({!r}, read_only=True); print('ope
 @pytest.mark.parametrize("until", [5, None])
 def test_a_reader_of_the_database_does_not_stop_the_run(path, grid, monkeypatch, until):
     """It is waited for until the last row, and what is not in the database then is in the journal."""
-    from optid.studies.storage import database
-
     monkeypatch.setattr(running, "EVERY", 0.0)
     monkeypatch.setattr(running, "WAIT", 0.0)
-    monkeypatch.setattr(database, "PATIENCE", 0.1)
+    monkeypatch.setattr(opening, "PATIENCE", 0.1)
     grid([cell(k) for k in range(9)])
     hands, readers = Hands(), []
 

@@ -12,8 +12,8 @@ from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
 from optid.studies.grid import Cell, cells, check_unchanged, left
 from optid.studies.storage import database
-from optid.studies.storage.database import InUse
-from optid.studies.storage.journal import Journal, locked
+from optid.studies.storage.journal import Journal, kept, locked
+from optid.studies.storage.opening import InUse
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 
 BATCH, EVERY = 500, 2.0  # rows, and seconds, after which what is in the journal goes to the database
@@ -120,12 +120,7 @@ class _Writer:
     def absorb(self) -> None:
         """Write to the database what is in the journal and not in the database, wherever a run was stopped."""
         there = database.identities(self._db)
-        try:
-            self.write([row for row in self._journal.rows()
-                        if (row["study"], row["key"], row["repetition"]) not in there])
-        except (ValueError, LookupError) as error:
-            raise DatabaseError(f"{self._journal.path} holds what is no row of this version ({error}). Remove it: the "
-                                "cells that only it knows are run again") from error
+        self.write([row for row in kept(self._db) if (row["study"], row["key"], row["repetition"]) not in there])
 
     def add(self, row: Row) -> None:
         self._journal.add(row)

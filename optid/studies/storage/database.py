@@ -1,123 +1,20 @@
-"""The database of a study: one DuckDB file, one row per cell and repetition; read, append, export.
+"""The rows in the database of a study, one per cell and repetition: read, append, export."""
 
-A writer opens the file for each batch and closes it again, so that a report can be made while the study runs and a
-killed study leaves a database that opens. Every batch is one transaction.
-"""
-
-import os
-import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.errors import DatabaseError, OptidError
-from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
+from optid.errors import DatabaseError
+from optid.studies.storage import journal
+from optid.studies.storage.opening import opened, writing
+from optid.studies.storage.rows import COLUMNS, DONE, NAMES, complete
 
 if TYPE_CHECKING:
     import duckdb
 
 FORMATS: dict[str, str] = {".parquet": "FORMAT parquet", ".csv": "FORMAT csv, HEADER"}
-PATIENCE = 10.0  # seconds to wait for another process that has the file open for a moment
-
-
-class InUse(DatabaseError):
-    """Another process has the database open."""
-
-
-@contextmanager
-def opened(path: str | Path, write: bool = False, patience: float | None = None
-           ) -> "Iterator[duckdb.DuckDBPyConnection]":
-    """Open a database of studies; it is made when it is not there and ``write`` is asked for.
-
-    Args:
-        path: the file.
-        write: open it for writing.
-        patience: seconds to wait for another process that has it open; `PATIENCE` when not given.
-
-    Raises:
-        InUse: by another process, for longer than that.
-        DatabaseError: no such file, not a database of studies, another schema version, or duckdb is missing (with the
-            pip line).
-    """
-    path = Path(path)
-    if not write and not path.is_file():
-        raise DatabaseError(f"{path}: no such database; `optid study run` makes one")
-    if not path.exists():
-        _create(path)
-    connection = _connected(path, write, PATIENCE if patience is None else patience)
-    try:
-        _check(path, connection)
-        yield connection
-    finally:
-        connection.close()
-
-
-def _connected(path: Path, write: bool, patience: float) -> "duckdb.DuckDBPyConnection":
-    try:
-        import duckdb
-    except ImportError:
-        raise DatabaseError("a database of studies needs duckdb: pip install 'optid[study]'") from None
-    until = time.monotonic() + patience
-    while True:
-        try:
-            return duckdb.connect(str(path), read_only=not write, config={"threads": 1})
-        except duckdb.Error as error:
-            text = str(error).splitlines()[0]
-            if "set lock" not in text.lower():
-                raise DatabaseError(f"{path} cannot be opened: {text}") from None
-            if time.monotonic() > until:
-                raise InUse(f"{path} has been in use by another process for {patience:g} s: {text}") from None
-            time.sleep(0.02)
-
-
-def _tables(connection: "duckdb.DuckDBPyConnection") -> set[str]:
-    return {name for (name,) in connection.execute("SELECT table_name FROM duckdb_tables()").fetchall()}
-
-
-def _create(path: Path) -> None:
-    """Make the file under another name first: whoever is killed here leaves nothing that does not open."""
-    new = path.with_name(path.name + ".new")
-    unsaved = new.with_name(new.name + ".wal")
-    for rest in (new, unsaved):
-        rest.unlink(missing_ok=True)
-    connection = _connected(new, True, PATIENCE)
-    try:
-        _fill(connection)
-    finally:
-        connection.close()
-    if unsaved.exists():
-        raise DatabaseError(f"{path} cannot be written: there is no room for its tables")
-    os.replace(new, path)
-
-
-def _fill(connection: "duckdb.DuckDBPyConnection") -> None:
-    columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
-    from optid import __version__
-
-    connection.execute("BEGIN")
-    connection.execute(f"CREATE TABLE rows ({columns}, PRIMARY KEY (study, key, repetition))")
-    connection.execute(f"CREATE TABLE superseded ({columns})")
-    connection.execute("CREATE TABLE studies (study VARCHAR PRIMARY KEY, description VARCHAR)")
-    connection.execute("CREATE TABLE meta (name VARCHAR PRIMARY KEY, value VARCHAR)")
-    connection.executemany("INSERT INTO meta VALUES (?, ?)", [("schema version", str(SCHEMA_VERSION)),
-                                                               ("made by", f"optid {__version__}")])
-    connection.execute("COMMIT")
-
-
-def _check(path: Path, connection: "duckdb.DuckDBPyConnection") -> None:
-    tables = _tables(connection)
-    if not {"rows", "meta"} <= tables:
-        raise DatabaseError(f"{path} is a DuckDB file, but not a database of studies (it has "
-                            f"{', '.join(sorted(tables)) or 'no tables'}); give another file name")
-    found = connection.execute("SELECT value FROM meta WHERE name = 'schema version'").fetchone()
-    version = found[0] if found else "unknown"
-    if version != str(SCHEMA_VERSION):
-        made = connection.execute("SELECT value FROM meta WHERE name = 'made by'").fetchone()
-        raise DatabaseError(f"{path} has schema version {version}{f' (made by {made[0]})' if made else ''}; this is "
-                            f"version {SCHEMA_VERSION}. Export it with the optid that made it, or give another file")
 
 
 def append(path: str | Path, rows: Sequence[Mapping[str, Any]], patience: float | None = None) -> None:
@@ -140,39 +37,37 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]], patience: float 
     with writing(path, patience) as connection:
         if not whole:
             return
-        connection.register("batch", {c.name: _packed([row[c.name] for row in whole], c.kind) for c in COLUMNS})
+        _register(connection, whole)
         names = ", ".join(f'"{name}"' for name in NAMES)
-        casts = ", ".join(f'CAST("{c.name}" AS {c.sql})' for c in COLUMNS)
-        same = "SELECT r.rowid FROM rows AS r JOIN batch AS b ON b.study = r.study AND "  # by equality: hashed, no loop
-        older = (f"rowid IN ({same} b.place = r.place WHERE b.key <> r.key OR b.repetition <> r.repetition UNION ALL "
-                 f"{same} b.key = r.key AND b.repetition = r.repetition WHERE b.place <> r.place)")
-        connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {older}")
-        connection.execute(f"DELETE FROM rows WHERE {older}")
-        connection.execute(f"INSERT INTO rows ({names}) SELECT {casts} FROM batch")
+        connection.execute(f"INSERT INTO superseded SELECT {names} FROM rows WHERE {OLDER}")
+        connection.execute(f"DELETE FROM rows WHERE {OLDER}")
+        connection.execute(f"INSERT INTO rows ({names}) SELECT {CASTS} FROM batch")
 
 
-@contextmanager
-def writing(path: str | Path, patience: float | None = None) -> "Iterator[duckdb.DuckDBPyConnection]":
-    """Open a database for one transaction, which is undone when anything fails.
+CASTS = ", ".join(f'CAST("{c.name}" AS {c.sql})' for c in COLUMNS)
+_SAME = "SELECT r.rowid FROM rows AS r JOIN batch AS b ON b.study = r.study AND "  # by equality: hashed, no loop
+OLDER = (f"rowid IN ({_SAME} b.place = r.place WHERE b.key <> r.key OR b.repetition <> r.repetition UNION ALL "
+         f"{_SAME} b.key = r.key AND b.repetition = r.repetition WHERE b.place <> r.place)")
+"""Which rows make room for those of a batch."""
 
-    Args:
-        path: the database; made when it is not there.
-        patience: as in `opened`.
 
-    Raises:
-        DatabaseError: as in `opened`, or it cannot be written.
+def _register(connection: "duckdb.DuckDBPyConnection", whole: Sequence[Mapping[str, Any]]) -> None:
+    """Let whole rows be known to a connection as the table ``batch``."""
+    connection.register("batch", {c.name: _packed([row[c.name] for row in whole], c.kind) for c in COLUMNS})
+
+
+def _all_rows(connection: "duckdb.DuckDBPyConnection", path: str | Path) -> str:
+    """Name of the table of all rows: with those that a run, under way or killed, has in the journal only.
+
+    Nobody writes to the database while it is open here, so that every row is in it, in the journal, or in both.
     """
-    try:
-        with opened(path, write=True, patience=patience) as connection:
-            connection.execute("BEGIN")
-            yield connection
-            connection.execute("COMMIT")
-    except OptidError:
-        raise
-    except Exception as error:
-        if not type(error).__module__.startswith(("duckdb", "_duckdb")) and not isinstance(error, OSError):
-            raise
-        raise DatabaseError(f"{path} cannot be written: {str(error).splitlines()[0]}") from error
+    if not (waiting := journal.kept(path)):
+        return "rows"
+    _register(connection, waiting)
+    names = ", ".join(f'"{name}"' for name in NAMES)
+    connection.execute(f"CREATE TEMP TABLE all_rows AS SELECT {names} FROM rows WHERE NOT {OLDER}")
+    connection.execute(f"INSERT INTO all_rows SELECT {CASTS} FROM batch ANTI JOIN rows USING (study, key, repetition)")
+    return "all_rows"
 
 
 def _packed(values: list[Any], kind: str) -> np.ndarray:
@@ -188,6 +83,8 @@ def _packed(values: list[Any], kind: str) -> np.ndarray:
 def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
     """Return the rows as one array per column, in the order in which the cells started.
 
+    Those that are only in the journal, of a run that is under way or was killed, are among them; nothing is written.
+
     Args:
         path: the database.
         study: only rows of this study.
@@ -198,14 +95,14 @@ def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarra
         value; "flag" bool, False where there is none; "time" datetime64[us].
 
     Raises:
-        DatabaseError: as in `opened`.
+        DatabaseError: as in `opened`, or what is in the journal is no row of this version.
     """
     names = ", ".join(f"coalesce(\"{c.name}\", '') AS \"{c.name}\"" if c.kind in ("text", "json") else f'"{c.name}"'
                       for c in COLUMNS)
     with opened(path) as connection:
         condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
-        found = connection.execute(f"SELECT {names} FROM rows {condition} ORDER BY started, key, repetition", values
-                                   ).fetchnumpy()
+        found = connection.execute(f"SELECT {names} FROM {_all_rows(connection, path)} {condition} "
+                                   "ORDER BY started, key, repetition", values).fetchnumpy()
     return {c.name: _unpacked(found[c.name], c.kind, c.always) for c in COLUMNS}
 
 
@@ -370,7 +267,7 @@ def check_target(target: str | Path) -> Path:
 
 
 def export(path: str | Path, target: str | Path, study: str | None = None) -> int:
-    """Write the rows to a Parquet or CSV file and return how many there are.
+    """Write the rows, as `read_rows` finds them, to a Parquet or CSV file and return how many there are.
 
     Args:
         path: the database.
@@ -378,7 +275,7 @@ def export(path: str | Path, target: str | Path, study: str | None = None) -> in
         study: only rows of this study.
 
     Raises:
-        DatabaseError: another ending, the target cannot be written, or as in `opened`.
+        DatabaseError: another ending, no rows, the target cannot be written, or as in `read_rows`.
     """
     target = check_target(target)
     condition, values = ("WHERE study = ?", [study]) if study is not None else ("", [])
@@ -386,9 +283,13 @@ def export(path: str | Path, target: str | Path, study: str | None = None) -> in
     with opened(path) as connection:
         import duckdb
 
+        source = f"{_all_rows(connection, path)} {condition}"
+        if connection.execute(f"SELECT 1 FROM {source} LIMIT 1", values).fetchall() == []:
+            whose = f"no rows of a study {study!r}" if study is not None else "no rows"
+            raise DatabaseError(f"{path} has {whose} to export: `optid study run` makes them")
         try:
             count = connection.execute(
-                f"COPY (SELECT {names} FROM rows {condition} ORDER BY started, key, repetition) "
+                f"COPY (SELECT {names} FROM {source} ORDER BY started, key, repetition) "
                 f"TO '{str(target).replace(chr(39), 2 * chr(39))}' ({FORMATS[target.suffix.lower()]})", values
             ).fetchone()
         except duckdb.Error as error:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.errors import DatabaseError
+from optid.studies.storage.rows import complete
 
 
 @contextmanager
@@ -67,6 +68,34 @@ def _acquired(path: Path, name: Path) -> int:
         os.close(handle)  # its former holder removed it between our two steps
 
 
+def path_beside(database: Path) -> Path:
+    """Return the path of the journal of a database."""
+    return database.with_name(database.name + ".journal")
+
+
+def kept(database: str | Path) -> list[dict[str, Any]]:
+    """Return the rows in the journal of a database; a last line that a killed process left unfinished is none.
+
+    Args:
+        database: its path, or a link to it.
+
+    Raises:
+        DatabaseError: the journal cannot be read, or holds what is no row of this version.
+    """
+    path = path_beside(Path(database).resolve())
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be read: {error.strerror}") from None
+    try:
+        return [complete(json.loads(line)) for line in content.split(b"\n")[:-1]]
+    except (ValueError, TypeError) as error:
+        raise DatabaseError(f"{path} holds what is no row of this version ({error}). Remove it: the cells that only it "
+                            "knows are run again") from error
+
+
 class Journal:
     """Rows that are not in the database yet, one line of JSON each."""
 
@@ -79,7 +108,7 @@ class Journal:
         Raises:
             DatabaseError: it cannot be written.
         """
-        self.path = database.with_name(database.name + ".journal")
+        self.path = path_beside(database)
         try:
             self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
         except OSError as error:
@@ -100,11 +129,6 @@ class Journal:
         except OSError as error:
             os.ftruncate(self._handle, size)  # half a row is none
             raise DatabaseError(f"{self.path} cannot be written: {error.strerror}") from error
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return what is in it; a last line that a killed process left unfinished is none."""
-        content = os.pread(self._handle, os.fstat(self._handle).st_size, 0)
-        return [json.loads(line) for line in content.split(b"\n")[:-1]]
 
     def clear(self) -> None:
         """Forget everything: it is in the database."""
