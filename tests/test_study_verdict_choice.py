@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from study_rows import run, table_of, times_of
 
+from optid.studies.verdicts.advice import evidence
 from optid.studies.verdicts.averages import paired_ratio
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
 from optid.studies.verdicts.profiles import time_ratios
@@ -223,6 +224,37 @@ def test_it_depends_on_the_formulation_where_it_does():
     assert conclude(ahead).headline.word == "a for exact; b for linear"
     same = conclude(table_of(times_of(1.0, 5.0)) + table_of(times_of(1.0, 5.0), formulation="linear"))
     assert same.headline.word == "Use a" and same.recommended == ("a",)
+
+
+def test_what_is_left_of_a_ratio_in_the_whole_fit_and_who_proves_is_said():
+    rows = table_of(times_of(1.0, 7.0, problems=26))
+    for row in rows:
+        row |= {"fit_s": 2.0 + row["solve_s"] / 100, "proved": row["solver"] == "b" or row["seed"] >= 2}
+    rows = [{**row, "fit_s": 3.0} if row["solver"] == "b" else row for row in rows]
+    verdict = conclude(rows)
+    a, b = (verdict.overall.standing(name) for name in "ab")
+    assert (a.proved, b.proved) == (24, 26) and b.fit == pytest.approx(3.0) and a.fit == pytest.approx(2.0, rel=0.05)
+    text = verdict.headline.text
+    assert "; for the whole fit 1.4" in text and "Proved globally optimal: a 24 of 26, b 26 of 26." in text
+    two = conclude([{**row, "formulation": name} for row in rows for name in ("f", "g")])
+    assert "× for the whole fit. Proved globally optimal: a 24 of 26" in evidence(two.sections[0])
+    whole = conclude(rows, time="fit").headline.text
+    assert "for the whole fit" not in whole and "takes 1.4" in whole
+    assert "Proved" not in conclude([{**row, "proved": True} for row in rows]).headline.text
+
+
+def test_a_solver_that_ties_everywhere_but_once_heads_the_verdict():
+    """Those that come first by a hair in a tie are not each named for their own formulation."""
+    order = {"f": (1.0, 1.01, 5.0), "g": (1.0, 5.0, 1.01), "h": (1.01, 1.0, 5.0), "i": (7.0, 7.0, 1.0)}
+    rows = [row for k, (name, factors) in enumerate(order.items())
+            for row in table_of(times_of(*factors, seed=k, spread=0.01), formulation=name)]  # fmt: skip
+    headline = conclude(rows).headline
+    assert headline.word == "a; for i c"
+    assert "a comes first, or ties for it, in 3 of 4 formulations" in headline.text
+    everywhere = [row for row in rows if row["formulation"] != "i"]
+    assert conclude(everywhere).headline.word in ("Use a", "A tie: a and b")
+    few = [row for row in rows if row["formulation"] != "h" or row["seed"] < 3]
+    assert conclude(few).headline.word == "c for g and i; a for f"  # h cannot be told, and c ties in g
 
 
 def test_a_standing_counts_what_it_says():

@@ -77,7 +77,8 @@ def _standing(s: Standing, section: Section) -> dict[str, Any]:
     rank = ranking.ranks[ranking.names.index(s.solver)] if s.solver in ranking.names else np.nan
     return {
         "solver": s.solver, "problems": s.problems, "solved": s.solved, "share": number(s.share), "refused": s.refused,
-        "false": s.false_claims, "fastest": s.fastest, "time": number(s.time), "penalised": number(s.penalised),
+        "false": s.false_claims, "fastest": s.fastest, "time": number(s.time), "fit": number(s.fit),
+        "proved": s.proved, "penalised": number(s.penalised),
         "residual": number(s.residual, 3), "rank": number(rank), "failures": s.failures,
         "against": None if pair is None else [number(v) for v in (pair.value, pair.low, pair.high, pair.n)],
         "growth": {"slope": number(growth.slope), "low": number(growth.low), "high": number(growth.high),

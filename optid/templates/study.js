@@ -46,6 +46,8 @@ function drawStandings() {
     { name: "time", title: "time", hint: "shifted geometric mean on what it solved: compares only where others solved the same", number: true, value: (s) => s.time, text: (s) => duration(s.time) },
     { name: "against", title: section.first ? `against ${section.first.length > 24 ? section.first.slice(0, 23) + "…" : section.first}` : "against", hint: "ratio of times on the problems both solved, with its 95 % interval", number: true, value: (s) => (s.against ? s.against[0] : section.first === s.solver ? 1 : null),
       node: (s) => !s.against ? (section.first === s.solver ? "1" : "-") : element("span", {}, times(s.against), element("span", { class: "faint" }, s.against[3] > 1 && s.against[0] !== null ? ` (${significant(s.against[1])} to ${significant(s.against[2])})` : "")) },
+    { name: "fit", title: "whole fit", hint: "the same mean of the whole fit: building, judging and proving, too", number: true, value: (s) => s.fit, text: (s) => duration(s.fit) },
+    { name: "proved", title: "proved", hint: "problems on which its answer is proved globally optimal", number: true, descending: true, value: (s) => s.proved, text: (s) => s.proved.toLocaleString("en") },
     { name: "fastest", title: "fastest on", hint: "problems on which nobody was faster", number: true, descending: true, value: (s) => s.fastest, text: (s) => s.fastest.toLocaleString("en") },
     { name: "penalised", title: "failures at limit", hint: "shifted geometric mean with every failure counted as the time limit", number: true, value: (s) => s.penalised, text: (s) => duration(s.penalised) },
     { name: "rank", title: "mean rank", hint: "over the data sets, 1 is best", number: true, value: (s) => s.rank, text: (s) => significant(s.rank) },

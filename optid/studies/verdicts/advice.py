@@ -1,7 +1,7 @@
 """The verdict in words: recommendations with the numbers they rest on, warnings, and what cannot be told."""
 
 from optid.showing.wording import seconds
-from optid.studies.verdicts.averages import Paired
+from optid.studies.verdicts.averages import Paired, paired_ratio
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, listed
 from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
 from optid.studies.verdicts.quality import Quality
@@ -47,7 +47,8 @@ def choice_of_solver(section: Section) -> Statement:
         text = f"{solved}. No difference in time beyond chance or 10 %: {each}.{_claims(section, names)}"
         word = f"A tie: {listed(names)}"
     else:
-        text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_quicker(section)}{_claims(section, (lead.solver,))}"
+        text = f"{solved}{_refusals(lead)}. {_runner_up(section)}{_proofs(section)}{_quicker(section)}"
+        text += _claims(section, (lead.solver,))
         word = f"Use {lead.solver}"
         if lead.refused > RARE * n:
             most = lead.solved == max(choice.solved.values())
@@ -79,9 +80,11 @@ def evidence(section: Section) -> str:
     if after is None:
         return "nobody else solved any"
     fewer = "" if after.solved == section.standing(choice.first).solved else f" solved {after.solved:,},"
-    ratio = choice.against.get(after.solver)
-    return f"next: {after.solver}{fewer} {_times(ratio)}" if ratio is not None and ratio.enough else (
-        f"next: {after.solver}{fewer}".rstrip(","))  # fmt: skip
+    ratio, whole = choice.against.get(after.solver), _whole_fit(section, after.solver)
+    if ratio is None or not ratio.enough:
+        return f"next: {after.solver}{fewer}".rstrip(",")
+    rest = f", {whole.value:.3g} × for the whole fit" if whole else ""
+    return f"next: {after.solver}{fewer} {_times(ratio)}{rest}.{_proofs(section)}".rstrip(".")
 
 
 def _next(section: Section) -> Standing | None:
@@ -147,10 +150,30 @@ def _runner_up(section: Section) -> str:
         speed = f", in {_times(pair)} where both work" if pair is not None and pair.enough else ""
         return f"The next, {name}, solved only {after.solved:,}{speed}."
     fewer, most = _count(section, name), max(choice.candidates, key=lambda one: choice.solved[one])
-    text = f"The next{'' if fewer else ' as reliable'}, {name}, {fewer}{_against(section, name)}."
+    text = f"The next{'' if fewer else ' as reliable'}, {name}, {fewer}{_against(section, name)}"
+    whole = _whole_fit(section, name)
+    text += f"; for the whole fit {times_as(whole.value)}." if whole else "."
     if choice.solved[most] > max(choice.solved[choice.first], choice.solved[name]):
         text += f" {most} {_count(section, most)}{_against(section, most)}."
     return text
+
+
+def _whole_fit(section: Section, name: str) -> Paired | None:
+    """What is left of the ratio of times in the whole fit, where the solver's share of it is compared."""
+    found = section.found
+    one, first = found.solvers.index(name), found.solvers.index(section.choice.first)
+    pair = paired_ratio(found.fit[:, one], found.fit[:, first])
+    return pair if pair.enough and found.measure == "solve" else None
+
+
+def _proofs(section: Section) -> str:
+    """Say how many answers are proved, of the first and the next, where that is not all of one of them."""
+    after = _next(section)
+    named = [section.standing(section.choice.first), *([after] if after else [])]
+    if all(one.proved == one.solved for one in named) or not any(one.proved for one in named):
+        return ""
+    shown = ", ".join(f"{one.solver} {one.proved:,} of {one.solved:,}" for one in named)
+    return f" Proved globally optimal: {shown}."
 
 
 def _quicker(section: Section) -> str:
@@ -217,30 +240,54 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
         return models if models is not None and decided else choice_of_solver(overall)
     if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)
-    beaten = any(s.choice.kind == FIRST and s.choice.first not in (choice.first, *choice.tied) for s in sections)
+    leaders = {choice.first, *choice.tied}
+    beaten = any(s.choice.kind in (FIRST, TIE) and not leaders <= {s.choice.first, *s.choice.tied} for s in sections)
     if choice.kind in (FIRST, TIE) and overall.standing(choice.first).solved >= 0.99 * n and not beaten:
         return choice_of_solver(overall)
     decided = [section for section in sections if section.recommended or section.choice.kind == ONLY_ONE]
     if not decided:
         return choice_of_solver(overall)
-    firsts = list(dict.fromkeys(section.choice.first for section in decided))
-    if len(firsts) == 1 and len(decided) == len(sections):
-        lead = overall.standing(firsts[0])
-        text = f"{lead.solver} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}, and "
-        at = overall.found.accuracy
-        text += f"reached the accuracy of {at:.0e} on {of(lead.solved, n)} ({counting(at)})."
-        return Statement(_tone(lead, n), f"Use {lead.solver}", text, "solver")
-    named = {first: [section.name for section in decided if section.choice.first == first] for first in firsts}
-    best = "; ".join(f"{first} for {listed(names)}" for first, names in named.items())
+    at, used = overall.found.accuracy, _used(overall, decided)
+    main = next(iter(used))
+    counted = f"an accuracy of {at:.0e} ({counting(at)})"
+    if len(used) == 1 and len(decided) == len(sections):
+        lead = overall.standing(main)
+        text = f"{main} comes first, or ties for it, in {of(len(decided), len(sections), 'formulation')}, and "
+        text += f"reached {counted} on {of(lead.solved, n)}."
+        return Statement(_tone(lead, n), f"Use {main}", text, "solver")
+    best = _by_formulation(used, short=len(decided) == len(sections))
     most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    at = overall.found.accuracy
-    text = f"{most.solver} solved most, {of(most.solved, n)} at an accuracy of {at:.0e} ({counting(at)})."
+    text = f"{most.solver} solved most, {of(most.solved, n)} at {counted}."
     if most.solved < 0.99 * n:
         text = f"No solver does everything: {text}"
+    if len(used[main]) > 1:
+        text += f" {main} comes first, or ties for it, in {len(used[main]):,} of {len(sections):,} formulations."
     if len(decided) < len(sections):
         text += f" For {len(sections) - len(decided)} of {len(sections)} formulations it cannot be told."
-    tones = [_tone(section.standing(section.choice.first), len(section.found.data)) for section in decided]
+    tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in used.items() for one in theirs]
     tone = max(tones if len(decided) == len(sections) else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
     if len(best) <= LONGEST:
         return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
     return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")
+
+
+def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:
+    """Few solvers that come first, or tie for it, in all these sections: {solver: sections}, whoever covers most first.
+
+    Of solvers that cover as many, the one that stands better on all problems.
+    """
+    order, left, used = [s.solver for s in overall.standings], list(decided), {}
+    while left:
+        leads = {name: [one for one in left if name in (one.choice.first, *one.choice.tied)] for name in order}
+        name = max(leads, key=lambda solver: len(leads[solver]))
+        used[name] = leads[name]
+        left = [one for one in left if one not in leads[name]]
+    return used
+
+
+def _by_formulation(used: dict[str, list[Section]], short: bool) -> str:
+    """Write who to use where; in short "auto; for monotone ipopt" where one solver covers several."""
+    main, *others = used
+    if not short or len(used[main]) < 2:
+        return "; ".join(f"{name} for {listed([one.name for one in theirs])}" for name, theirs in used.items())
+    return "; ".join([main, *(f"for {listed([one.name for one in used[name]])} {name}" for name in others)])

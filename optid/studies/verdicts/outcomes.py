@@ -67,6 +67,8 @@ class Results:
         reason: sentence of the first run that did not solve it, (P, S).
         false: whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S).
         time: median over the repetitions in seconds, (P, S); ``nan`` unless solved.
+        fit: median over the repetitions of the whole fit in seconds, (P, S); ``nan`` unless solved.
+        proved: whether every repetition was proved globally optimal, (P, S).
         objective: (P, S), of the runs whose verified accuracy was reached, local minima included; ``nan`` otherwise.
         size: yardstick of differences of objectives, (P,).
         residual: worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point.
@@ -88,6 +90,8 @@ class Results:
     reason: np.ndarray
     false: np.ndarray
     time: np.ndarray
+    fit: np.ndarray
+    proved: np.ndarray
     objective: np.ndarray
     size: np.ndarray
     residual: np.ndarray
@@ -172,7 +176,8 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
     state, reason = np.full(shape, NOT_RUN, dtype=object), np.full(shape, "", dtype=object)
     false = np.zeros(shape, dtype=bool)
     np.logical_or.at(false, (problem, solver), table["false_claim"])
-    row, numbers = np.full(shape, -1), {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
+    row, proved = np.full(shape, -1), np.zeros(shape, dtype=bool)
+    numbers = {name: np.full(shape, np.nan) for name in ("time", "fit", "objective", "residual")}
     for (p, s), runs in entries.items():
         runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
         bad = next((i for i in runs if not verified[i]), next((i for i in runs if states[i] != SOLVED), None))
@@ -182,6 +187,8 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
         numbers["residual"][p, s] = np.max(residual[runs])
         if bad is None:
             numbers["time"][p, s] = np.median(seconds[runs])
+            numbers["fit"][p, s] = np.median(table["fit_s"][runs])
+            proved[p, s] = table["proved"][runs].all()
         if verified[runs].all():
             numbers["objective"][p, s] = np.max(table["objective"][runs])
     found = Results(
@@ -189,7 +196,8 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
         n=np.array([_largest(table["n_samples"][m], table["samples"][m]) for m in members]),
         size=np.array([_largest(table["scale"][m]) for m in members]),
         limit=np.array([_largest(table["time_limit"][m]) for m in members]),
-        solvers=solvers, state=state, reason=reason, false=false, row=row, accuracy=accuracy, measure=time, **numbers,
+        solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved, accuracy=accuracy,
+        measure=time, **numbers,
     )  # fmt: skip
     return _against_the_best(found)
 
@@ -278,7 +286,8 @@ def _against_the_best(found: Results) -> Results:
     denied = np.isin(found.state, (INFEASIBLE, str(Status.UNBOUNDED))) & np.any(verified, axis=1, keepdims=True)
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
     values = {f.name: getattr(found, f.name) for f in fields(found)}
-    values |= {"state": state, "false": found.false | denied, "time": np.where(worse, np.nan, found.time), "size": size}
+    values |= {"state": state, "false": found.false | denied, "proved": found.proved & ~worse, "size": size,
+               "time": np.where(worse, np.nan, found.time), "fit": np.where(worse, np.nan, found.fit)}
     return Results(**values)
 
 

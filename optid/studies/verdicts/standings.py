@@ -28,7 +28,10 @@ class Standing:
         fastest: problems on which nobody was faster.
         time: shifted geometric mean of the seconds on what it solved; not comparable where others solved other
             problems.
-        penalised: the same with every failure counted as the time limit; ``inf`` where a limit is not known.
+        fit: the same of the whole fit; building, judging and proving take their time, too.
+        proved: problems on which what it solved is proved globally optimal.
+        penalised: the same as the time, with every failure counted as the time limit; ``inf`` where a limit is not
+            known.
         against: its time against the first choice on the problems both solved; None for the first choice itself and
             where there is none.
         residual: median verified residual on what it solved.
@@ -43,6 +46,8 @@ class Standing:
     false_claims: int
     fastest: int
     time: float
+    fit: float
+    proved: int
     penalised: float
     against: Paired | None
     residual: float
@@ -156,6 +161,8 @@ def _standings(found: Results, counted: np.ndarray, choice: Choice) -> list[Stan
             int(found.false[:, s].sum()),
             int(fastest[:, s].sum()),
             shifted_geometric_mean(times[solved, s]),
+            shifted_geometric_mean(found.fit[solved, s]),
+            int(found.proved[:, s].sum()),
             shifted_geometric_mean(np.where(solved, times[:, s], limits)[ran]),
             against,
             float(np.median(known)) if known.size else float("nan"),
