@@ -207,9 +207,36 @@ def test_other_files_are_refused(path):
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1))):
         with pytest.raises(DatabaseError, match="not a database of studies"):
             attempt()
-    path.write_text("time,u,y\n" * 1000)
-    with pytest.raises(DatabaseError, match="cannot be opened"):
+
+
+@pytest.mark.parametrize("name, content, words", [
+    ("valve.csv", b"time,u,y\n1,2,3\n" * 1000, "valve.csv is a file of another kind, .*give the one that `optid study"),
+    ("study.toml", b'name = "small"\n' * 30, "study.toml is a file of another kind"),
+    ("short.duckdb", b"\n", "is a file of another kind"),
+    ("empty.duckdb", b"", "is empty, and no database: remove it"),
+])
+def test_files_of_another_kind_are_told_with_what_to_do(tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
+        with pytest.raises(DatabaseError, match=words):
+            attempt()
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.1, 0.3])
+def test_a_database_that_was_cut_short_is_told_with_what_to_do(path, share):
+    append(path, rows(2000))
+    content = path.read_bytes()
+    path.write_bytes(content[:max(int(share * len(content)), 20)])
+    with pytest.raises(DatabaseError, match="cannot be (opened|read): .*cut short, take another copy, or remove it"):
         read_rows(path)
+
+
+def test_a_folder_is_no_database(tmp_path):
+    for attempt in (lambda: read_rows(tmp_path), lambda: append(tmp_path, rows(1))):
+        with pytest.raises(DatabaseError, match="no such database|Is a directory"):
+            attempt()
 
 
 def test_export_to_another_ending_or_nowhere(path, tmp_path):

@@ -17,6 +17,7 @@ from optid.studies.storage.rows import COLUMNS, SCHEMA_VERSION
 if TYPE_CHECKING:
     import duckdb
 
+MAGIC = b"DUCK"  # bytes 8 to 11 of every file of DuckDB
 PATIENCE = 10.0  # seconds to wait for another process that has the file open for a moment
 
 
@@ -36,20 +37,49 @@ def opened(path: str | Path, write: bool = False, patience: float | None = None
 
     Raises:
         InUse: by another process, for longer than that.
-        DatabaseError: no such file, not a database of studies, another schema version, or duckdb is missing (with the
-            pip line).
+        DatabaseError: no such file, not a database of studies, a damaged one, another schema version, or duckdb is
+            missing (with the pip line).
     """
     path = Path(path)
     if not write and not path.is_file():
         raise DatabaseError(f"{path}: no such database; `optid study run` makes one")
-    if not path.exists():
+    if path.exists():
+        _check_kind(path)
+    else:
         _create(path)
     connection = _connected(path, write, PATIENCE if patience is None else patience)
     try:
         _check(path, connection)
         yield connection
+    except Exception as error:
+        if write or not _of_duckdb(error):  # `writing` has words of its own
+            raise
+        raise _damaged(path, "read", error) from error
     finally:
         connection.close()
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse a file of another kind before DuckDB, which opens a table of text as a database in memory, sees it."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be opened: {error.strerror}") from None
+    if not head:
+        raise DatabaseError(f"{path} is empty, and no database: remove it, and `optid study run` makes one")
+    if head[8:] != MAGIC:
+        raise DatabaseError(f"{path} is a file of another kind, not a database of studies: give the one that `optid "
+                            "study run` wrote, or another name for a new one")
+
+
+def _of_duckdb(error: Exception) -> bool:
+    return type(error).__module__.startswith(("duckdb", "_duckdb"))
+
+
+def _damaged(path: Path, what: str, error: Exception) -> DatabaseError:
+    return DatabaseError(f"{path} cannot be {what}: {str(error).splitlines()[0]}. Where it is damaged, such as a copy "
+                         "that was cut short, take another copy, or remove it and run the study again")
 
 
 def _connected(path: Path, write: bool, patience: float) -> "duckdb.DuckDBPyConnection":
@@ -64,7 +94,7 @@ def _connected(path: Path, write: bool, patience: float) -> "duckdb.DuckDBPyConn
         except duckdb.Error as error:
             text = str(error).splitlines()[0]
             if "set lock" not in text.lower():
-                raise DatabaseError(f"{path} cannot be opened: {text}") from None
+                raise _damaged(path, "opened", error) from None
             if time.monotonic() > until:
                 raise InUse(f"{path} has been in use by another process for {patience:g} s: {text}") from None
             time.sleep(0.02)
@@ -136,6 +166,6 @@ def writing(path: str | Path, patience: float | None = None) -> "Iterator[duckdb
     except OptidError:
         raise
     except Exception as error:
-        if not type(error).__module__.startswith(("duckdb", "_duckdb")) and not isinstance(error, OSError):
+        if not _of_duckdb(error) and not isinstance(error, OSError):
             raise
         raise DatabaseError(f"{path} cannot be written: {str(error).splitlines()[0]}") from error
