@@ -250,17 +250,17 @@ def test_filters_count_as_the_rows_do(opened, rows):
     opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("tanks objective > 0 n_samples=1500")
     exact = [r for r in some if r["data"] == "two tanks" and r["objective"] is not None and r["n_samples"] == 1500]
-    opened.wait(f"document.getElementById('runs-count').textContent === '{len(exact)} of {RUNS:,} runs'", 5)
+    opened.wait(f"document.getElementById('runs-count').textContent === '{len(exact)} of {RUNS:,} runs'")
     assert 0 < len(exact) < len(some)
     opened.click("#filter-reset")
-    opened.wait(f"document.getElementById('runs-count').textContent === '{RUNS:,} of {RUNS:,} runs'", 5)
+    opened.wait(f"document.getElementById('runs-count').textContent === '{RUNS:,} of {RUNS:,} runs'")
     opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("constructor = x")  # no column is called so, and no part of the page is mistaken for one
-    opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'", 5)
+    opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'")
     opened.click("#filter-reset")
     opened.run("document.getElementById('filter-text').focus({preventScroll: true})")
     opened.write("no such words anywhere")
-    opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'", 5)
+    opened.wait("document.querySelector('#runs-table tbody').textContent === 'Nothing here.'")
 
 
 @in_browser
@@ -316,7 +316,7 @@ def test_figures_zoom_by_dragging_buttons_keys_and_wheel(opened, figure):
     x, y = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
     before = opened.run("scrollY")
     opened.mouse("mouseWheel", x, y, deltaX=0, deltaY=-100, modifiers=2)
-    opened.wait(f"document.querySelector('{svg}').dataset.view.split(' ')[1] < {whole[1]} - 1e-6", 5)
+    opened.wait(f"document.querySelector('{svg}').dataset.view.split(' ')[1] < {whole[1]} - 1e-6")
     assert opened.run("scrollY") == before
 
 
@@ -392,7 +392,7 @@ def test_a_point_and_a_run_open_their_details_and_escape_closes_them(opened, row
     assert "residual" in opened.run(tip)
     opened.mouse("mousePressed", *place, button="left", clickCount=1)
     opened.mouse("mouseReleased", *place, button="left", clickCount=1)
-    opened.wait("document.getElementById('detail').open", 10)
+    opened.wait("document.getElementById('detail').open")
     opened.click("#detail .close")
     assert not opened.run("document.getElementById('detail').open")
 
@@ -493,6 +493,21 @@ def test_no_reason_is_cut_off(browser, tmp_path):
     assert browser.run(f"{cells}.every(c => c.scrollWidth <= c.clientWidth + 1)")
     hints = browser.run("document.querySelector('#standings details').innerText")
     assert "failures at limit" in hints and "every failure counted as the time limit" in hints
+
+
+@in_browser
+def test_two_lengths_are_drawn_without_a_slope_and_their_axis_is_clear(browser, tmp_path):
+    rows = [row for row in synthetic(1500, 1) if row["n_samples"] in (200, 5000)]
+    browser.window(1280, 900)
+    browser.open(write_page(rows, tmp_path / "page.html"))
+    caption = browser.run("document.querySelector('#growth figcaption').textContent")
+    assert "slope cannot be told: it needs at least 3 record lengths" in caption and "grows as" not in caption
+    assert browser.run("document.querySelectorAll('#growth [data-series]').length") > 0
+    free = """[...document.querySelectorAll('#growth .plot, #accuracy .plot')].every((plot) => {
+      const texts = [...plot.querySelectorAll('svg text')], title = texts.find((t) => t.hasAttribute('transform'));
+      return texts.filter((t) => t.getAttribute('text-anchor') === 'end' && !t.closest('g')).every(
+        (t) => t.getBoundingClientRect().left >= title.getBoundingClientRect().right); })"""
+    assert browser.run(free)
 
 
 @in_browser

@@ -249,7 +249,7 @@ def test_a_solver_that_ties_everywhere_but_once_heads_the_verdict():
     rows = [row for k, (name, factors) in enumerate(order.items())
             for row in table_of(times_of(*factors, seed=k, spread=0.01), formulation=name)]  # fmt: skip
     headline = conclude(rows).headline
-    assert headline.word == "a; for i c"
+    assert headline.word == "Use a; for i c"
     assert "a comes first, or ties for it, in 3 of 4 formulations" in headline.text
     everywhere = [row for row in rows if row["formulation"] != "i"]
     assert conclude(everywhere).headline.word in ("Use a", "A tie: a and b")

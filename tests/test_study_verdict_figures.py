@@ -24,6 +24,7 @@ from optid.studies.verdicts.ranks import (
     signed_ranks,
 )
 from optid.studies.verdicts.table import columns
+from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
 
@@ -219,6 +220,14 @@ def test_failures_rank_last_and_tie():
 
 
 # ---- growth
+
+
+def test_the_length_of_a_problem_is_what_the_fits_see():
+    """Samples held out are simulated on top, so that a length that is asked for is the length that is fitted."""
+    rows = [run("a", p, samples=n, n_samples=round(n / 0.7), n_estimation=n) for p, n in enumerate((300, 1000, 3000))]
+    assert list(tabulate(columns(rows)).n) == [300, 1000, 3000]
+    growth = conclude([{**row, "seed": 0} for row in rows]).overall.standing("a").growth
+    assert list(growth.lengths) == [300, 1000, 3000]
 
 
 def test_growth_recovers_a_power_law_and_equals_linear_regression():

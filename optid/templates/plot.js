@@ -105,7 +105,7 @@ function makePlot(host, spec, hidden) {
     const width = Math.max(280, Math.round(box.clientWidth || 560));
     const rows = spec.y.categories ? 70 + 30 * spec.y.categories.length : Math.min(380, Math.max(260, 0.56 * width));
     const longest = spec.y.categories ? Math.max(...spec.y.categories.map((n) => n.length)) : 0;
-    return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 62, right: 14, top: 10, bottom: 44 };
+    return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 72, right: 14, top: 10, bottom: 44 };
   }
 
   function draw() {

@@ -132,9 +132,10 @@ function growthFigure() {
   const known = section.standings.filter((s) => s.growth.n.length > 1);
   const series = known.map((s) => ({ ...styled(s.solver), kind: "line", xs: s.growth.n, ys: s.growth.t }));
   const words = (g) => g.missing ? `cannot tell: ${g.missing}` : `${significant(g.slope, 3)} (${significant(g.low, 3)} to ${significant(g.high, 3)})`;
+  const told = known.some((s) => !s.growth.missing);
   const none = section.standings.length ? section.standings[0].growth.missing : "";
-  figure("growth", "Time against record length", series.length ? "Geometric mean time of what was solved; the slope is the exponent of N in the table of the solvers." : `Cannot be told: it ${none || "needs a run"}.`, series.length ? {
-    x: { title: "samples N", log: true, format: (v) => v.toLocaleString("en") }, y: { title: "time", log: true, format: duration }, series,
+  figure("growth", "Time against record length", series.length ? `Geometric mean time of what was solved, over the samples that were fitted. ${told ? "The slope is the exponent of N: “grows as” in the table of the solvers." : `Its slope cannot be told: it ${none}.`}` : `Cannot be told: it ${none || "needs a run"}.`, series.length ? {
+    x: { title: "samples fitted, N", log: true, format: (v) => v.toLocaleString("en") }, y: { title: "time", log: true, format: duration }, series,
     tip: (one, i) => `${one.name}\n${duration(one.ys[i])} at N = ${one.xs[i].toLocaleString("en")}`,
   } : null, series.length ? numbersBelow(["solver", "exponent of N (95 %)"], known.map((s) => [s.solver, words(s.growth)])) : null);
 }
@@ -202,8 +203,8 @@ function drawAgreement() {
 
 // ---- runs
 
-const SHOWN = ["open", "state", "solver", "formulation", "data", "n_samples", "noise", "seed", "time_s", "objective", "residual", "gap", "simulation_fit", "reason"];
-const TITLES = { state: "result", time_s: "time", n_samples: "N", simulation_fit: "simulation fit" };
+const SHOWN = ["open", "state", "solver", "formulation", "data", "n_estimation", "noise", "seed", "time_s", "objective", "residual", "gap", "simulation_fit", "reason"];
+const TITLES = { state: "result", time_s: "time", n_estimation: "N fitted", simulation_fit: "simulation fit" };
 const FACETS = { state: "Result", solver: "Solver", formulation: "Formulation", data: "Data" };
 let runs = null;
 const filters = {};

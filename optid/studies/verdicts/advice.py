@@ -286,8 +286,8 @@ def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:
 
 
 def _by_formulation(used: dict[str, list[Section]], short: bool) -> str:
-    """Write who to use where; in short "auto; for monotone ipopt" where one solver covers several."""
+    """Write who to use where; in short "Use auto; for monotone ipopt" where one solver covers several."""
     main, *others = used
     if not short or len(used[main]) < 2:
         return "; ".join(f"{name} for {listed([one.name for one in theirs])}" for name, theirs in used.items())
-    return "; ".join([main, *(f"for {listed([one.name for one in used[name]])} {name}" for name in others)])
+    return "; ".join([f"Use {main}", *(f"for {listed([one.name for one in used[name]])} {name}" for name in others)])

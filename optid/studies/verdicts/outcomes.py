@@ -61,7 +61,7 @@ class Results:
     Attributes:
         study, data, formulation: labels per problem, (P,).
         samples, noise, seed: what the record was simulated with, (P,); ``nan`` for files.
-        n: length of the record, (P,); ``nan`` where no run got that far.
+        n: samples that the fits see, those held out left out, (P,); ``nan`` where no run got that far.
         solvers: labels, S of them, in alphabetical order.
         state: `SOLVED` or the word for why not, (P, S).
         reason: sentence of the first run that did not solve it, (P, S).
@@ -193,7 +193,7 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
             numbers["objective"][p, s] = np.max(table["objective"][runs])
     found = Results(
         *(table[name][first] for name in ("study", "data", "formulation", "samples", "noise", "seed")),
-        n=np.array([_largest(table["n_samples"][m], table["samples"][m]) for m in members]),
+        n=np.array([_largest(*(table[c][m] for c in ("n_estimation", "n_samples", "samples"))) for m in members]),
         size=np.array([_largest(table["scale"][m]) for m in members]),
         limit=np.array([_largest(table["time_limit"][m]) for m in members]),
         solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved, accuracy=accuracy,
