@@ -1,6 +1,7 @@
 """Running a study: nothing twice, nothing lost, one writer, and a clear word where it cannot go on."""
 
 import errno
+import re
 import subprocess
 import sys
 import time
@@ -561,7 +562,10 @@ except DatabaseError as error:
     assert closed == "True" and int(ran) > 5
     assert ("study.duckdb.journal" if full == "journal" else "study.duckdb") + " cannot be written: " in words
     assert len(finished(path)) >= 10
+    kept = re.search(r"([\d,]+) of 3,000 cells are kept\. Where the disk is full, free space; the same run", words)
+    assert kept is not None, words
     grid([cell(k) for k in range(3000)])
     rest = Hands()
     assert len(run(STUDY, path, execute=rest)) == 3000
     assert len(rest.ran) + int(ran) + 10 in (3000, 3001)  # the row for which there was no room is made again
+    assert len(rest.ran) == 3000 - int(kept[1].replace(",", ""))

@@ -110,6 +110,7 @@ class _Writer:
     def __init__(self, db: Path) -> None:
         self._db, self._journal = db, Journal(db)
         self._pending: list[Row] = []
+        self.added = 0  # rows that are safe in the journal
         self._full, self._since = BATCH, time.monotonic()
         try:
             self.absorb()  # refuses a database of another version before anything is written
@@ -124,6 +125,7 @@ class _Writer:
 
     def add(self, row: Row) -> None:
         self._journal.add(row)
+        self.added += 1
         if not self._pending:
             self._since = time.monotonic()
         self._pending.append(row)
@@ -168,13 +170,17 @@ def _work(todo: list[Cell], total: int, execute: Executor, writer: _Writer, prog
                 done += 1
                 if progress is not None:
                     progress(done, total, row)
-        except DatabaseError:
+            writer.flush()
+        except InUse:
             raise
+        except DatabaseError as error:
+            kept = total - len(todo) + writer.added
+            raise DatabaseError(f"{error}. {kept:,} of {total:,} cells are kept. Where the disk is full, free space; "
+                                "the same run goes on from there") from error
         except BaseException:  # Ctrl-C at any point, a lost cluster
             with suppress(InUse):  # the journal has the rows
                 writer.absorb()
             raise
-    writer.flush()
     if expected:
         raise StudyError(f"{len(expected)} cells of {total} came back without a row; run the study again")
 
