@@ -37,5 +37,5 @@ def client(two_processes):
     """A client of that cluster, when all its workers are there."""
     distributed = pytest.importorskip("distributed")
     with distributed.Client(two_processes, set_as_default=False) as one:
-        one.wait_for_workers(2, timeout=180)  # the nanny replaces those that the test before killed
+        one.wait_for_workers(2, timeout=600)  # the nanny replaces those that the test before killed
         yield one

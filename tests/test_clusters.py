@@ -153,7 +153,7 @@ def closed_port():
 def test_a_scheduler_that_cannot_be_reached_is_said_to_be_one_quickly(tmp_path, closed_port):
     started = time.monotonic()
     assert "no scheduler can be reached at tcp://127.0.0.1" in refused(f"tcp://127.0.0.1:{closed_port}")
-    assert time.monotonic() - started < 6  # a Client alone tries for 30 s
+    assert time.monotonic() - started < 10  # a Client alone tries for 30 s
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
         optid.open_stream(da.zeros((100, 2)), columns=["u", "y"], scheduler=f"127.0.0.1:{closed_port}")
     (tmp_path / "scheduler.json").write_text(json.dumps({"address": f"tcp://127.0.0.1:{closed_port}"}))
@@ -247,7 +247,7 @@ def test_a_real_worker_with_another_solver_is_refused(tmp_path):
         worker = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(tmp_path)}, stderr=subprocess.DEVNULL)
         try:
             with distributed.Client(empty, set_as_default=False) as client:
-                client.wait_for_workers(1, timeout=120)
+                client.wait_for_workers(1, timeout=600)
                 with pytest.raises(ClusterError, match=r"worker \S+ has other packages: clarabel: \S+ here, 0.0.1"):
                     check_workers(client, ["optid", "numpy", "clarabel"])
                 check_workers(client, ["optid", "numpy"])

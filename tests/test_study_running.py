@@ -482,7 +482,7 @@ def test_a_real_study_from_python_to_its_frame():
         (FormulationEntry("exact", "hammerstein_arx.exact", (), {"na": 1, "nb": 2, "basis": "triangular:5"}),
          FormulationEntry("linear", "arx", (), {"na": 1, "nb": 2})),
         (SolverEntry("gn", "gauss_newton"), SolverEntry("clarabel", "clarabel"), SolverEntry("gurobi", "gurobi")),
-        repetitions=2, warm=True)
+        repetitions=2, warm=True, time_limit=300.0)
     frame = study.run(workers=2)
     assert len(frame) == 2 * 2 * 3 * 2
     outcomes = frame.groupby(["formulation", "solver"])["outcome"].agg(lambda words: "/".join(sorted(set(words))))

@@ -11,6 +11,7 @@ SOURCE = Path(__file__).parent / "third_party"
 STUDY = """
 name = "third party"
 solvers = ["predictor_corrector", "clarabel", "gauss_newton"]
+time_limit = 300
 
 [[data]]
 system = "linear"
