@@ -210,6 +210,51 @@ def test_what_only_posing_the_problem_tells(text, line, words):
     assert any(told.startswith(f"line {line}, ") and words in told for told in found), found
 
 
+OPTIONS = SMALL + """
+[[solver]]
+name = "tuned"
+solver = "clarabel"
+options = {{ max_iter = {}, {} }}
+"""
+
+
+@pytest.mark.parametrize("written, column, words", [
+    (("50", "max_itr = 3"), 38, "max_itr makes clarabel fail where it succeeds without: TypeError"),
+    (('"many"', "equilibrate_enable = true"), 24, "max_iter makes clarabel fail where it succeeds without: TypeError"),
+])
+def test_options_that_a_solver_does_not_take_are_told_at_their_place(written, column, words):
+    (told,) = problems(OPTIONS.format(*written))
+    assert told.startswith(f"line 27, column {column}: {words}")
+
+
+def test_options_are_tried_only_where_that_says_something(monkeypatch):
+    from optid.studies.definition import trial
+
+    found = Study.from_text(OPTIONS.format("1", "equilibrate_enable = true"))  # it stops early: for the run to say
+    assert dict(found.solvers[2].options) == {"max_iter": 1, "equilibrate_enable": True}
+    wrong = {"solver": "clarabel", "options": {"max_itr": 3}}
+    with pytest.raises(StudyError, match=r"solvers\[1\].options.max_itr: max_itr makes clarabel fail"):
+        replace(found, solvers=["scs", wrong]).check_data()
+    replace(found, solvers=[wrong], formulations=found.formulations[1:]).check_data()  # not for clarabel at all
+    replace(found, solvers=[{"solver": "mosek", "options": {"x": 1}}]).check_data()  # not installed
+    monkeypatch.setattr(trial, "_solve", lambda *_: pytest.fail("no options, and yet a trial"))
+    Study.from_text(SMALL)
+
+
+def test_options_that_kill_a_solver_are_told(monkeypatch):
+    import os
+
+    from optid import backends
+
+    def run(program, settings):
+        return os.kill(os.getpid(), 9) if settings.options else clarabel.run(program, settings)
+
+    clarabel = backends.back_ends()["clarabel"]
+    monkeypatch.setitem(backends.back_ends(), "clarabel", replace(clarabel, run=run))
+    (told,) = problems(OPTIONS.format("50", "equilibrate_enable = true").replace("max_iter = 50, ", ""))
+    assert "equilibrate_enable makes clarabel fail" in told and "SIGKILL" in told
+
+
 def test_a_formulation_that_fits_some_of_the_data_is_left_to_the_run():
     text = SMALL.replace("[[data]]", '[[data]]\nsystem = "two_modes"\n\n[[data]]', 1)
     one_output = text + '[[formulation]]\nformulation = "oe.exact"\nna = 2\nnb = 2\n'

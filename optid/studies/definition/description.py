@@ -163,14 +163,20 @@ class Study:
         return as_toml(self)
 
     def check_data(self) -> None:
-        """Read every data file, and pose every formulation on a short record, unless that was done already.
+        """Read every data file, pose every formulation and try options on a short record, unless that was done already.
 
         Raises:
             StudyError: lists the files and columns that are not there or cannot be read; where all can, the
-                formulations whose arguments or constraints fit none of their data.
+                formulations whose arguments or constraints fit none of their data, and the options with which a
+                solver fails where it succeeds without.
         """
         from optid.studies.definition.problems import Problems
-        from optid.studies.definition.trial import Records, note_impossible, note_unreadable
+        from optid.studies.definition.trial import (
+            Records,
+            note_impossible,
+            note_unreadable,
+            note_wrong_options,
+        )
 
         if self.data_checked:
             return
@@ -178,6 +184,7 @@ class Study:
         note_unreadable(self.data, records, problems)
         if not problems:
             note_impossible(self.data, self.formulations, records, problems)
+            note_wrong_options(self.data, self.formulations, self.solvers, records, problems)
         problems.told(f"study {self.name!r}")
         object.__setattr__(self, "data_checked", True)
 

@@ -9,7 +9,7 @@ from optid.studies.definition.description import Study
 from optid.studies.definition.entries import read
 from optid.studies.definition.positions import locate
 from optid.studies.definition.problems import Problems
-from optid.studies.definition.trial import Records, note_impossible, note_unreadable
+from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 _END = " (at end of document)"
@@ -64,6 +64,8 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
         note_unreadable(found["data"], records, problems, wrong={problem.path[:2] for problem in problems})
     if not problems:
         note_impossible(found["data"], found["formulations"], records, problems)
+        note_wrong_options(found["data"], found["formulations"], found["solvers"], records, problems,
+                           len(found["solvers"]) - len(raw.get("solver", [])))
     problems.told(label, positions)
     study = Study(**found, folder=folder)
     object.__setattr__(study, "data_checked", True)

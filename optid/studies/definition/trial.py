@@ -1,8 +1,9 @@
-"""What can be found out about a study before it runs: data that cannot be read, formulations that cannot be posed."""
+"""What can be found out before a study runs: data that cannot be read, models that cannot be posed, wrong options."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,12 +11,18 @@ from optid.data import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
-from optid.studies.definition.description import DataEntry, FormulationEntry
+from optid.solution import Status
+from optid.solving import solve
+from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Problems
 from optid.studies.sources.systems import simulate, system
 
 SHORT = 300
-"""Samples on which a formulation is tried."""
+"""Samples on which a formulation, and the options of a solver, are tried."""
+TRIAL = 20.0
+"""Seconds that a trial of options may take; whoever needs longer is left to the run."""
+LONGEST = 300
+"""Characters of the words of a solver that fails."""
 
 
 class Records:
@@ -123,15 +130,77 @@ def note_impossible(data: Sequence[DataEntry], formulations: Sequence[Formulatio
 def _refused(entry: FormulationEntry, record: Data) -> str:
     """Why a formulation does not accept its arguments on a record; empty where it does, or where that is not known."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            constraints = tuple(named_constraint(text) for text in entry.constraints)
-            more = {"constraints": constraints} if constraints else {}
-            problem = look_up(entry.formulation)[1](record, **entry.options, **more)
-            if not hasattr(problem, "view"):  # a procedure poses its first programme when it is asked for it
-                next(problem)
+        _posed(entry, record)
     except (StructureError, LookupFailed) as error:
         return str(error)
     except Exception:  # a record that is too short, a defect: the run will tell
         return ""
     return ""
+
+
+def _posed(entry: FormulationEntry, record: Data) -> Any:
+    """Return the programme of a formulation on a record, the first one of a procedure."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        constraints = tuple(named_constraint(text) for text in entry.constraints)
+        more = {"constraints": constraints} if constraints else {}
+        problem = look_up(entry.formulation)[1](record, **entry.options, **more)
+        return problem if hasattr(problem, "view") else next(problem)
+
+
+def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
+                       solvers: Sequence[SolverEntry], records: Records, problems: Problems, listed: int = 0) -> None:
+    """Note the options with which a solver fails on a short record that it solves without them.
+
+    Args:
+        data: entries of the study.
+        formulations: entries of the study.
+        solvers: entries of the study.
+        records: where data are read.
+        problems: collects what is wrong.
+        listed: so many solvers come first that are no [[solver]] of the file.
+    """
+    for i, entry in enumerate(solvers):
+        if not entry.options:
+            continue
+        programme = next(_solved_without(entry.solver, data, formulations, records), None)
+        if programme is None or not (all_fail := _failure(programme, entry.solver, entry.options)):
+            continue
+        alone = {key: _failure(programme, entry.solver, {key: value}) for key, value in entry.options.items()}
+        path = ("solver", i - listed, "options")
+        for key, why in alone.items():
+            if why:
+                problems.add((*path, key), f"{key} makes {entry.solver} fail where it succeeds without: {why}")
+        if not any(alone.values()):
+            problems.add(path, f"these options make {entry.solver} fail where it succeeds without: {all_fail}")
+
+
+def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: Records
+                    ) -> Iterator[Any]:
+    """Programmes on short records that a solver solves without any option."""
+    for entry in formulations:
+        for one in data:
+            if not entry.data or one.name in entry.data:
+                try:
+                    programme = _posed(entry, records.beginning(one))
+                    solved = _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL)
+                except Exception:  # not posed, not installed, not for this formulation
+                    continue
+                if solved:
+                    yield programme
+
+
+def _failure(programme: Any, solver: str, options: Mapping[str, Any]) -> str:
+    """Why a solver ends without a point; empty where it has one, or ran out of time."""
+    found = _solve(programme, solver, options)
+    if found.status is not Status.FAILED or found.has_point:
+        return ""
+    reason = " ".join(found.reason.split()) or "it does not say why"
+    return reason if len(reason) <= LONGEST else reason[: LONGEST - 1] + "…"
+
+
+def _solve(programme: Any, solver: str, options: Mapping[str, Any]) -> Any:
+    """Solve in a process of its own: options may crash a solver, or never let it end."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return solve(programme, solver, time_limit=TRIAL, prove=False, **options)
