@@ -48,7 +48,7 @@ def test_scripts_are_short(script):
 
 
 def test_the_built_in_study_solves_everything():
-    rows = replace(example_study(), seeds=1).run(workers=1)
+    rows = replace(example_study(), seeds=1, time_limit=300.0).run(workers=1)
     assert len(rows) == 16 and rows[rows["solver"] == "auto"]["reached"].all()
     assert set(rows["outcome"]) == {"done", "refused"}
 

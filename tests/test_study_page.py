@@ -511,6 +511,15 @@ def test_two_lengths_are_drawn_without_a_slope_and_their_axis_is_clear(browser, 
 
 
 @in_browser
+def test_the_tables_of_a_wide_window_are_not_cut(browser, page):
+    browser.window(1400, 900)
+    browser.open(page)
+    for table in ("standings", "runs-table"):
+        region = f"document.querySelector('#{table} .grid')"
+        assert browser.run(f"{region}.scrollWidth <= {region}.clientWidth + 1"), table
+
+
+@in_browser
 @pytest.mark.parametrize("width", [320, 390, 768])
 def test_a_phone_needs_no_sideways_scrolling(browser, page, width):
     browser.window(width, 800, phone=True)

@@ -244,3 +244,16 @@ def test_a_comparison_of_no_rows_is_refused():
 def test_no_rows_at_all_say_so(nothing):
     verdict = conclude(nothing)
     assert verdict.headline.word == "Nothing to compare" and not verdict.recommended and not verdict.statements
+
+
+def test_data_on_which_every_run_ends_with_an_error_are_named():
+    broken = {"outcome": "error", "status_verified": None, "objective": None, "reason": "no column 'y' in b.csv"}
+    rows = [run(s, p, "good") for s in "ab" for p in range(7)] + [run(s, 0, "bad", **broken) for s in "ab"]
+    (said,) = [one for one in conclude(rows).statements if one.word == "Data that failed"]
+    assert said.text == "Every run on bad ended with an error: no column 'y' in b.csv." and said.tone == "bad"
+    refused = {"outcome": "refused", "status_verified": None, "objective": None, "reason": "not its class"}
+    rows += [run("c", p, data, **refused) for data in ("good", "bad") for p in range(2)]
+    assert any(one.word == "Data that failed" for one in conclude(rows).statements)
+    some = [*rows, run("c", 5, "bad")]
+    assert not any(one.word == "Data that failed" for one in conclude(some).statements)
+    assert not any(one.word == "Data that failed" for one in conclude(rows[:14]).statements)

@@ -27,6 +27,7 @@ SCRIPTS = ("plot.js", "grid.js", "study.js")
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
 FOLDED = 8  # formulations above which their list is folded away
 LISTED = 40  # false claims, and rows of the models, on the page; the database has them all
+FEW_REASONS = 12  # kinds of failure that are shown without being asked for
 WIDEST = 120  # characters of a text in a table
 REASON = 400  # characters of a reason, which is broken into lines
 
@@ -84,6 +85,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "statements": verdict.statements,
         "claims": _claims(verdict),
         "quality": _quality_table(verdict.quality) if verdict.quality.records else None,
+        "few_reasons": 0 < len(verdict.failures) <= FEW_REASONS,
         "formulations": [section.name for section in verdict.sections],
         "requested": f"{verdict.accuracy:.0e}",
         "tolerance": f"{verdict.found.tolerance:.0e}",

@@ -49,9 +49,9 @@ function drawStandings() {
     { name: "fit", title: "whole fit", hint: "the same mean of the whole fit: building, judging and proving, too", number: true, value: (s) => s.fit, text: (s) => duration(s.fit) },
     { name: "proved", title: "proved", hint: "problems on which its answer is proved globally optimal", number: true, descending: true, value: (s) => s.proved, text: (s) => s.proved.toLocaleString("en") },
     { name: "fastest", title: "fastest on", hint: "problems on which nobody was faster", number: true, descending: true, value: (s) => s.fastest, text: (s) => s.fastest.toLocaleString("en") },
-    { name: "penalised", title: "failures at limit", hint: "shifted geometric mean with every failure counted as the time limit", number: true, value: (s) => s.penalised, text: (s) => duration(s.penalised) },
-    { name: "rank", title: "mean rank", hint: "over the data sets, 1 is best", number: true, value: (s) => s.rank, text: (s) => significant(s.rank) },
-    { name: "growth", title: "grows as", hint: "exponent of the record length N, with its 95 % interval", number: true, value: (s) => s.growth.slope, node: growth },
+    { name: "penalised", title: "time, failures at limit", hint: "shifted geometric mean with every failure counted as the time limit", number: true, value: (s) => s.penalised, text: (s) => duration(s.penalised) },
+    { name: "rank", title: "mean rank", hint: "over the data sets, 1 is best; a failure or a refusal is last, so that who takes more problems ranks better", number: true, value: (s) => s.rank, text: (s) => significant(s.rank) },
+    { name: "growth", title: "time grows as", hint: "exponent of the record length N, with its 95 % interval", number: true, value: (s) => s.growth.slope, node: growth },
     { name: "residual", title: "residual", hint: "median on what it solved of the largest of violation, complementarity and a tenth of the stationarity", number: true, value: (s) => s.residual, text: (s) => significant(s.residual, 2) },
     { name: "false", title: "false claims", hint: "problems on which a claim of success or infeasibility was false", number: true, descending: true, value: (s) => s.false, node: (s) => s.false ? element("a", { href: "#failures", class: "state-bad" }, String(s.false)) : "0" },
   ];
@@ -122,7 +122,7 @@ function ranksFigure() {
   const series = drawnHere ? r.names.map((name, k) => ({ ...styled(name), kind: "interval", xs: [r.ranks[k]], ys: [names.indexOf(name)], halves: [half] })) : [];
   const caption = r.missing ? `Whether a difference carries over to other data sets cannot be told: the test ${r.missing}.`
     : `${r.test} over ${plural(r.n, "data set")}, probability ${r.p < 0.001 ? "below 0.001" : significant(r.p, 2)}. ` + (!r.apart ? "The ranks do not differ beyond chance." : half ? `Solvers whose bars overlap cannot be told apart (critical difference ${significant(r.difference)}).` : "The two differ.");
-  figure("ranks", "Mean rank over the data sets", caption + (r.left_out.length ? ` Left out, because they did not run or solve everywhere: ${r.left_out.slice(0, 4).join(", ")}${r.left_out.length > 4 ? ` and ${r.left_out.length - 4} more` : ""}.` : ""), drawnHere ? {
+  figure("ranks", "Mean rank over the data sets", `${caption} A failure or a refusal ranks last.` + (r.left_out.length ? ` Left out, because they did not run or solve everywhere: ${r.left_out.slice(0, 4).join(", ")}${r.left_out.length > 4 ? ` and ${r.left_out.length - 4} more` : ""}.` : ""), drawnHere ? {
     x: { title: "mean rank (1 is best)", low: 0.85, high: names.length + 0.15, ticks: names.map((_, k) => k + 1) }, y: { categories: names }, series,
     tip: (one) => `${one.name}: mean rank ${significant(one.xs[0])}`,
   } : null, drawnHere ? numbersBelow(["solver", "mean rank"], r.names.map((name, k) => [name, significant(r.ranks[k])])) : null);
@@ -134,7 +134,7 @@ function growthFigure() {
   const words = (g) => g.missing ? `cannot tell: ${g.missing}` : `${significant(g.slope, 3)} (${significant(g.low, 3)} to ${significant(g.high, 3)})`;
   const told = known.some((s) => !s.growth.missing);
   const none = section.standings.length ? section.standings[0].growth.missing : "";
-  figure("growth", "Time against record length", series.length ? `Geometric mean time of what was solved, over the samples that were fitted. ${told ? "The slope is the exponent of N: “grows as” in the table of the solvers." : `Its slope cannot be told: it ${none}.`}` : `Cannot be told: it ${none || "needs a run"}.`, series.length ? {
+  figure("growth", "Time against record length", series.length ? `Geometric mean time of what was solved, over the samples that were fitted. ${told ? "The slope is the exponent of N: “time grows as” in the table of the solvers." : `Its slope cannot be told: it ${none}.`}` : `Cannot be told: it ${none || "needs a run"}.`, series.length ? {
     x: { title: "samples fitted, N", log: true, format: (v) => v.toLocaleString("en") }, y: { title: "time", log: true, format: duration }, series,
     tip: (one, i) => `${one.name}\n${duration(one.ys[i])} at N = ${one.xs[i].toLocaleString("en")}`,
   } : null, series.length ? numbersBelow(["solver", "exponent of N (95 %)"], known.map((s) => [s.solver, words(s.growth)])) : null);

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
-from optid.studies.storage.rows import REFUSED
+from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.advice import carries_over, choice_of_solver, headline, no_solution
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
+from optid.studies.verdicts.choice import listed
 from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.outcomes import (
     CONTRADICTED,
@@ -157,10 +158,24 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
         said = [models]
         if found.solved.any() and len(overall.standings) > 1 and (len(sections) == 1 or head == solvers):
             said.append(carries_over(overall.ranking))
-    said += [_never(overall), _refuted(found, table), _no_truth(quality), _other_accuracies(found, table)]
+    said += [_failed_data(found), _never(overall), _refuted(found, table), _no_truth(quality)]
+    said.append(_other_accuracies(found, table))
     if overall.infeasible:
         said.append(Statement("fair", "Infeasible problems", no_solution(overall), "solver"))
     return [statement for statement in said if statement is not None]
+
+
+def _failed_data(found: Results) -> Statement | None:
+    """Name the data sets on which every run ended with an error, such as a file that cannot be read."""
+    keys = np.array([f"{study}\0{data}" for study, data in zip(found.study, found.data)], dtype=object)
+    tried, error = applicable(found), found.state == ERROR
+    failed = [key for key in sorted(set(keys)) if (there := tried[keys == key]).any()
+              and (error[keys == key] | ~there).all()]  # fmt: skip
+    if not failed:
+        return None
+    why = found.reason[(keys == failed[0])[:, None] & error][0]
+    text = f"Every run on {listed([key.partition(chr(0))[2] for key in failed])} ended with an error: {why[:200]}"
+    return Statement("bad", "Data that failed", text.rstrip(".") + ".", "data sets")
 
 
 def _never(overall: Section) -> Statement | None:
