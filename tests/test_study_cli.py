@@ -274,6 +274,8 @@ def test_systems_are_listed():
 
     found = run("study", "systems")
     assert found.exit_code == 0 and all(name in found.stdout for name in SYSTEMS)
+    lines = {words[0]: words[3:6] for words in map(str.split, found.stdout.splitlines()) if words}
+    assert lines["thruster"] == ["2", "1", "0"] and lines["pendulum"] == ["3", "2", "1"]
 
 
 # -- compare -----------------------------------------------------------------------------------------------------------

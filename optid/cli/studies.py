@@ -157,13 +157,16 @@ def systems() -> None:
                   pad_edge=False)
     table.add_column("system", no_wrap=True)
     table.add_column("samples", justify="right")
-    table.add_column("noise", justify="right")
+    for column in ("noise", "na", "nb", "nk"):
+        table.add_column(column, justify="right")
     table.add_column("what it is")
     for name, system in SYSTEMS.items():
-        table.add_row(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}", system.about)
+        orders = (str(system.suggestion.get(key, default)) for key, default in (("na", "-"), ("nb", "-"), ("nk", 0)))
+        table.add_row(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}", *orders, system.about)
     output().print(table)
     output().print(Text("samples and noise are those used where a study names none; noise is relative to the "
-                        "noise-free output.", "dim"))
+                        "noise-free output. na, nb and nk suit the system; with other ones a model may be "
+                        "far from the truth.", "dim"))
 
 
 @study.command(cls=Command)
