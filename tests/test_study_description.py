@@ -86,6 +86,7 @@ BAD = [
     ("repetitions = 1.5", 1, 15, "whole number from 1"),
     ("warm = 1", 1, 8, "true or false"),
     ("seeds = [1, -2]", 1, 13, "whole number from 0"),
+    ("seeds = 100_000_000", 1, 9, "100,000,000 seeds are too many: at most 1,000,000"),
     ("seeds = [1, 2, 1]", 1, 16, "seeds has 1 twice"),
     ("accuracy = [1e-4, 1e-8, 0.0001]", 1, 25, "accuracy has 0.0001 twice"),
     ("[[data]]\nname = 'x'\nsystem = 'thruster'\nsamples = [100, 100]", 4, 17, "samples has 100 twice"),
@@ -404,6 +405,17 @@ def test_the_grid_has_every_combination_once():
     assert pickle.loads(pickle.dumps(cells)) == cells
     done = {(cell.key, cell.repetition) for cell in cells[::2]}
     assert grid.left(cells, done) == cells[1::2]
+
+
+def test_cells_are_counted_without_being_made(rig):
+    study = Study("t", data=["linear", {"system": "thruster", "samples": [50, 60], "noise": [0.1, 0.2]}, {
+        "file": "rig.csv", "inputs": "current", "outputs": "thrust"}], folder=rig, repetitions=2, seeds=3,
+        formulations=[{"formulation": "arx", "na": 1, "nb": 1}, {"name": "b", "formulation": "arx", "na": 2, "nb": 1,
+                                                                 "data": ["linear", "rig"]}],
+        solvers=["auto", {"solver": "scs", "accuracy": [1e-4, 1e-6]}])
+    assert grid.number_of_cells(study) == len(grid.cells(study)) == (3 * 2 + 12 + 2) * 3 * 2
+    with pytest.raises(StudyError, match="has 600,000,060 cells; at most 1,000,000 are taken"):
+        grid.cells(replace(study, repetitions=10_000_001))
 
 
 def test_a_formulation_may_be_for_some_of_the_data():

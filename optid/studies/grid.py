@@ -20,6 +20,10 @@ KEY_VERSION = 1
 """Part of every key: to be counted up when what a key says changes its meaning."""
 
 
+MOST = 1_000_000
+"""Cells of a study: more would take months, and minutes to count one by one."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """One run: a record, a formulation with its options, a solver with its settings. Picklable; rows come from it.
@@ -84,8 +88,11 @@ def cells(study: Study) -> list[Cell]:
         study: what to expand.
 
     Raises:
-        StudyError: data files that cannot be read, or entries that differ in nothing but their labels.
+        StudyError: more cells than `MOST`, data files that cannot be read, or entries that differ in nothing but their
+            labels.
     """
+    if (count := number_of_cells(study)) > MOST:
+        raise StudyError(f"study {study.name!r} has {count:,} cells; at most {MOST:,} are taken. Make two of it")
     study.check_data()
     found: list[Cell] = []
     entries = [located(entry, study.folder) for entry in study.data]
@@ -103,6 +110,16 @@ def cells(study: Study) -> list[Cell]:
                     found += [replace(cell, repetition=number) for number in range(study.repetitions)]
     _check_distinct(found)
     return found
+
+
+def number_of_cells(study: Study) -> int:
+    """Return how many cells a study has, without making them."""
+    count = 0
+    for entry in study.data:
+        records = 1 if entry.system is None else len(entry.samples or "1") * len(entry.noise or "1") * len(study.seeds)
+        count += records * sum(not formulation.data or entry.name in formulation.data
+                               for formulation in study.formulations)
+    return count * study.repetitions * sum(len(solver.accuracy or study.accuracy) for solver in study.solvers)
 
 
 def left(all_cells: Iterable[Cell], done: Collection[tuple[str, int]]) -> list[Cell]:

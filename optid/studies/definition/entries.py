@@ -18,6 +18,8 @@ from optid.studies.definition.problems import Problems, one_or_several, shown
 from optid.studies.sources.systems import SYSTEMS
 
 AUTO, ALL = "auto", "all"
+MOST_SEEDS = 1_000_000
+"""A study has no more cells than that."""
 
 READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")
 """Keys of a data entry that say how its files are read."""
@@ -289,6 +291,9 @@ def _accuracies(path: Path, value: Any, problems: Problems) -> tuple[float, ...]
 def _seeds(value: Any, problems: Problems) -> tuple[int, ...]:
     if not isinstance(value, list | tuple | range):
         count = problems.whole(("seeds",), value, 1)
+        if count is not None and count > MOST_SEEDS:
+            problems.add(("seeds",), f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are taken")
+            return ()
         return tuple(range(count or 1))
     seeds = [problems.whole(("seeds", i), seed, 0) for i, seed in enumerate(value)]
     if not seeds:
