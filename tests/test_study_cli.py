@@ -269,6 +269,15 @@ def test_the_built_in_study_is_one(tmp_path, monkeypatch):
     assert found.exit_code == 0 and "96 cells, 96 of them to run" in found.stdout
 
 
+def test_compare_says_why_a_solver_was_not_run_and_what_to_do(folder):
+    words = ("compare", "rig.csv", "-u", "current", "-y", "thrust", "--na", 2, "--nb", 1, "--repetitions", 1)
+    linear = run(*words, "-f", "arx", "--solvers", "mosek", "clarabel")
+    assert linear.exit_code == 0 and "mosek: solver 'mosek' is not installed: pip install Mosek" in linear.stdout
+    assert "not for arx" not in linear.stdout
+    nobody = run(*words, "--basis", "triangular:5", "--solvers", "clarabel")
+    assert nobody.exit_code == 4 and "Use an NLP back end (gauss_newton, ipopt, uno)" in nobody.stdout
+
+
 def test_systems_are_listed():
     from optid.studies.sources.systems import SYSTEMS
 

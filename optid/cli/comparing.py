@@ -13,7 +13,7 @@ from rich.text import Text
 
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.options import MODEL, RECORD, SOLVER, Example, Files, Report, Seed, reads_a_record
-from optid.cli.studies import Accept, Workers, follow_progress
+from optid.cli.studies import NOTHING_SOLVED, Accept, Workers, follow_progress
 from optid.cli.terminal import note, output, say
 from optid.errors import LookupFailed
 from optid.registry import formulation as look_up
@@ -121,6 +121,8 @@ def compare(
 
         write_page(verdict_on_one_record(rows), report, command=command_line())
         say(f"report written to {report}")
+    if not found.lines:
+        raise typer.Exit(NOTHING_SOLVED)
 
 
 def _assumed(formulation: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -163,10 +165,13 @@ def _as_options(text: str) -> str:
 
 
 def _show(found: Any, posed: str, record: str) -> None:
+    from optid.backends import back_ends
     from optid.showing.wording import number, seconds
     from optid.solution import GRADIENT
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.outcomes import SOLVED
+
+    absent = {name for name, back_end in back_ends().items() if not back_end.installed}
 
     def clock(value: float) -> str:
         return "-" if value != value else seconds(value)
@@ -191,8 +196,14 @@ def _show(found: Any, posed: str, record: str) -> None:
     output().print(table)
     for reason, solvers in found.reasons.items():
         say(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
-    if found.refused:
-        say(Text(f"not for {posed}: {', '.join(found.refused)}", "dim"))
+    unfit = []
+    for solver, reason in found.refused.items():
+        if solver in absent or not found.lines:  # with what to install, or which solvers take it
+            say(Text(f"{solver}: {reason}", "dim"))
+        else:
+            unfit.append(solver)
+    if unfit:
+        say(Text(f"not for {posed}: {', '.join(unfit)}", "dim"))
     say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: how far the "
              "point is from optimal, measured by optid (constraints, complementarity, and gradient / "
              f"{GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.", "dim"))
