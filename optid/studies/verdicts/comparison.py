@@ -160,7 +160,9 @@ def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
     caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
                        "told by a study of at least 6 problems (optid study run).", "data sets")  # fmt: skip
     said = [statement for statement in verdict.statements if statement.about != "data sets"]
-    return replace(verdict, headline=found.headline, statements=(caveat, *said))
+    text = found.headline.text
+    head = replace(found.headline, text=text[:1].upper() + text[1:])  # a sentence of its own on the page
+    return replace(verdict, headline=head, statements=(caveat, *said))
 
 
 def _order(line: Line) -> tuple[Any, ...]:
