@@ -210,7 +210,9 @@ def test_a_stream_needs_a_record_to_draw(tmp_path):
 @pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
 def test_colours_are_told_apart_by_every_kind_of_colour_vision(scheme):
     sheet = (Path(plots.__file__).parent / "templates" / "page.html.j2").read_text(encoding="utf-8")
-    colours = [re.findall(rf"--{name}: (#[0-9a-f]{{6}})", sheet)[scheme] for name in ("blue", "orange", "green", "ink")]
+    both = [re.search(rf"--{name}: light-dark\((#[0-9a-f]{{6}}), (#[0-9a-f]{{6}})\)", sheet)
+            for name in ("blue", "orange", "green", "ink")]
+    colours = [pair[1 + scheme] for pair in both]
     if scheme == 0:  # the figures and the page share their light colours
         assert colours == [panels.BLUE, panels.ORANGE, panels.GREEN, panels.INK]
 

@@ -3,13 +3,12 @@
     python benchmarks/studies/kill.py [--kills 10] [--seed 0] [--workers 2]
 
 The command `optid study run` is started and killed (SIGKILL) after a random number of new rows and a random moment
-more, ten times; then it runs to its end. Printed for every kill: rows in the database as it was left and in the
-journal beside it, and whether the database could be read. At the end every cell must have exactly one row, every row
-of before a kill must still be the same one (nothing is computed again), and no worker may live on.
+more, ten times; then it runs to its end. Printed for every kill: rows as they were left, how many of them are in the
+journal beside the database, and whether the database could be read. At the end every cell must have exactly one row,
+every row of before a kill must still be the same one (nothing is computed again), and no worker may live on.
 """
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ import psutil
 
 from optid.studies.definition.description import Study
 from optid.studies.grid import cells
+from optid.studies.storage import journal
 from optid.studies.storage.database import finished, read_rows
 
 STUDY = """
@@ -52,20 +52,17 @@ def moments(db: Path) -> dict[tuple[str, int], np.datetime64]:
     return found
 
 
-def waiting(db: Path) -> dict[tuple[str, int], np.datetime64]:
-    """When each row of the journal was started; half a line at its end is no row."""
-    journal = db.with_name(db.name + ".journal")
-    lines = journal.read_bytes().split(b"\n")[:-1] if journal.exists() else []
-    rows = [json.loads(line) for line in lines]
-    return {(row["key"], row["repetition"]): np.datetime64(row["started"].partition("+")[0], "us") for row in rows}
+def waiting(db: Path) -> set[tuple[str, int]]:
+    """Rows that are in the journal."""
+    return {(row["key"], row["repetition"]) for row in journal.kept(db)}
 
 
 def until_new_rows(process: subprocess.Popen, db: Path, number: int, limit: float = 300.0) -> None:
     """Wait until the process has written so many rows more."""
-    before = len(finished(db) | set(waiting(db)))
+    before = len(finished(db) | waiting(db))
     until = time.monotonic() + limit
     while process.poll() is None and time.monotonic() < until:
-        if len(finished(db) | set(waiting(db))) - before >= number:
+        if len(finished(db) | waiting(db)) - before >= number:
             return
         time.sleep(0.02)
 
@@ -92,7 +89,7 @@ def main() -> None:
         total = len(cells(Study.from_toml(file)))
         command = [sys.executable, "-m", "optid", "study", "run", str(file), "--db", str(db), "--workers",
                    str(arguments.workers)]
-        print(f"{total} cells; kill after so many new rows: rows in the database, in the journal, readable")
+        print(f"{total} cells; kill after so many new rows: rows, of which in the journal, readable")
         seen: dict = {}
         killed = 0
         for _ in range(arguments.kills):
@@ -106,11 +103,10 @@ def main() -> None:
             process.wait()
             killed += alive
             now = moments(db)  # raises where the database cannot be read
-            kept = waiting(db) | now
-            same = all(kept.get(identity) == moment for identity, moment in seen.items())
+            same = all(now.get(identity) == moment for identity, moment in seen.items())
             print(f"  {number:>4}  {len(now):>4}  {len(waiting(db)):>3}  yes{'' if same else '  ROWS CHANGED'}"
                   f"{'' if alive else '  (it had ended)'}")
-            seen |= now | waiting(db)
+            seen |= now
             _, living = psutil.wait_procs(children, timeout=10.0)
             if living or not same:
                 raise SystemExit(f"workers that live on: {living}" if living else "rows changed")

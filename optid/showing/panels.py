@@ -14,7 +14,7 @@ from optid.bases.basis import Array
 from optid.validation.correlations import Correlation
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
-BLUE, ORANGE, GREEN, RED = "#1063b5", "#d9660a", "#008c66", "#c2344d"
+BLUE, ORANGE, GREEN, RED = "#1063b5", "#a84e00", "#007a3e", "#b82e47"
 """Blue, orange and green of a colour-blind safe palette; red marks what lies outside a band."""
 
 STYLE: dict[str, Any] = {
