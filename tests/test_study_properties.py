@@ -39,7 +39,7 @@ def _values(column):
 ROWS = st.fixed_dictionaries({column.name: _values(column) for column in COLUMNS}).map(complete)
 BATCHES = st.lists(ROWS, min_size=1, max_size=4, unique_by=(lambda r: (r["study"], r["key"], r["repetition"]),
                                                             lambda r: (r["study"], r["place"])))
-FEW = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @FEW

@@ -77,9 +77,9 @@ def test_a_worker_that_dies_between_cells_is_no_fault_of_the_next_cell():
 
 
 @pytest.mark.parametrize("then, words", [("abort", "the worker died: signal SIGABRT"), ("raise", "no such thing"),
-                                         ("stuck", "the limit is 10 s"), ("hog", "the limit is 500 MB")])
+                                         ("stuck", "the limit is 5 s"), ("hog", "the limit is 500 MB")])
 def test_a_row_that_was_kept_stands_whatever_comes_after_it(then, words):
-    rows = by_key([cell(0, "keep_row", then=then, time_limit=10.0 if then == "stuck" else 300.0, memory_limit=500.0),
+    rows = by_key([cell(0, "keep_row", then=then, time_limit=5.0 if then == "stuck" else 300.0, memory_limit=500.0),
                    cell(1, "abort")], workers=1)
     assert (rows[0]["outcome"], rows[0]["objective"]) == ("done", 5.0)
     assert rows[0]["reason"].startswith("no warm solve: ") and words in rows[0]["reason"]
@@ -111,7 +111,7 @@ def test_children_count_and_go_with_their_worker(tmp_path):
     hog = "held = bytearray(400_000_000)\nimport time\ntime.sleep(600)"
     sleeper = f"import os, time\nos.setsid()\nopen({str(left)!r}, 'w').close()\ntime.sleep(600)"
     rows = by_key([cell(0, "family", memory_limit=400.0, program=hog, pids=str(pids)),
-                   cell(1, "family", time_limit=10.0, program=sleeper, pids=str(pids))], workers=1)
+                   cell(1, "family", time_limit=5.0, program=sleeper, pids=str(pids))], workers=1)
     assert (rows[0]["outcome"], rows[1]["outcome"]) == ("memory limit", "time limit")
     children = [int(line) for line in pids.read_text().split()]
     assert len(children) == 2 and left.exists()  # the second was out of the session of its worker
