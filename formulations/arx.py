@@ -10,11 +10,11 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.equation_error import EquationError, compress, residual_programme
-from formulations.losses import with_loss
+from formulations.losses import degree, with_loss
 from optid.bases import Linear
 from optid.data import Data
 from optid.models import HammersteinARX
-from optid.program import Program, Values
+from optid.program import Program, RankOneForm, Values
 from optid.solving import Procedure
 from optid.streams import Stream
 
@@ -36,7 +36,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    options = {"na": na, "nb": nb, "nk": nk, "basis": Linear(), "ridge": ridge}
+    options = {"na": na, "nb": nb, "nk": nk, "basis": Linear(), "ridge": ridge, "degree": degree(loss)}
 
     def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
         problem = compress(data, weights=weights, **options)
@@ -56,4 +56,5 @@ def _arx(problem: EquationError, constraints: Sequence[Any]) -> Program:
 
     return residual_programme(
         problem, "arx", {**linear, **numerators}, problem.residual(linear, list(numerators.values())), start={},
-        recover=recover, view=problem.view({**linear, **numerators}, "linear")).subject_to(*constraints)
+        recover=recover, view=problem.view({**linear, **numerators}, "linear"),
+        least_squares=RankOneForm(problem.problem, (*linear, *keys), ())).subject_to(*constraints)

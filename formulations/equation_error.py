@@ -13,8 +13,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from formulations.arguments import per_channel, whole_number
-from optid.bases import fitted_bases
+from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity
@@ -23,6 +24,7 @@ from optid.program import Program, View
 from optid.rank_one import RankOne
 from optid.regressors import Layout, Statistics, collect
 from optid.streams import Stream
+from optid.units import energy_unit, in_units, own_units
 
 
 class Compressed(Protocol):
@@ -30,6 +32,8 @@ class Compressed(Protocol):
 
     @property
     def problem(self) -> RankOne: ...  # noqa: D102
+    @property
+    def unit(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,18 @@ class EquationError:
         statistics: what one pass over the record left.
         problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
         meta: dt, names and units for the model.
+        units: from those of the problem (`optid.units`) to those of the record.
+        bases: one per input, in the units of the record.
+        unit: what one unit of the objective is in units of the record.
         unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
     """
 
     statistics: Statistics
     problem: RankOne
     meta: Mapping[str, Any]
+    units: Transform
+    bases: tuple[Basis, ...]
+    unit: float = 1.0
     unweighted: Statistics | None = None
 
     @property
@@ -89,9 +99,8 @@ class EquationError:
     def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
         """Return what constraints may speak about."""
         full = solve_triangular(self.problem.root, self.problem.target)
-        return View(expressions, kind=kind, channels=self.channels,
-                    bases=dict(zip(self.channels, self.layout.bases)), gauge=gauge,
-                    reference=self.linear_part(full[: self.problem.linear]))
+        return View(expressions, kind=kind, channels=self.channels, bases=dict(zip(self.channels, self.bases)),
+                    gauge=gauge, reference=self.linear_part(full[: self.problem.linear]), units=self.units)
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""
@@ -129,7 +138,10 @@ class EquationError:
 
     @property
     def energy(self) -> np.ndarray:
-        """Sum of squares of every output about its mean over the rows used: what a one-step fit of 0 % leaves."""
+        """Sum of squares of every output about its mean over the rows used, in the units of the problem.
+
+        It is what a one-step fit of 0 % leaves.
+        """
         statistics = self.unweighted or self.statistics
         n, root = self.layout.n_columns, statistics.root
         columns = root[:, n:]
@@ -143,7 +155,7 @@ class EquationError:
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
               gauge: str, flip: bool = True) -> HammersteinARX:
-        """Build the model from one (mu, b) per input, b of shape `b_shape`.
+        """Build the model in the units of the record from one (mu, b) per input, b of shape `b_shape`.
 
         Args:
             values: holds ``a`` and ``offset``.
@@ -162,7 +174,7 @@ class EquationError:
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),
             nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), gauge=gauge, **self.meta)
-        return model
+        return model.with_transform(self.units)
 
 
 def flat(expression: cp.Expression) -> cp.Expression:
@@ -177,8 +189,8 @@ def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
-             weights: Sequence[np.ndarray] | None = None) -> EquationError:
-    """Read the record once and return the compressed problem.
+             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2) -> EquationError:
+    """Read the record once and return the compressed problem, posed in the record's own units (`optid.units`).
 
     Args:
         data: the record.
@@ -189,6 +201,8 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         ridge: weight of ``‖Theta‖²``.
         curvature: weight of the integral of ``f''²`` summed over the columns of Theta.
         weights: nonnegative row weights per experiment, or None.
+        own: False for a record that is in its own units already.
+        degree: of the loss in the residuals: 2 for squares, 1 for the sum of magnitudes.
 
     Raises:
         StructureError: impossible orders.
@@ -199,11 +213,20 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     nks = per_channel("nk", nk, inputs, low=0)
     order = whole_number("na", na, 0, "the number of past outputs")
     bases = fitted_bases(data, basis)
-    layout = Layout(na=order, nb=nbs, nk=nks, bases=bases, outputs=tuple(outputs), inputs=tuple(inputs))
+    units = Transform.identity(len(inputs), len(outputs))
+    if own:
+        units = own_units(data, [isinstance(one, Linear) for one in bases])
+        data = in_units(data, units)
+    inner = tuple(one.mapped(1 / scale, -origin / scale)[0] if isinstance(one, Linear) else one
+                  for one, scale, origin in zip(bases, units.u_scale, units.u_offset))
+    layout = Layout(na=order, nb=nbs, nk=nks, bases=inner, outputs=tuple(outputs), inputs=tuple(inputs))
     if ridge < 0 or curvature < 0:
         raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
     statistics = collect(data, layout, weights=weights)
-    return EquationError(statistics, lifted_problem(statistics, ridge, curvature), model_meta(data))
+    unit = units.y_scale[0] ** degree
+    penalties = energy_unit(units) / unit * np.array([ridge, curvature])
+    return EquationError(statistics, lifted_problem(statistics, *penalties, units.u_scale), model_meta(data),
+                         units, bases, unit)
 
 
 def model_meta(data: Data | Stream) -> dict[str, Any]:
@@ -213,8 +236,15 @@ def model_meta(data: Data | Stream) -> dict[str, Any]:
             "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
 
 
-def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> RankOne:
-    """Order the triangular system of the statistics by z and add the quadratic penalties on Theta."""
+def lifted_problem(statistics: Statistics, ridge: float, curvature: float, scales: Sequence[float]) -> RankOne:
+    """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
+
+    Args:
+        statistics: of the record.
+        ridge: weight of ``‖Theta‖²``.
+        curvature: weight of the integral of ``f''²``.
+        scales: unit of every input: Theta in the units of the record is Theta / scale.
+    """
     layout, ny = statistics.layout, len(statistics.layout.outputs)
     n, na = layout.n_columns, layout.na
     sizes = [b.size for b in layout.bases]
@@ -238,7 +268,8 @@ def lifted_problem(statistics: Statistics, ridge: float, curvature: float) -> Ra
         system[rows, -1] = root[:n, n + o]
         remainder += float(np.sum(root[n:, n + o] ** 2))
     if ridge:
-        system[ny * n :, linear:-1] = np.sqrt(ridge) * np.eye(total - linear)
+        each = np.concatenate([np.full(p * q, 1 / scale) for (p, q), scale in zip(blocks, scales)])
+        system[ny * n :, linear:-1] = np.sqrt(ridge) * np.diag(each)
     if curvature:
         extra = np.zeros((total - linear, total + 1))
         position = linear
@@ -272,4 +303,4 @@ def residual_programme(problem: Compressed, name: str, variables: dict[str, cp.V
     objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + penalty)
     return Program(name=name, objective=objective, constraints=constraints, variables={**variables, "residual": r},
                    structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
-                   compressed=problem, **parts)
+                   compressed=problem, unit=problem.unit, **parts)

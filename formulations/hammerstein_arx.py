@@ -22,7 +22,7 @@ import numpy as np
 
 from formulations.equation_error import EquationError, compress, residual_programme
 from formulations.gauges import check_gauge, scale_fixed
-from formulations.losses import with_loss
+from formulations.losses import degree, with_loss
 from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
 from optid.data import Data
@@ -63,7 +63,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         RankError: the record does not determine the parameters.
     """
     check_gauge(gauge)
-    options = {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature}
+    options = {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
+               "degree": degree(loss)}
 
     def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
         problem = compress(data, weights=weights, **options)
@@ -162,7 +163,8 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
         RankError: the record does not determine the parameters.
     """
     return _relaxed("hammerstein_arx.nuclear", data, constraints, loss, gauge, weight, "whitened",
-                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature})
+                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
+                     "degree": degree(loss)})
 
 
 def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
@@ -191,7 +193,8 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
     return _relaxed("hammerstein_arx.overparametrised", data, constraints, loss, gauge, 0.0, svd,
-                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature})
+                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
+                     "degree": degree(loss)})
 
 
 def _relaxed(name: str, data: Data | Stream, constraints: Sequence[Any], loss: str, gauge: str, weight: float,
@@ -213,13 +216,17 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
     keys = [problem.key("Theta", c) for c in range(len(problem.channels))]
     thetas = {key: cp.Variable(shape, name=key) for key, shape in zip(keys, problem.problem.blocks)}
     tau = cp.Parameter(nonneg=True, name="weight", value=float(weight))
-    penalty = 2 * tau * sum(cp.normNuc(t) for t in thetas.values()) if name.endswith("nuclear") else 0.0
+    nuclear = name.endswith("nuclear")
+    heights = [problem.units.y_scale[0] / scale for scale in problem.units.u_scale]  # of Theta in the record's units
+    penalty = 2 / problem.unit * tau * sum(
+        height * cp.normNuc(t) for t, height in zip(thetas.values(), heights)) if nuclear else 0.0
     program = residual_programme(
         problem, name, {**linear, **thetas}, problem.residual(linear, list(thetas.values())), penalty=penalty,
         start={}, recover=partial(_split_model, problem, reduce(problem.problem), keys, gauge, svd),
         view=problem.view({**linear, **thetas}, "relaxed"),
-        parameters={"weight": tau} if name.endswith("nuclear") else {},
-        certify=partial(certify_nuclear, problem.problem) if name.endswith("nuclear") else None)
+        parameters={"weight": tau} if nuclear else {},
+        least_squares=None if nuclear else RankOneForm(problem.problem, (*linear, *keys), ()),
+        certify=partial(certify_nuclear, problem.problem, np.array(heights) / problem.unit) if nuclear else None)
     return program.subject_to(*constraints)
 
 

@@ -18,6 +18,7 @@ from optid.regressors import residuals
 from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
 from optid.streams import Stream
+from optid.units import in_units
 
 Pose = Callable[[list[np.ndarray] | None], tuple[Program, EquationError]]
 
@@ -51,6 +52,11 @@ def parse_loss(loss: str) -> tuple[str, float]:
     return kind, threshold
 
 
+def degree(loss: str) -> int:
+    """Return the degree of a loss in the units of the residuals: 1 for "l1", 2 otherwise."""
+    return 1 if parse_loss(loss)[0] == "l1" else 2
+
+
 def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Program | Procedure:
     """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
 
@@ -71,6 +77,7 @@ def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Pr
 
 def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: bool) -> Procedure:
     program, problem = pose(None)
+    record = in_units(data, problem.units)
     scale, unweighted = program.scale, problem.statistics  # the weights of a pass are no unit of the data
     weights: list[np.ndarray] | None = None
     spread = width = 0.0
@@ -79,7 +86,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
         solution: Solution = yield program
         if not solution.has_point:
             return None
-        sizes = _row_sizes(data, problem, solution)
+        sizes = _row_sizes(record, problem, solution)
         if step < SETTLING:  # the scale settles before the loss is fixed; afterwards the objective cannot rise
             spread = max(float(np.nanmedian(np.concatenate(sizes))) / 0.6745, 1e-300)
             width = spread * (1.0 if kind == "l1" else threshold)
@@ -87,7 +94,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
             width = max(width / 3, spread * threshold)  # the kink sharpens as the rounded problem is solved
         found = _evidence(program, solution, sizes, weights, kind, width, convex)
         stalled = final and best - found.objective <= 1e-12 * max(abs(found.objective), 1e-300)
-        now = relative_gap(found.objective, found.bound.value, scale)
+        now = relative_gap(found.objective, found.bound.value, scale * program.unit)
         if (convex and step >= SETTLING and now <= CLOSED) or (stalled and not now < 0.9 * gap):
             break
         best, gap = min(best, found.objective) if final else np.inf, now
@@ -129,12 +136,13 @@ def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], wei
     pooled, w = np.concatenate(sizes), np.concatenate(weights or [np.ones_like(r) for r in sizes])
     keep = ~np.isnan(pooled)
     pooled, w = pooled[keep], w[keep]
-    penalty = max(0.0, solution.objective - float(np.sum(w * pooled**2)))
+    unit = program.unit
+    penalty = max(0.0, solution.objective / unit - float(np.sum(w * pooled**2)))
     objective = _loss(pooled, kind, width) + penalty
     model = program.recover(solution.values)
     if not convex:
         bound = Bound.none(f"the exact form with the {kind} loss has no proof")
-        return Evidence(model, objective, bound, _settled(solution), bound.reason)
+        return Evidence(model, unit * objective, bound, _settled(solution), bound.reason)
     limit = 2 * width if kind == "huber" else 1.0
     dual = 2 * w * pooled  # satisfies the stationarity of the weighted pass, hence of the dual, exactly
     shrink = min(1.0, limit / max(float(np.max(dual, initial=0.0)), 1e-300))
@@ -142,9 +150,9 @@ def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], wei
     value = shrink * float(dual @ pooled) - shrink**2 * conjugate + shrink * penalty
     gap = relative_gap(objective, value, program.scale)
     proved = gap < 1e-6
-    bound = Bound(value, proved, f"{kind} dual", f"dual point of the last pass, gap {gap:.1e}")
+    bound = Bound(unit * value, proved, f"{kind} dual", f"dual point of the last pass, gap {gap:.1e}")
     status = Status.OPTIMAL if proved and _settled(solution) is Status.LOCAL else _settled(solution)
-    return Evidence(model, objective, bound, status, bound.reason)
+    return Evidence(model, unit * objective, bound, status, bound.reason)
 
 
 def _settled(solution: Solution) -> Status:

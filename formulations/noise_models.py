@@ -184,7 +184,7 @@ def _regressed(criterion: PredictionErrors, e: Sequence[Array] | None) -> Array:
     if e is not None:
         data = _with_channel(data, e)
         arguments |= {"nb": (*layout.nb, unknowns.nc), "nk": (*layout.nk, 1), "basis": (*layout.bases, Linear())}
-    problem = compress(data, **arguments)
+    problem = compress(data, own=False, **arguments)
     point = minimise(problem.problem, count=4).point
     values = problem.linear_part(point.w)
     c = np.zeros(unknowns.nc)

@@ -78,4 +78,4 @@ def check_inputs_differ(data: Data, layout: Layout) -> None:
     if layout.m > 1 and sum(e.n_samples - layout.first_row for e in data.experiments) >= ROWS_PER_UNKNOWN * columns:
         complete = Data([e.u for e in data.experiments], [e.u[:, :1] for e in data.experiments], data.dt,
                         list(data.inputs), list(data.outputs))
-        compress(complete, na=0, nb=layout.nb, nk=layout.nk, basis=layout.bases)
+        compress(complete, na=0, nb=layout.nb, nk=layout.nk, basis=layout.bases, own=False)

@@ -38,7 +38,7 @@ def equation_error(data: Data, unknowns: Unknowns) -> Array | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # rows lost here are not lost to the simulation error
-            problem = compress(data, na=layout.na, nb=layout.nb, nk=layout.nk, basis=layout.bases)
+            problem = compress(data, na=layout.na, nb=layout.nb, nk=layout.nk, basis=layout.bases, own=False)
         point = minimise(problem.problem, count=4).point
     except OptidError:
         return None

@@ -13,6 +13,7 @@ import numpy as np
 from formulations.rule import Rule
 from formulations.static_curve import output_index, through_matrices
 from optid.errors import StructureError
+from optid.limits import Limit
 from optid.program import View
 
 __all__ = ["impulse_response", "no_effect", "positive_real", "step_response"]
@@ -78,11 +79,12 @@ def no_effect(channel: str, output: str | None = None) -> Rule:
         _needs_realisation(view, "no_effect")
         theta = view[view.key("Theta", _known(view, channel))]
         if output is None:
-            return theta == 0
+            return Limit(theta == 0, band=np.eye(theta.size), span=np.eye(theta.size))
         rows = markov_rows(view, channel, output, len(view.reference["A"]) + 1)
         # the rows of an output that does not see every state are dependent: a basis of them says the same
         left, sizes, _ = np.linalg.svd(rows.T, full_matrices=False)
-        return theta @ left[:, sizes > 1e-10 * sizes[0]] == 0
+        independent = left[:, sizes > 1e-10 * sizes[0]].T
+        return Limit((theta @ independent.T).T == 0, band=rows, span=independent)
 
     return Rule(f"no_effect:{channel}" + ("" if output is None else f",{output}"), build)
 

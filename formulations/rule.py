@@ -13,7 +13,7 @@ class Rule:
 
     Attributes:
         name: name under which it is reported.
-        build: view -> CVXPY constraint or list of them.
+        build: view -> CVXPY constraint, or `optid.limits.Limit` where its bound needs words, or a list of them.
         verify: model -> what is wrong with it, "" where it obeys; for statements that the constraint itself only
             approximates.
         about: what it restricts, "poles" or "coefficients": a procedure of several steps hands it to the steps that

@@ -26,12 +26,14 @@ from formulations.stability import stable
 from formulations.static_curve import basis_of, denominator, offset_of, settles, static_theta
 from optid.bases import Triangular
 from optid.errors import StructureError
+from optid.limits import Limit
 from optid.program import View
 
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
 FACTORED = ("exact", "tangent", "realisation")  # kinds whose variables are mu and b
+RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -52,12 +54,12 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
 
 def convex(channel: str | None = None) -> Rule:
     """The nonlinearity is convex over the interval of its basis."""
-    return _cone("convex", "", channel, lambda basis: basis.curvature())
+    return _cone("convex", "", channel, lambda basis: basis.curvature(), power=2)
 
 
 def concave(channel: str | None = None) -> Rule:
     """The nonlinearity is concave over the interval of its basis."""
-    return _cone("concave", "", channel, lambda basis: -basis.curvature())
+    return _cone("concave", "", channel, lambda basis: -basis.curvature(), power=2)
 
 
 def odd(channel: str | None = None) -> Rule:
@@ -140,7 +142,9 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
     def build(view: View) -> Any:
         basis, theta = basis_of(view, channel), static_theta(view, channel, output)
         curve = basis.values(us) @ theta + offset_of(view, output)
-        return [curve == cp.multiply(ys, denominator(view)), *settles(view)]
+        size = denominator(view)
+        points = Limit(curve == cp.multiply(ys, size), size, None, step=_range_of(basis, theta, size), words=RANGE)
+        return [points, *settles(view)]
 
     return Rule(_label("through", channel, output), build)
 
@@ -191,7 +195,8 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
             raise StructureError(f"bounds on {name!r} depend on the gauge, and 'norm' only fixes a length; choose "
                                  "gauge='b0' or gauge='gain', or bound the static gain or slope instead")
         variable = view[name] if index is None else cp.hstack([view[name][int(index)]])
-        return ([variable >= low] if low is not None else []) + ([variable <= high] if high is not None else [])
+        return ([Limit(variable >= low, bound="low")] if low is not None else []) + (
+            [Limit(variable <= high, bound="high")] if high is not None else [])
 
     return Rule(_label(f"coefficients:{name}", None), build)
 
@@ -230,7 +235,8 @@ def shared(name: str, first: str, second: str) -> Rule:
     """Two inputs share ``b`` (the dynamics) or ``mu`` (the nonlinearity), each in the gauge of the formulation."""
 
     def build(view: View) -> Any:
-        return view[view.key(name, first)] == view[view.key(name, second)]
+        equal = view[view.key(name, first)] == view[view.key(name, second)]
+        return Limit(equal, band=np.eye(equal.size), span=np.eye(equal.size))
 
     return Rule(f"shared:{name}:{first},{second}", build)
 
@@ -258,13 +264,19 @@ def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list
     return [member for part in parts for member in (part if isinstance(part, list) else [part])]
 
 
-def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
+def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], power: int = 0) -> Rule:
+    words = RANGE if power == 0 else f"{RANGE} over the squared width of its interval"
+
     def build(view: View, one: str) -> Any:
-        matrix = rows(basis_of(view, one))
+        basis = basis_of(view, one)
+        matrix = rows(basis)
         if view.kind in FACTORED and view.key("mu", one) in view:
-            return matrix @ view[view.key("mu", one)] >= 0
-        outputs = view.outputs if view.kind == "realisation" else (None,)
-        return [matrix @ static_theta(view, one, output) >= 0 for output in outputs or (None,)]
+            coefficients = [view[view.key("mu", one)]]
+        else:
+            outputs = view.outputs if view.kind == "realisation" else (None,)
+            coefficients = [static_theta(view, one, output) for output in outputs or (None,)]
+        return [Limit(matrix @ each >= 0, bound=one, step=_range_of(basis, each, power=power), words=words)
+                for each in coefficients]
 
     return Rule(_label(f"{word}:{direction}" if direction else word, channel),
                 lambda view: _every(view, channel, lambda one: build(view, one)))
@@ -272,9 +284,13 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
-        matrix = _independent(rows(basis_of(view, one)))
+        basis = basis_of(view, one)
+        whole = rows(basis)
+        matrix = _independent(whole)
         factored = view.kind in FACTORED and view.key("mu", one) in view
-        return matrix @ view[view.key("mu" if factored else "Theta", one)] == 0
+        coefficients = view[view.key("mu" if factored else "Theta", one)]
+        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(basis, coefficients),
+                     words=RANGE)
 
     return Rule(_label(word, channel), lambda view: _every(view, channel, lambda one: build(view, one)))
 
@@ -287,16 +303,31 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
         raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
 
     def build(view: View) -> Any:
-        curve = rows(basis_of(view, channel)) @ static_theta(view, channel, output)
+        basis, theta, size = basis_of(view, channel), static_theta(view, channel, output), denominator(view)
+        curve = rows(basis) @ theta
         if offset:
             curve = curve + offset_of(view, output)
-        size = denominator(view)
+        meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
+                                   "words": RANGE if offset else f"{RANGE} over the width of its interval"}
         if low == high:
-            return [curve - low * size == 0, *settles(view)]
-        return ([curve - low * size >= 0] if low is not None else []) + (
-            [curve - high * size <= 0] if high is not None else []) + settles(view)
+            return [Limit(curve - low * size == 0, size, "value", **meaning), *settles(view)]
+        return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
+            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + settles(view)
 
     return Rule(_label(word, channel), build)
+
+
+def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) -> Callable[[], float]:
+    """Return what 1 % of the range of f is at the assigned point, per width of its interval to a power."""
+
+    def step() -> float:
+        matrix = np.asarray(coefficients.value, dtype=float)
+        curve = basis.values(basis.grid()) @ (matrix if matrix.ndim == 1 else matrix.sum(axis=1))
+        scale = float(size.value) if isinstance(size, cp.Expression) else float(size)
+        low, high = basis.interval or (0.0, 1.0)
+        return 0.01 * float(np.ptp(curve)) / abs(scale) / (high - low) ** power
+
+    return step
 
 
 def _everywhere(basis: Any) -> np.ndarray:

@@ -18,12 +18,14 @@ import numpy as np
 from formulations.pole_regions import disc_side, lmi
 from formulations.rule import Rule
 from optid.errors import StructureError
+from optid.limits import Limit
 from optid.models.roots import pulled, roots_of
 from optid.models.roots import radius as root_radius
 from optid.program import View
 
 FREQUENCIES = 128
 MARGIN = 1e-6  # by how much of the radius the disc is shrunk, so that a binding constraint leaves a stable model
+NEARBY = 1e-4  # relative change of the radius by which the price of a larger one is found
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
 
 LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of the centre end, as shares of the radius
@@ -57,17 +59,23 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         if a.ndim != 1:
             raise StructureError("stable is defined for one output; constrain the entries of a instead")
         na = a.shape[0]
-        powers = radius ** -np.arange(1.0, na + 1)
         if points is not None:
             return _real(a, na, radius, points)
         if na == 1:
-            return [a <= radius, a >= -radius]
+            return [Limit(a <= radius), Limit(a >= -radius)]
         if na == 2:
-            scaled = [powers[0] * a[0], powers[1] * a[1]]
-            return [1 + scaled[0] + scaled[1] >= 0, 1 - scaled[0] + scaled[1] >= 0, scaled[1] <= 1]
+            first, second = a[0] / radius, a[1] / radius**2
+            along, across = first / radius, 2 * second / radius  # minus the derivatives by the radius
+            return [Limit(1 + first + second >= 0, -along - across), Limit(1 - first + second >= 0, along - across),
+                    Limit(second <= 1, across)]
         reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
-        rows, levels = inner_region(reference, radius, keep=view.kind == "tangent")
-        return rows @ a >= levels
+        rows, levels, centre = inner_region(reference, radius, keep=view.kind == "tangent")
+        grid = frequencies(roots_of(scaled(centre, radius)))
+        wider, narrower = ((1 + sign * NEARBY) * radius for sign in (1, -1))
+        (above, high), (below, low) = (_positive_real(centre * (near / radius) ** np.arange(1, na + 1), near, grid)
+                                       for near in (wider, narrower))
+        width = wider - narrower
+        return Limit(rows @ a >= levels, ((above - below) @ a - (high - low)) / width)
 
     def verify(model: Any) -> str:
         largest = float(np.max(np.abs(model.poles), initial=0.0))
@@ -78,8 +86,9 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
     return Rule(name, build, verify, frozenset({"poles"}))
 
 
-def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rows, levels) such that every a with ``rows @ a >= levels`` has its roots in the disc.
+def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (rows, levels, centre) such that every a with ``rows @ a >= levels`` has its roots in the disc.
 
     Args:
         reference: coefficients (na,) of the polynomial to centre on.
@@ -90,19 +99,25 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False) ->
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius
     for limit in LIMITS if keep and inside else LIMITS[:1]:
-        rows, levels = _positive_real(central(whole, radius, limit), radius)
+        centre = central(whole, radius, limit)
+        rows, levels = _positive_real(centre, radius)
         if not (keep and inside) or np.all(rows @ whole >= levels):
-            return rows, levels
-    return _positive_real(whole, radius)
+            return rows, levels, centre
+    return *_positive_real(whole, radius), whole
 
 
-def _positive_real(centre: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def scaled(a: np.ndarray, radius: float) -> np.ndarray:
+    """Return the coefficients of the polynomial whose roots are those of A divided by a radius."""
+    return a * radius ** -np.arange(1.0, a.size + 1)
+
+
+def _positive_real(centre: np.ndarray, radius: float, grid: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the inequalities Re(A / C) >= `GAP` on a grid of the circle."""
     order = np.arange(1, centre.size + 1)
     powers = radius ** -order.astype(float)
-    scaled = centre * powers
-    lags = np.exp(-1j * frequencies(roots_of(scaled)))[:, None] ** order
-    values = 1 + lags @ scaled
+    where = frequencies(roots_of(scaled(centre, radius))) if grid is None else grid
+    lags = np.exp(-1j * where)[:, None] ** order
+    values = 1 + lags @ scaled(centre, radius)
     size = np.abs(values) ** 2
     rows = np.real(np.conj(values)[:, None] * lags * powers) / size[:, None]
     levels = GAP - np.real(values) / size

@@ -9,6 +9,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.errors import StructureError
+from optid.limits import Limit
 from optid.program import View
 
 SETTLES = 1e-6
@@ -96,4 +97,4 @@ def denominator(view: View) -> Any:
 
 def settles(view: View) -> list[Any]:
     """Return the constraint ``1 + sum(a) > 0``, without which there is no static characteristic."""
-    return [denominator(view) >= SETTLES] if "a" in view else []
+    return [Limit(denominator(view) >= SETTLES, bound="settles")] if "a" in view else []

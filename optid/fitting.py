@@ -64,6 +64,14 @@ class Fit:
     seconds: float = 0.0
 
     @cached_property
+    def values(self) -> dict[str, np.ndarray]:
+        """Values at the solution of everything a constraint may speak about, by name, in the units of ``data``."""
+        if not self.solution.has_point:
+            return {}
+        self.program.assign(self.solution.values)
+        return {name: np.asarray(expression.value, dtype=float) for name, expression in self.program.view.items()}
+
+    @cached_property
     def one_step_fit(self) -> np.ndarray:
         """One-step fit in % of every output: on the rows used for the estimate where the programme knows them.
 

@@ -8,7 +8,8 @@ import cvxpy as cp
 import numpy as np
 
 from optid.certificate.lifting import lift_exact, places
-from optid.program import EQUALITIES, Program
+from optid.limits import EQUALITIES
+from optid.program import Program
 
 
 def explain(program: Program) -> str:

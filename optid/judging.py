@@ -4,17 +4,15 @@ from collections.abc import Mapping
 
 import cvxpy as cp
 import numpy as np
-import scipy.sparse as sp
 from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 from cvxpy.constraints.zero import Equality, Zero
 
+from optid.gradients import flat_value, jacobians
 from optid.program import Program, RankOneForm, Values
 from optid.solution import Residuals
-
-ZERO = 1e-9  # a variable smaller than this has no size of its own to measure by
 
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
@@ -46,24 +44,38 @@ def _rank_one_residuals(program: Program, form: RankOneForm) -> tuple[float, flo
     The gauge has multiplier zero, because moving the scale between mu and b does not change the objective.
     """
     problem = form.problem
-    flat = {name: _flat(variable) for name, variable in program.variables.items()}
-    w = np.concatenate([flat[name] for name in form.linear] or [np.zeros(0)])
+    flat = {name: flat_value(variable) for name, variable in program.variables.items()}
     pairs = [(flat[mu], flat[b]) for mu, b in form.blocks]
-    z = np.concatenate([w, *(np.kron(b, mu) for mu, b in pairs)])
+    z = np.concatenate([*(flat[name] for name in form.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
     r = problem.root @ z - problem.target
-    pull = 2.0 * problem.root.T @ r
-    parts, position = [pull[: w.size]], w.size
-    for mu, b in pairs:
-        block = pull[position : position + mu.size * b.size].reshape(b.size, mu.size)
-        parts += [block.T @ b, block @ mu]
-        position += mu.size * b.size
-    size = 2.0 * float(np.max(np.abs(problem.root.T @ problem.target), initial=0.0))
-    return float(r @ r) + problem.remainder, float(np.max(np.abs(np.concatenate(parts)))) / (1.0 + size)
+    value = float(r @ r) + problem.remainder
+    pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
+    parts, position = [], 0
+    for name in form.linear:
+        span = slice(position, position + flat[name].size)
+        parts.append((name, pull[span], effort[span]))
+        position = span.stop
+    for (mu_name, b_name), (mu, b) in zip(form.blocks, pairs):
+        span = slice(position, position + mu.size * b.size)
+        block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
+        parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
+        position = span.stop
+    yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
+    for name, gradient, terms in parts:
+        worst = max(worst, _relative(np.abs(gradient), terms, yardstick, _size(program.variables[name], usual)))
+    return value, worst
 
 
-def _flat(expression: cp.Expression) -> np.ndarray:
-    """Value of an expression as a flat array, column by column."""
-    return np.ravel(np.asarray(expression.value, dtype=float), order="F")
+def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
+    """Largest entry of a variable, of its start where it vanishes, one where both do."""
+    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
+    return max(size, usual.get(variable.id, 0.0)) or 1.0
+
+
+def _relative(gradient: np.ndarray, terms: np.ndarray, yardstick: float, size: float) -> float:
+    """Largest component of a gradient relative to its terms plus the objective's size per size of the variable."""
+    floor = yardstick / size + terms
+    return float(np.max(gradient / np.where(floor > 0, floor, 1.0), initial=0.0))
 
 
 def value_size(program: Program, objective: float) -> float:
@@ -76,60 +88,54 @@ def measure_violation(program: Program) -> tuple[float, str]:
 
     Bounds that variables carry as attributes count as well, under the name of the variable.
     """
-    worst, name, usual = 0.0, "", usual_sizes(program)
+    worst, name, usual = 0.0, "", program.usual_sizes()
     for key, group in program.constraints.items():
         if key in program.derived:
             continue  # recomputed, hence exact
         for member in group:
             with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
-                amount = float(np.max(np.asarray(member.violation()), initial=0.0)) / term_size(member, usual)
+                amount = float(np.max(np.asarray(member.violation()), initial=0.0))
+            amount = amount / term_size(member, usual) if amount else 0.0
             if not amount <= worst:  # also true for nan
                 worst, name = amount, key
     for key, variable in program.variables.items():
-        value, amount = np.asarray(variable.value, dtype=float), 0.0
+        value, amount, size = np.asarray(variable.value, dtype=float), 0.0, _size(variable, usual)
         if has_bounds(variable):
-            lower, upper = variable.get_bounds()
+            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
             amount = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
+            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in (lower, upper))])
         elif variable.attributes["PSD"] or variable.attributes["NSD"]:
             sign = 1.0 if variable.attributes["PSD"] else -1.0
             amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
-        amount /= 1.0 + float(np.max(np.abs(value), initial=0.0))
+        amount /= size
         if not amount <= worst:
             worst, name = amount, key
     return (worst if np.isfinite(worst) else float("inf")), name
 
 
-def usual_sizes(program: Program) -> dict[int, float]:
-    """Largest entry of every variable at the programme's start, by id of the variable."""
-    return {program.variables[name].id: float(np.max(np.abs(value), initial=0.0))
-            for name, value in program.start.items() if name in program.variables}
-
-
 def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
     """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
 
-    For affine constraints every variable counts with its largest entry, so that the measure does not depend on units;
-    where that vanishes, and for other constraints, it is one more than the largest argument.
+    Every variable of an equality or inequality counts with its largest entry, so that the measure does not depend on
+    units. The size of a cone constraint is its largest argument.
 
     Args:
         member: the constraint.
         usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
     """
-    largest = 1.0 + max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
-    if not isinstance(member, Equality | Zero | Inequality | NonPos) or not member.expr.is_affine():
+    largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0) or 1.0
+    if not isinstance(member, Equality | Zero | Inequality | NonPos):
         return largest
-    total = np.zeros(member.size)
-    inner = -_flat(member.expr)
-    for variable, jacobian in member.expr.grad.items():
-        if jacobian is None:
-            return largest
-        entries = sp.csc_array(jacobian if sp.issparse(jacobian) else np.atleast_2d(jacobian))
-        entries = entries.reshape((variable.size, member.size))
-        size = max(float(np.max(np.abs(_flat(variable)), initial=0.0)), (usual or {}).get(variable.id, 0.0))
-        total += np.asarray(abs(entries).sum(axis=0)).ravel() * size
-        inner += entries.T @ _flat(variable)
-    size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of the constraint
-    return size if size > ZERO**2 else largest
+    slopes = jacobians(member.expr)
+    if slopes is None:
+        return largest
+    total, inner = np.zeros(member.size), -flat_value(member.expr)
+    for variable, slope in slopes.items():
+        total += abs(slope).sum(axis=1) * max(float(np.max(np.abs(flat_value(variable)), initial=0.0)),
+                                              (usual or {}).get(variable.id, 0.0))
+        inner += slope @ flat_value(variable)
+    size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine constraint
+    return size or largest
 
 
 def has_bounds(variable: cp.Variable) -> bool:
@@ -168,81 +174,95 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
     return None
 
 
-class _Gradient:
-    """Gradient of the Lagrangian, with the size of the terms every component is a sum of."""
+class Lagrangian:
+    """Objective plus constraints weighed by their multipliers: gradient at the assigned point and what it is a sum of.
+
+    Attributes:
+        variables: of the programme.
+        total: {id of a variable: gradient (size,)}.
+        terms: {id of a variable: sum of the magnitudes of its terms}.
+        value: sum of the products of multipliers and constraints.
+        complementarity: sum of their magnitudes, over inequalities and cones.
+        known: whether every part had a gradient.
+    """
 
     def __init__(self, program: Program) -> None:
         self.variables = list(program.variables.values())
+        self.usual = program.usual_sizes()
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
         self.terms = {v.id: np.zeros(v.size) for v in self.variables}
+        self.value, self.complementarity, self.known = 0.0, 0.0, True
+
+    @classmethod
+    def of(cls, program: Program, duals: Values) -> "Lagrangian":
+        """Add up the constraints that have multipliers, these projected on the dual cones."""
+        found = cls(program)
+        for name, multipliers in duals.items():
+            position = 0
+            for member in program.constraints[name]:
+                length = sum(d.size for d in member.dual_variables)
+                terms = multiplier_terms(member, multipliers[position : position + length])
+                position += length
+                if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
+                    found.known = False
+                    return found
+                products = [flat_value(expression) * weights for expression, weights in terms]
+                found.value += float(sum(map(np.sum, products)))
+                if not isinstance(member, Equality | Zero):
+                    whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
+                    found.complementarity += abs(float(sum(map(np.sum, products)))) if whole else float(
+                        np.sum(np.abs(products[0])))
+        return found
 
     def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
         """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
         if not _smooth(expression):
             return False
-        for variable, jacobian in expression.grad.items():
-            if jacobian is None:
-                return False
+        slopes = jacobians(expression)
+        for variable, slope in (slopes or {}).items():
             if variable.id in self.total:
-                jacobian = jacobian if np.ndim(jacobian) else np.full((1, 1), jacobian)
-                self.total[variable.id] += np.asarray(jacobian @ weights).ravel()
-                self.terms[variable.id] += np.asarray(abs(jacobian) @ np.abs(weights)).ravel()
-        return True
+                self.total[variable.id] += slope.T @ weights
+                self.terms[variable.id] += abs(slope).T @ np.abs(weights)
+        return slopes is not None
 
     def residual(self, yardstick: float) -> float:
         """Return the largest component relative to its terms plus the objective's size per size of the variable."""
         worst = 0.0
         for variable in self.variables:
-            part = _free_part(variable, self.total[variable.id])
+            part = self.free_part(variable)
             if part is None:
                 return float("nan")
-            size = float(np.max(np.abs(_flat(variable)), initial=0.0))
-            floor = yardstick / (size if size > ZERO else 1.0)
-            worst = max(worst, float(np.max(part / (floor + self.terms[variable.id]), initial=0.0)))
+            worst = max(worst, _relative(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
         return worst
 
-
-def _free_part(variable: cp.Variable, gradient: np.ndarray) -> np.ndarray | None:
-    """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
-    flags = variable.attributes
-    if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
-        return None
-    gradient = np.reshape(gradient, variable.shape, order="F")
-    if flags["symmetric"]:
-        gradient = (gradient + gradient.T) / 2
-    if has_bounds(variable):
-        lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
-        value = np.asarray(variable.value)
-        margin = 1e-6 * (1.0 + np.abs(value))
-        held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
-        gradient = np.where(held, 0.0, gradient)
-    return np.abs(np.ravel(gradient, order="F"))
+    def free_part(self, variable: cp.Variable) -> np.ndarray | None:
+        """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
+        flags = variable.attributes
+        if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
+            return None
+        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
+        if flags["symmetric"]:
+            gradient = (gradient + gradient.T) / 2
+        if has_bounds(variable):
+            lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
+            value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
+            held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
+            gradient = np.where(held, 0.0, gradient)
+        return np.abs(np.ravel(gradient, order="F"))
 
 
 def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
     unknown = float("nan"), float("nan")
-    gradient, complementarity = _Gradient(program), 0.0
     yardstick = max(abs(objective), program.scale)
+    if any(name not in duals for name in program.constraints):
+        return unknown
     try:
-        if not gradient.add(program.objective.expr, np.ones(1)):
+        lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
+        if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
             return unknown
-        for name, group in program.constraints.items():
-            if name not in duals:
-                return unknown
-            position = 0
-            for member in group:
-                length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, duals[name][position : position + length])
-                position += length
-                if terms is None or not all(gradient.add(expression, weights) for expression, weights in terms):
-                    return unknown
-                if not isinstance(member, Equality | Zero):
-                    products = [_flat(expression) * weights for expression, weights in terms]
-                    whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
-                    complementarity += abs(sum(map(np.sum, products))) if whole else float(np.sum(np.abs(products[0])))
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
         return unknown
-    return gradient.residual(yardstick), float(complementarity / value_size(program, objective))
+    return lagrangian.residual(yardstick), float(lagrangian.complementarity / value_size(program, objective))
 
 
 _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",

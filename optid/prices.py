@@ -8,8 +8,9 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
-from optid.judging import term_size, usual_sizes
-from optid.program import EQUALITIES, INEQUALITIES, Program
+from optid.judging import term_size
+from optid.limits import EQUALITIES, INEQUALITIES, Limit, slope_of
+from optid.program import Program
 from optid.solution import Solution
 
 ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below which it counts as active
@@ -19,15 +20,21 @@ ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below wh
 class Price:
     """One user constraint at the solution.
 
+    Multiplier and price are derivatives by the bound that the user wrote: the number in the constraint, in its units.
+    Rows that share a bound move together; of several bounds the most expensive one counts. For conditions without a
+    number (monotone, odd, ...) the bound is the zero in their rows: how far, in units of f, each of them may be missed.
+
     Attributes:
         name: the user's name.
         active: how many of its rows hold with equality.
         rows: how many rows it has.
-        slack: smallest slack over the rows (0 for equalities).
-        multiplier: largest multiplier over the rows, in units of the objective per unit of the constraint; ``nan``
-            where the solver gives none.
-        fit_points: points of one-step fit (%, all outputs together) gained per unit by which the most expensive row
-            is relaxed; ``nan`` where the constraint belongs to a step with an objective of its own.
+        slack: smallest slack over the rows in units of the constraint (0 for equalities).
+        multiplier: change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers.
+        fit_points: points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the
+            constraint belongs to a step with an objective of its own.
+        step: what 1 % is in units of the bound: of the range of f where the bound is about f, else of the size of what
+            it bounds.
+        words: what the step is 1 % of, in words.
     """
 
     name: str
@@ -36,11 +43,18 @@ class Price:
     slack: float
     multiplier: float
     fit_points: float
+    step: float = float("nan")
+    words: str = ""
 
     @property
     def binding(self) -> bool:
         """Whether at least one row is active."""
         return self.active > 0
+
+    @property
+    def points_per_step(self) -> float:
+        """Points of one-step fit gained per step of the bound: the price that is printed."""
+        return self.fit_points * self.step
 
 
 def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]:
@@ -52,21 +66,24 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     if not solution.has_point:
         return ()
     program.assign(solution.values)
-    energy = float(np.sum(getattr(program.compressed, "energy", solution.scale)))
+    unit = program.unit
+    energy = unit * float(np.sum(getattr(program.compressed, "energy", solution.scale / unit)))
     worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
-    found, usual = [], usual_sizes(program)
+    found, usual = [], program.usual_sizes()
     for name, group in program.user_constraints.items():
+        limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
         active = rows = 0
         slack = np.inf
-        for member in group:
-            size = term_size(member, usual)
-            gaps = _slacks(member)
+        for limit in limits:
+            gaps = _slacks(limit.member)
             rows += gaps.size
-            active += int(np.count_nonzero(gaps <= ACTIVE * size))
+            active += int(np.count_nonzero(gaps <= ACTIVE * term_size(limit.member, usual)))
             slack = min(slack, float(np.min(gaps, initial=np.inf)))
         dual = solution.duals.get(name)
-        multiplier = float(np.max(np.abs(dual), initial=0.0)) if dual is not None else np.nan
-        found.append(Price(name, active, rows, max(slack, 0.0), multiplier, multiplier * worth))
+        slope, limit = slope_of(limits, dual) if dual is not None else (np.nan, limits[0])
+        step = limit.step() if limit.step is not None else 0.01 * term_size(limit.member, usual)
+        found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, step,
+                           limit.words or "the size of what it bounds"))
     return tuple(found)
 
 

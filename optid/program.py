@@ -8,15 +8,14 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonPos
-from cvxpy.constraints.zero import Equality, Zero
 
+from optid.channels import Transform
 from optid.errors import StructureError, nearest
+from optid.limits import EQUALITIES, INEQUALITIES, Limit
 from optid.solution import Bound
+from optid.units import outward
 
 Values = Mapping[str, np.ndarray]
-EQUALITIES = Equality | Zero
-INEQUALITIES = Inequality | NonPos
 
 
 class View(Mapping[str, cp.Expression]):
@@ -33,12 +32,17 @@ class View(Mapping[str, cp.Expression]):
         reference: values of the unconstrained least-squares estimate, for constraints that need a centre; in a
             "realisation" step the matrices ``A`` and ``C`` that are held.
         outputs: names of the outputs, where constraints may have to choose one.
+        units: from the units of the programme to those of the record, in which the expressions are; None where they
+            are the same.
+        inner: the expressions in the units of the programme.
     """
 
     def __init__(self, expressions: Mapping[str, cp.Expression], *, kind: str, channels: tuple[str, ...] = (),
                  bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None,
-                 outputs: tuple[str, ...] = ()) -> None:
-        self._expressions = dict(expressions)
+                 outputs: tuple[str, ...] = (), units: Transform | None = None) -> None:
+        self.inner = dict(expressions)
+        self.units = units
+        self._expressions = self.inner if units is None else outward(self.inner, kind, units, channels)
         self._auxiliaries: dict[int, cp.Variable] = {}
         self.outputs = tuple(outputs)
         self.kind = kind
@@ -91,11 +95,11 @@ class View(Mapping[str, cp.Expression]):
         return f"{name}[{channel}]"
 
 
-def named(built: Any, default: str) -> dict[str, tuple[Constraint, ...]]:
-    """Bring what a constraint builder returned into the form {name: (constraint, ...)}.
+def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
+    """Bring what a constraint builder returned into the form {name: (limit, ...)}.
 
     Args:
-        built: a CVXPY constraint, a list of them, or a dictionary of either.
+        built: a CVXPY constraint or a `Limit`, a list of them, or a dictionary of either.
         default: name used where the builder gave none.
 
     Raises:
@@ -107,15 +111,15 @@ def named(built: Any, default: str) -> dict[str, tuple[Constraint, ...]]:
         groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
     else:
         groups = {default: built}
-    result: dict[str, tuple[Constraint, ...]] = {}
+    result: dict[str, tuple[Limit, ...]] = {}
     for name, item in groups.items():
         members = tuple(item) if isinstance(item, list | tuple) else (item,)
         for member in members:
-            if not isinstance(member, Constraint):
+            if not isinstance(member, Constraint | Limit):
                 raise StructureError(
                     f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1"
                 )
-        result[name] = members
+        result[name] = tuple(one if isinstance(one, Limit) else Limit.of(one) for one in members)
     return result
 
 
@@ -210,6 +214,8 @@ class Program:
         note: why there can be no proof, where that is known beforehand.
         compressed: the compressed data the programme was built from, for uncertainty and figures; its class belongs
             to the formulation.
+        unit: what one unit of the objective is in units of the record; solutions report their values in the latter.
+        limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
     """
 
     name: str
@@ -230,6 +236,8 @@ class Program:
     scale: float = 1.0
     note: str = ""
     compressed: Any = field(default=None, repr=False)
+    unit: float = 1.0
+    limits: Mapping[str, tuple[Limit, ...]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def problem(self) -> cp.Problem:
@@ -280,14 +288,15 @@ class Program:
         """
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
-        constraints, variables = dict(self.constraints), dict(self.variables)
+        constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
+        usual: dict[int, float] | None = None
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
             for name, group in named(built, default).items():
                 if name in constraints:
                     raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
-                for member in group:
+                for member in (limit.member for limit in group):
                     foreign = set(member.variables()) - known
                     own = {v for v in foreign if self.view.owns(v)}
                     for variable in sorted(own, key=lambda v: v.id):
@@ -303,8 +312,18 @@ class Program:
                             f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
-                constraints[name] = group
-        return replace(self, constraints=constraints, variables=variables)
+                if self.view.units is not None:
+                    usual = usual if usual is not None else self.usual_sizes()
+                    constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
+                else:
+                    constraints[name], limits[name] = tuple(limit.member for limit in group), group
+        return replace(self, constraints=constraints, variables=variables, limits=limits)
+
+    def usual_sizes(self) -> dict[int, float]:
+        """Return the largest entry of every variable at the start, by id; variables that vanish there are left out."""
+        sizes = {self.variables[name].id: float(np.max(np.abs(value), initial=0.0))
+                 for name, value in self.start.items() if name in self.variables}
+        return {key: size for key, size in sizes.items() if size > 0}
 
     def freeze(self, **values: Any) -> "Program":
         """Return the programme with some variables held at values, as parameters that may be changed later.
@@ -334,9 +353,10 @@ class Program:
             if name in self.structural and not any(c.variables() for c in kept):
                 continue
             constraints[name] = kept
-        view = View({name: self.view[name].tree_copy(swap) for name in self.view}, kind=self.view.kind,
+        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, kind=self.view.kind,
                     channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
-                    reference=self.view.reference, outputs=self.view.outputs)
+                    reference=self.view.reference, outputs=self.view.outputs, units=self.view.units)
+        limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}
         left = {name: v for name, v in self.variables.items() if name not in values}
         held = {name: parameters[name] for name in values}
 
@@ -344,8 +364,8 @@ class Program:
             return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
-                       parameters=parameters, view=view, recover=recover, rank_one=None, nuclear=None, group=None,
-                       least_squares=None, certify=None,
+                       parameters=parameters, view=view, recover=recover, limits=limits,
+                       rank_one=None, nuclear=None, group=None, least_squares=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
@@ -362,7 +382,8 @@ class Program:
         if name not in self.user_constraints:
             raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
         penalty: Any = 0.0
-        for member in self.constraints[name]:
+        said = [limit.member for limit in self.limits.get(name, ())] or self.constraints[name]
+        for member in said:
             if isinstance(member, EQUALITIES):
                 penalty = penalty + cp.sum_squares(member.expr)
             elif isinstance(member, INEQUALITIES):
@@ -371,7 +392,8 @@ class Program:
                 raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
                                      "only equalities and inequalities can be softened")
         rest = {key: group for key, group in self.constraints.items() if key != name}
-        return replace(self, objective=cp.Minimize(self.objective.expr + weight * penalty), constraints=rest,
+        objective = cp.Minimize(self.objective.expr + weight / self.unit * penalty)
+        return replace(self, objective=objective, constraints=rest,
                        rank_one=None, nuclear=None, least_squares=None, certify=None,
                        note=f"constraint {name!r} is a penalty here")
 

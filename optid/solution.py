@@ -1,7 +1,7 @@
 """What a solve returns: why it stopped, whether there is a point, whether it is proved, what we measured ourselves."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -100,9 +100,11 @@ class Solution:
         status: why it stopped, after judgement.
         claimed: what the solver said, in its own word.
         reason: one sentence where the status needs one.
-        values: {variable name: array}, empty where there is no point.
-        duals: {constraint name: multiplier array}, empty where the solver gives none.
-        objective: value of the programme's objective at ``values``, recomputed (``nan`` without a point).
+        values: {variable name: array} in the units of the programme, empty where there is no point; see `Fit.values`.
+        duals: {constraint name: multiplier array} of the rows and the objective as the programme poses them, empty
+            where the solver gives none; see `optid.prices`.
+        objective: value of the programme's objective at ``values`` in units of the record, recomputed (``nan`` without
+            a point).
         bound: certified lower bound, or None where the programme has no certificate.
         residuals: our own measurements, or None without a point.
         scale: objective of the zero model (``YᵀY``), the yardstick of the gap.
@@ -138,6 +140,13 @@ class Solution:
         if self.claim in (Status.OPTIMAL, Status.LOCAL):
             return self.status not in (Status.OPTIMAL, Status.LOCAL)
         return self.claim is Status.INFEASIBLE and self.status is Status.FAILED
+
+    def in_units(self, unit: float) -> "Solution":
+        """Return the same with objective, bound and scale multiplied by a unit."""
+        if unit == 1.0:
+            return self
+        bound = self.bound if self.bound is None else replace(self.bound, value=unit * self.bound.value)
+        return replace(self, objective=unit * self.objective, bound=bound, scale=unit * self.scale)
 
     @property
     def proof(self) -> bool:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings, choose, find
+from optid.certificate.convex import TANGENT, certify_convex
 from optid.errors import SolverRefused, StructureError
 from optid.isolated import run_isolated
-from optid.judging import judge, measure_violation, value_size
+from optid.judging import judge, measure_violation
 from optid.program import Program, Values
 from optid.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
 
@@ -85,7 +86,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
     if not values:
         status, reason = _without_point(program, answer, back_end.name)
-        return replace(base, status=status, reason=reason)
+        return replace(base, status=status, reason=reason).in_units(program.unit)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
     if missing := set(program.variables) - set(values) - set(program.derived):
@@ -111,7 +112,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
                    values=point.values, duals=point.duals, objective=point.objective, bound=bound,
                    residuals=point.residuals,
-                   times=replace(base.times, judge=judged - clock, prove=done - judged))
+                   times=replace(base.times, judge=judged - clock, prove=done - judged)).in_units(program.unit)
 
 
 @dataclass(frozen=True)
@@ -172,13 +173,8 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
 
 
 def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) -> bool:
-    """Whether the certificate of a convex programme shows that the point is not optimal after all.
-
-    It decides alone where the objective has kinks, so that stationarity cannot be measured.
-    """
-    if bound.proved or not np.isfinite(bound.value):  # no bound refutes nothing
-        return False
-    if np.isfinite(point.residuals.stationarity) or program.kind == "NLP":
+    """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
+    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
         return False
     return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
 
@@ -202,12 +198,12 @@ def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judg
 
 
 def _convex_proof(program: Program, point: _Judged) -> Bound | None:
-    residuals = point.residuals
-    if not program.problem.is_dcp() or not np.isfinite(residuals.stationarity):
+    if program.kind == "NLP":
         return None
-    error = max(residuals.violation, residuals.stationarity, residuals.complementarity)
-    return Bound(point.objective - residuals.complementarity * value_size(program, point.objective), error < 1e-6,
-                 "convex optimality conditions", f"convex programme; optimality conditions hold to {error:.0e}")
+    try:
+        return certify_convex(program, point.values, point.duals, point.objective)
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return None
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,23 @@ class Stream:
         """Identity: a stream is in raw units."""
         return Transform.identity(self.m, self.l)
 
+    def in_units(self, units: Transform) -> "Stream":
+        """Return the same record in other units: ``raw = value * scale + offset`` with the raw values of this one."""
+        found = replace(self, _channels=replace(self._channels, units=units))
+        if "_survey" in self.__dict__:  # counting its samples once is enough
+            found.__dict__["_survey"] = self._survey
+        return found
+
+    def first_chunk(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (u, y) of the first chunk in which every output has a sample; of the last one where none has."""
+        source = fetched(self.parts[0], self.scheduler) if self.parts else self._whole
+        found = np.empty((0, self.m)), np.empty((0, self.l))
+        for u, y, _ in self._channels.read(source):
+            found = u, y
+            if not np.isnan(y).all(axis=0).any():
+                break
+        return found
+
     def reduced(
         self,
         leaf: Callable[[Part, Iterable[Chunk]], Result],

@@ -114,7 +114,7 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
         covariance = covariance + float(np.trace(noise)) / l * prior
     local = LocalEstimate(centre, _square_root(covariance), dof, inequalities @ directions, slack, draws, seed)
     meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
-    return Tangent(names, shapes, x, directions, local, noise, dof, parameters, MEANINGS[meaning])
+    return Tangent(names, shapes, x, directions, local, program.unit * noise, dof, parameters, MEANINGS[meaning])
 
 
 def unpacked(names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], x: Array) -> dict[str, Array]:

@@ -1,6 +1,7 @@
 """Records, raw-sample routes and searches that the tests of the formulations share."""
 
 import warnings
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -78,4 +79,17 @@ def search(program, points=72):
             found = minimize_scalar(value, bounds=(angles[i] - step, angles[i] + step), method="bounded",
                                     options={"xatol": 1e-6})
             best = min(best, float(found.fun))
-    return best
+    return program.unit * best
+
+
+def regression(fit, solution=None):
+    """Coefficients (columns, l) of the dense regressor in the units of the record, of a fit or of one of its steps."""
+    fit = fit if solution is None else replace(fit, solution=solution)
+    values, ny, layout = fit.values, fit.data.l, fit.program.compressed.layout
+    a = values.get("a", np.zeros(0))
+    rows = [np.reshape(a, (ny, -1), order="F" if ny > 1 else "C").T if a.size else np.zeros((0, ny))]
+    for name in layout.inputs:
+        key = "" if layout.m == 1 else f"[{name}]"
+        theta = values[f"Theta{key}"] if f"Theta{key}" in values else values[f"b{key}"]
+        rows.append(np.reshape(theta, (-1, ny), order="F"))
+    return np.vstack([*rows, values["offset"][None]])

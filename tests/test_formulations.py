@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from problems import BASIS, dense, plant, raw_problem, record
+from problems import BASIS, dense, plant, raw_problem, record, regression
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
@@ -95,7 +95,7 @@ def test_compressed_least_squares_equal_those_of_the_dense_regressor():
     theta, rest, *_ = np.linalg.lstsq(phi, y, rcond=None)
     assert fit.figures["rows"] == len(phi)
     assert fit.solution.objective == pytest.approx(rest.sum(), rel=1e-9)
-    assert np.allclose(fit.program.compressed.regression(fit.solution.values), theta, atol=1e-6)
+    assert np.allclose(regression(fit), theta, atol=1e-6)
 
 
 def test_linear_arx_equals_numpy():
@@ -111,11 +111,11 @@ def test_linear_arx_equals_numpy():
 @pytest.mark.parametrize("weight", [0.5, 5.0, 50.0])
 def test_nuclear_equals_the_raw_sample_problem(weight):
     data = record()
-    fit = optid.fit(data, "hammerstein_arx.nuclear", na=2, nb=3, basis=BASIS, weight=weight)
+    fit = optid.fit(data, "hammerstein_arx.nuclear", na=2, nb=3, basis=BASIS, weight=weight, accuracy=1e-10)
     phi, y = dense(data, 2, (3,), (0,), [BASIS])
     value, (theta,) = raw_problem(phi, y, 2, [(6, 3)], cp.sum_squares, weight)
     assert fit.solution.objective == pytest.approx(value, rel=1e-7)
-    assert np.allclose(fit.solution.values["Theta"], theta, atol=1e-5)
+    assert np.allclose(fit.values["Theta"], theta, atol=1e-5)
     assert fit.solution.proof
     assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-9)
 

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from problems import BASIS, dense, plant, raw_problem, record
+from problems import BASIS, dense, plant, raw_problem, record, regression
 from systems import by_hand
 
 import optid
@@ -22,9 +22,8 @@ def soiled():
 
 def threshold(fit, kind, number):
     """The width in units of the output, from the residuals of the pass in which the scale settled."""
-    theta = fit.program.compressed.regression(fit.steps[2][1].values)
-    layout = fit.program.compressed.layout
-    phi, y = dense(soiled(), layout.na, layout.nb, layout.nk, layout.bases)
+    theta, layout = regression(fit, fit.steps[2][1]), fit.program.compressed.layout
+    phi, y = dense(soiled(), layout.na, layout.nb, layout.nk, fit.program.compressed.bases)
     return number * np.median(np.abs(y - phi @ theta)) / 0.6745
 
 
@@ -53,7 +52,7 @@ def test_nuclear_equals_the_raw_sample_problem(loss, number):
     phi, y = dense(soiled(), 2, (2,), (0,), [BASIS])
     value, (theta,) = raw_problem(phi, y, 2, [(6, 2)], sizes(loss[:2], threshold(fit, loss, number)), 3.0)
     assert fit.solution.objective == pytest.approx(value, rel=1e-6)
-    assert np.allclose(fit.solution.values["Theta"], theta, atol=1e-3)
+    assert np.allclose(fit.values["Theta"], theta, atol=1e-3)
     assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-8)
 
 
@@ -86,7 +85,7 @@ def test_the_exact_robust_objective_is_a_local_minimum_of_its_loss():
         r = np.abs(y[:, 0] - phi @ z)
         return np.sum(np.where(r <= width, r**2, 2 * width * r - width**2))
 
-    v = fit.solution.values
+    v = fit.values
     x = np.concatenate([v["a"], v["mu"], v["b"], v["offset"]])
     assert value(x) == pytest.approx(fit.solution.objective, rel=1e-9)
     slope = [(value(x + h) - value(x - h)) / 2e-6 for h in 1e-6 * np.eye(x.size)]

@@ -83,7 +83,7 @@ def test_constraints_are_listed_with_state_and_price():
     price = example_fit("thruster").prices[0]
     line = next(line for line in text.splitlines() if line.startswith(price.name))
     assert f"active ({price.active} of {price.rows})" in line
-    assert float(line.split()[-1]) == pytest.approx(price.fit_points, rel=5e-3)
+    assert float(line.split()[-1]) == pytest.approx(price.points_per_step, rel=5e-3)
 
 
 def test_an_inactive_constraint_shows_its_slack_and_no_price():

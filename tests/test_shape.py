@@ -92,7 +92,7 @@ def test_the_relaxed_theta_obeys_and_bounds_the_exact_optimum(name):
     rule, _ = OBEYED[name]
     data = record(count=80, noise=0.8, seed=1)
     relaxed = optid.fit(data, "hammerstein_arx.overparametrised", na=2, nb=2, basis=BASIS, constraints=[rule])
-    values = relaxed.solution.values
+    values = relaxed.values
     total = values["Theta"].sum(axis=1)  # of a relaxation only the static characteristic has a meaning of its own
     stand_in = HammersteinARX(values["a"], ([1.0],), (type(nonlinearity(BASIS))(BASIS, total),), (0,), values["offset"])
     if name == "concave":
@@ -117,7 +117,7 @@ def test_a_relaxed_constraint_equals_the_raw_sample_problem():
                                    rows @ cp.sum(t[0], axis=1) <= 2.0 * (1 + cp.sum(a)),
                                    rows[3] @ cp.sum(t[0], axis=1) == 1 + cp.sum(a)])
     assert fit.solution.objective == pytest.approx(value, rel=1e-7)
-    assert np.allclose(fit.solution.values["Theta"], theta, atol=1e-5)
+    assert np.allclose(fit.values["Theta"], theta, atol=1e-5)
 
 
 def test_slack_constraints_change_nothing():
@@ -198,7 +198,7 @@ def test_channels_are_constrained_by_name():
 def test_two_channels_share_their_dynamics():
     fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=Triangular(5).fitted(-1, 1),
                     constraints=[shape.shared("b", "valve", "pump")])
-    assert np.allclose(fit.solution.values["b[valve]"], fit.solution.values["b[pump]"], atol=1e-8)
+    assert np.allclose(fit.values["b[valve]"], fit.values["b[pump]"], atol=1e-8)
 
 
 @pytest.mark.parametrize("build, words", [

@@ -61,7 +61,7 @@ def run(program: Program, settings: Settings) -> Answer:
             return _stopped(in_b, last, count)
         last = _answer(program, form.gauge, point, in_mu, in_b, count)
         # the decrease has to be far below the accuracy asked for, because convergence is only linear
-        if before - in_mu.objective <= 1e-4 * settings.accuracy * max(in_mu.objective, 1e-9 * program.scale):
+        if before - in_mu.objective <= 1e-4 * settings.accuracy * max(in_mu.objective, 1e-9 * in_mu.scale):
             return replace(last, status=Status.LOCAL, word="stationary")
         before = in_mu.objective
         point.update(in_b.values)

@@ -7,12 +7,15 @@ that the tangents misled is corrected by solving for everything but b, which is 
 
 import cvxpy as cp
 import numpy as np
+from scipy.optimize import nnls
 
 from optid.backends import Answer, BackEnd, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.errors import StructureError
+from optid.gradients import flat_value
 from optid.infeasibility import satisfiable
-from optid.judging import measure_violation
+from optid.judging import measure_violation, term_size
+from optid.limits import EQUALITIES, INEQUALITIES
 from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
@@ -216,8 +219,40 @@ class _Constrained:
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-        duals = {**multipliers, "residual": -2.0 * self._residual(x)}
+        duals = {**self._multipliers(x, multipliers), "residual": -2.0 * self._residual(x)}
         return self._merit(x, weight), Answer(status, word, self.at.unpack(x), duals, count)
+
+    def _multipliers(self, x: np.ndarray, found: Values) -> Values:
+        """Return multipliers at x: those of the last step, or fitted to the gradient where that leaves less of it.
+
+        A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
+        """
+        self.at.assign(x)
+        tangent, usual = self.at.slope_of_lift(x), self.program.usual_sizes()
+        slope = 2.0 * tangent.T @ (self.problem.root.T @ self._residual(x))
+        units = 1.0 / np.maximum(np.linalg.norm(self.problem.root @ tangent, axis=0), 1e-12)
+        rows, given, equal, touched, sizes = [], [], [], [], {}
+        for name, group in self.program.constraints.items():
+            if name == "residual":
+                continue
+            if name not in found or not all(isinstance(member, EQUALITIES | INEQUALITIES) for member in group):
+                return found
+            for member in group:
+                rows.append(self.full.slope(member.expr) * units)
+                equal += [isinstance(member, EQUALITIES)] * member.size
+                touched.append(flat_value(member.expr) > -1e-6 * term_size(member, usual))
+            given.append(np.ravel(found[name]))
+            sizes[name] = given[-1].size
+        matrix, held = np.vstack(rows), np.array(equal)
+        active = np.concatenate(touched) | held
+        both = np.vstack([matrix[active], -matrix[held]])
+        weights, rest = nnls(both.T, -slope * units, maxiter=30 * len(both))
+        if rest >= np.linalg.norm(matrix.T @ np.concatenate(given) + slope * units):
+            return found
+        fitted = np.zeros(len(matrix))
+        fitted[active] = weights[: active.sum()]
+        fitted[held] -= weights[active.sum() :]
+        return dict(zip(sizes, np.split(fitted, np.cumsum([*sizes.values()])[:-1])))
 
     def _no_start(self) -> Answer:
         if not satisfiable(self.program, list(self.program.user_constraints)):

@@ -15,7 +15,9 @@ import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings
 from optid.certificate.lifting import places
-from optid.program import EQUALITIES, INEQUALITIES, Program, RankOneForm, Values
+from optid.gradients import jacobians
+from optid.limits import EQUALITIES, INEQUALITIES
+from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point
 from optid.solution import Status
 
@@ -178,7 +180,7 @@ class StepQP:
         """Write a convex constraint in the units of the QP; an affine one also with rows of size one."""
         if not isinstance(member, EQUALITIES | INEQUALITIES) or not member.expr.is_affine():
             return member.tree_copy(self._swap)
-        slope = np.abs(self._slope(member.expr)) @ self._scale
+        slope = np.abs(self.slope(member.expr)) @ self._scale
         level = np.abs(np.ravel(member.expr.value, order="F"))
         unit = float(np.max(slope + level, initial=0.0)) or 1.0
         self._units[name][span] = unit
@@ -229,7 +231,7 @@ class StepQP:
             if tangent.rows is not None:
                 slope, level = tangent.rows[0] @ lift, tangent.rows[0] @ z - tangent.rows[1]
             else:
-                slope, level = self._slope(tangent.expression), np.ravel(tangent.expression.value, order="F")
+                slope, level = self.slope(tangent.expression), np.ravel(tangent.expression.value, order="F")
             tangent.slope.value = slope
             tangent.level.value = level - slope @ x
 
@@ -250,12 +252,12 @@ class StepQP:
         for name, group in self.at.program.constraints.items():
             for member, span in zip(group, _spans(group)) if name in duals else ():
                 if isinstance(member, EQUALITIES):
-                    found.append(self._slope(member.expr))
+                    found.append(self.slope(member.expr))
                 elif isinstance(member, INEQUALITIES):
-                    found.append(self._slope(member.expr)[duals[name][span] > least])
+                    found.append(self.slope(member.expr)[duals[name][span] > least])
         return np.vstack(found)
 
-    def _slope(self, expression: Any) -> np.ndarray:
+    def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
         if expression.is_affine():
             if expression.id not in self._slopes:
@@ -264,13 +266,9 @@ class StepQP:
         return self._jacobian(expression)
 
     def _jacobian(self, expression: cp.Expression) -> np.ndarray:
-        gradients: Mapping = expression.grad
-        parts = []
-        for variable in self.at.variables:
-            part = gradients.get(variable, np.zeros((variable.size, expression.size)))
-            dense = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
-            parts.append(np.reshape(dense, (variable.size, expression.size)).T)
-        return np.hstack(parts)
+        slopes = jacobians(expression) or {}
+        return np.hstack([slopes[v].toarray() if v in slopes else np.zeros((expression.size, v.size))
+                          for v in self.at.variables])
 
 
 def _spans(group: tuple[cp.Constraint, ...]) -> list[slice]:

@@ -12,7 +12,8 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
-from optid.program import EQUALITIES, INEQUALITIES, Program, RankOneForm, Values
+from optid.limits import EQUALITIES, INEQUALITIES
+from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, RankOne
 from optid.solution import Bound
 
@@ -164,7 +165,7 @@ def places(program: Program, form: RankOneForm) -> Places:
     stand_in = {}
     for shape, start, (mu, _) in zip(problem.blocks, _block_starts(problem), form.blocks):
         theta = cp.Variable(shape)
-        stand_in[id(program.view["Theta" + mu[len("mu"):]])] = theta
+        stand_in[id(program.view.inner["Theta" + mu[len("mu"):]])] = theta
         columns[theta.id] = start
     return Places(len(problem.target), columns, stand_in)
 
@@ -263,13 +264,21 @@ def _lift_b(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[i
     return True
 
 
-def certify_nuclear(problem: RankOne, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
-    """Bound ``‖R z - s‖² + remainder + 2 tau sum ‖Theta_c‖_*`` under linear constraints by its own dual.
+def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, values: Values, duals: Values
+                    ) -> tuple[Bound, None]:
+    """Bound ``‖R z - s‖² + remainder + 2 sum tau_c ‖Theta_c‖_*`` under linear constraints by its own dual.
 
-    For any nu with ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau`` the value
+    For any nu with ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
+
+    Args:
+        problem: R, s and the remainder.
+        heights: (inputs,) tau_c per unit of the programme's parameter "weight".
+        program: the programme.
+        values: the point.
+        duals: multipliers by constraint.
     """
-    tau = float(np.asarray(program.parameters["weight"].value))
+    taus = heights * float(np.asarray(program.parameters["weight"].value))
     lifted = Lifted(len(problem.target))
     columns, position = {}, 0
     names = [name for name in program.variables if name != "residual"]
@@ -294,19 +303,19 @@ def certify_nuclear(problem: RankOne, program: Program, values: Values, duals: V
     if linear is not None:
         lam = np.where(linear[2], lam, np.maximum(lam, 0.0))
         pull, cost = linear[0].T @ lam, float(lam @ linear[1])
-    free = len(z) if tau == 0 else problem.linear
+    free = len(z) if not np.any(taus) else problem.linear
     nu = nu - np.linalg.lstsq(problem.root[:, :free].T, problem.root[:, :free].T @ nu + pull[:free], rcond=None)[0]
     shrink = 1.0
     position = problem.linear
-    if tau > 0:
-        for p, q in problem.blocks:
+    if np.any(taus):
+        for (p, q), tau in zip(problem.blocks, taus):
             part = (problem.root[:, position : position + p * q].T @ nu + pull[position : position + p * q])
             shrink = min(shrink, 2.0 * tau / max(float(np.linalg.norm(part.reshape(q, p), 2)), 1e-300))
             position += p * q
     bound = problem.remainder - shrink * float(nu @ problem.target) - shrink**2 * float(nu @ nu) / 4 - shrink * cost
-    value = problem.value(z) + 2.0 * tau * sum(
-        float(np.linalg.norm(np.reshape(values[name], values[name].shape), "nuc"))
-        for name in names if name.startswith("Theta"))
+    matrices = [values[name] for name in names if name.startswith("Theta")]
+    value = problem.value(z) + 2.0 * sum(tau * float(np.linalg.norm(matrix, "nuc"))
+                                         for tau, matrix in zip(taus, matrices))
     gap = problem.gap(value, bound)
     proved = gap <= 1e-6
     kind = "the penalised convex problem, not the rank-one problem behind it"

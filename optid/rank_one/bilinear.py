@@ -97,16 +97,17 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
     state = [_unit(mu, b) for mu, b in zip(mus, bs)]
     for _ in range(max(alternations, 1)):
         state = _half_steps(pieces, target, state, both=alternations > 0)
-    damping, taken, gradient = 0.0, 0, np.inf
+    damping, taken, gradient, settled, promise = 0.0, 0, np.inf, False, np.inf
     residual = _residual(pieces, target, state)
     value = float(residual @ residual)
     while True:
         jacobian, slope, curvature = _linearise(pieces, root, core.shapes, residual, state)
-        gradient = float(np.linalg.norm(slope)) / reference
-        if gradient <= tolerance or taken >= iterations:
+        before, gradient = gradient, float(np.linalg.norm(slope)) / reference
+        settled = promise <= 1e-14 * value + noise and gradient > 0.5 * before  # what is left is rounding
+        if gradient <= tolerance or taken >= iterations or settled:
             break
         hessian = jacobian.T @ jacobian + curvature
-        improved = False
+        improved, promise = False, np.inf
         while not improved and damping < 1e12:
             step = _newton_step(hessian, slope, damping)
             if step is not None:
@@ -114,15 +115,17 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
                 trial_residual = _residual(pieces, target, trial)
                 trial_value = float(trial_residual @ trial_residual)
                 improved = trial_value <= value * (1 + 1e-14) + noise
+                promise = min(promise, -float(slope @ step))
             if not improved:
                 damping = max(4 * damping, 1e-3)
         if not improved:
+            settled = promise <= 1e-13 * value + noise
             break
         state, residual, value = trial, trial_residual, trial_value
         damping = damping / 8 if damping > 1e-3 else 0.0
         taken += 1
     point = core.point([size * unit for size, unit, _ in state], [b for _, _, b in state])
-    return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= tolerance)
+    return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= tolerance or settled)
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.channels import Transform
 from optid.errors import DataError
 from optid.reading.arrays import check_finite, check_integers
 from optid.reading.columns import as_stamps, seconds, uniform_step
@@ -27,6 +28,7 @@ class Channels:
         clock: column of time stamps, or None.
         step: sampling time that the stamps are compared with.
         tolerance: largest deviation of a time step, relative to the sampling time.
+        units: in which the samples are given, raw = value * scale + offset; None for those of the source.
     """
 
     inputs: Mapping[str, str]
@@ -34,6 +36,7 @@ class Channels:
     clock: str | None
     step: float
     tolerance: float
+    units: Transform | None = None
 
     def read(self, source: Any) -> Iterator[Chunk]:
         """Start a pass over a source or a part: what has a `label` and `blocks`.
@@ -74,6 +77,8 @@ class Channels:
         for block in blocks:
             u, y = (_gathered(block, pairs, label, done) for pairs in (self.inputs, self.outputs))
             done += len(u)
+            if self.units is not None:
+                u, y = self.units.apply_u(u), self.units.apply_y(y)
             if self.clock is None:
                 yield u, y, None
                 continue

@@ -20,7 +20,10 @@ Facts = list[tuple[str, str]]
 MOST = 12
 """Entries of an array among the figures that are printed."""
 
-PRICE_NOTE = "Price: points of one-step fit (%) gained per unit by which the dearest row of the constraint is relaxed."
+PRICE_NOTE = (
+    "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit (%) gained when the "
+    "bound is relaxed by 1 % of the range of f, or, where it is not about f, of the size of what it bounds."
+)
 
 
 def title(fit: "Fit") -> str:
@@ -83,7 +86,7 @@ def constraint_table(fit: "Fit") -> Table:
                 state,
                 "-" if p.binding else number(p.slack, 3),
                 number(p.multiplier, 3) if priced else "-",
-                number(p.fit_points, 3) if priced else "-",
+                number(p.points_per_step, 3) if priced else "-",
             )
         )
     return Table("Constraints", ("constraint", "state", "slack", "multiplier", "price"), rows, PRICE_NOTE)

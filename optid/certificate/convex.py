@@ -1,0 +1,181 @@
+"""Lower bounds for convex programmes, recomputed from multipliers as values of the Lagrangian dual.
+
+For multipliers w in the dual cone of the constraints ``g(x) in K`` the minimum of ``L(x) = F(x) + <w, g(x)>`` over all
+x bounds the optimum from below, however inaccurate w is: bad multipliers give a weak bound, never a wrong one.
+
+* Least squares ``F = ‖R z - s‖² + remainder`` with affine constraints: the minimum is known in closed form,
+  ``L(z0) - ‖R^-T grad L(z0)‖² / 4`` for any z0. Where the solver gives no multipliers, or poor ones, those of linear
+  constraints are computed here by least-distance programming (Lawson and Hanson, Solving Least Squares Problems, 1974,
+  chapter 23).
+* Any other smooth convex F: L is convex, so that its tangent at the point bounds it from below; what is left of its
+  gradient there counts over a box of `REACH` times the size of every variable around the point.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+
+from optid.gradients import flat_value, jacobians
+from optid.judging import Lagrangian
+from optid.limits import EQUALITIES, INEQUALITIES
+from optid.program import Program, RankOneForm, Values
+from optid.solution import Bound, relative_gap
+
+Array = np.ndarray
+
+CLOSED = 1e-6
+"""Relative gap up to which a convex programme counts as solved to its optimum."""
+
+TANGENT = "tangent"
+"""Method of a bound from a tangent: it may be weak at a good point, so that it proves but does not refute."""
+
+REACH = 2.0
+"""Half-width of the box in which a bound from a tangent holds, in sizes of the variables."""
+
+
+def certify_convex(program: Program, values: Values, duals: Values, objective: float) -> Bound | None:
+    """Return the dual bound at a point; None where it cannot be formed (no multipliers, an objective with kinks).
+
+    Args:
+        program: a convex programme.
+        values: the point.
+        duals: {constraint: flat multipliers}; names may be missing.
+        objective: its value at the point.
+    """
+    program.assign(values)
+    form = program.least_squares
+    if form is None:
+        value = _tangent_bound(program, duals, objective)
+        found = None if value is None else (value, f"tangent of the Lagrangian, within {REACH:g} times the solution")
+        method = TANGENT
+    else:
+        found, method = _least_squares_bound(program, form, duals, objective), "convex dual"
+    if found is None or not np.isfinite(found[0]):
+        return None
+    value, words = found
+    gap = relative_gap(abs(objective), value + abs(objective) - objective, program.scale)
+    state = "convex programme" if gap <= CLOSED else "not proved"
+    return Bound(value, gap <= CLOSED, method, f"{state}: {words}, relative gap {gap:.1e}")
+
+
+def _least_squares_bound(program: Program, form: RankOneForm, duals: Values, objective: float
+                         ) -> tuple[float, str] | None:
+    words = "least-squares dual"
+    best = _quadratic_bound(program, form, duals, objective)
+    if best is not None and relative_gap(objective, best, program.scale) <= CLOSED:
+        return best, f"{words} of the solver's multipliers"
+    own = _own_multipliers(program, form)
+    mine = None if own is None else _quadratic_bound(program, form, own, objective)
+    if mine is not None and (best is None or mine > best):
+        return mine, f"{words} of multipliers by least-distance programming"
+    return None if best is None else (best, f"{words} of the solver's multipliers")
+
+
+def _quadratic_bound(program: Program, form: RankOneForm, duals: Values, objective: float) -> float | None:
+    """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
+    lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.user_constraints if name in duals})
+    if any(name not in duals for name in program.user_constraints) or not lagrangian.known:
+        return None
+    root = form.problem.root
+    z = np.concatenate([*(flat_value(program.variables[name]) for name in form.linear), np.zeros(0)])
+    pull = 2.0 * root.T @ (root @ z - form.problem.target)
+    gradient, inner = lagrangian.total, {program.variables[name].id for name in form.linear}
+    pull = pull + np.concatenate([*(gradient[program.variables[name].id] for name in form.linear), np.zeros(0)])
+    step = solve_triangular(root, pull, trans=1)
+    others = [v for v in program.variables.values() if v.id not in inner]  # those that constraints brought with them
+    loose = sum(float(np.abs(gradient[v.id]) @ np.full(v.size, _width(v))) for v in others)
+    return objective + lagrangian.value - float(step @ step) / 4 - loose
+
+
+def _tangent_bound(program: Program, duals: Values, objective: float) -> float | None:
+    if any(name not in duals for name in program.constraints):
+        return None
+    lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
+    if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
+        return None
+    loose = 0.0
+    for variable in program.variables.values():
+        part = lagrangian.free_part(variable)
+        if part is None:
+            return None
+        loose += float(np.sum(part)) * _width(variable)
+    return objective + lagrangian.value - loose
+
+
+def _width(variable: object) -> float:
+    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))  # type: ignore[arg-type]
+    return REACH * (size or 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Linear constraints ``rows @ z <= right`` (or ``=``) of one programme, in order."""
+
+    rows: Array
+    right: Array
+    equal: Array
+    names: tuple[str, ...]
+
+
+def _linear_rows(program: Program, form: RankOneForm) -> _Rows | None:
+    """Read the user's constraints as rows on z; None where one of them is no linear equality or inequality in z."""
+    columns, position = {}, 0
+    for name in form.linear:
+        columns[program.variables[name].id] = position
+        position += program.variables[name].size
+    rows, right, equal, names = [], [], [], []
+    for name, group in program.user_constraints.items():
+        for member in group:
+            if not isinstance(member, EQUALITIES | INEQUALITIES) or not member.expr.is_affine():
+                return None
+            slopes = jacobians(member.expr)
+            if slopes is None or any(v.id not in columns for v in slopes):
+                return None
+            part, level = np.zeros((member.size, position)), -flat_value(member.expr)
+            for variable, slope in slopes.items():
+                part[:, columns[variable.id] : columns[variable.id] + variable.size] = slope.toarray()
+                level += slope @ flat_value(variable)
+            rows.append(part)
+            right.append(level)
+            equal += [isinstance(member, EQUALITIES)] * member.size
+            names += [name] * member.size
+    if not rows:
+        return None
+    return _Rows(np.vstack(rows), np.concatenate(right), np.array(equal), tuple(names))
+
+
+def _own_multipliers(program: Program, form: RankOneForm) -> dict[str, Array] | None:
+    """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
+    found = _linear_rows(program, form)
+    if found is None:
+        return None
+    problem = form.problem
+    estimate = solve_triangular(problem.root, problem.target)
+    slopes = solve_triangular(problem.root, found.rows.T, trans=1).T
+    lengths = np.linalg.norm(slopes, axis=1)
+    lengths[lengths == 0] = 1.0
+    slopes, need = slopes / lengths[:, None], (found.rows @ estimate - found.right) / lengths
+    size = float(np.max(np.abs(need), initial=0.0))
+    if not size:
+        return {name: np.zeros(found.names.count(name)) for name in program.user_constraints}
+    # x = R (z - estimate): minimise |x|² subject to slopes x + need <= 0, equalities as two inequalities
+    both = np.vstack([-slopes, slopes[found.equal]])
+    wanted = np.concatenate([need, -need[found.equal]]) / size
+    target = np.zeros(both.shape[1] + 1)
+    target[-1] = 1.0
+    try:
+        weights, _ = nnls(np.vstack([both.T, wanted]), target, maxiter=30 * len(both))
+    except RuntimeError:  # its iterations did not suffice
+        return None
+    residual = target - np.vstack([both.T, wanted]) @ weights
+    if not residual[-1] > 1e-12:  # the polyhedron is empty as far as the rounding tells
+        return None
+    weights = 2.0 * size * weights / residual[-1]
+    multipliers = weights[: len(slopes)].copy()
+    multipliers[found.equal] -= weights[len(slopes) :]
+    multipliers /= lengths
+    names = np.array(found.names)
+    return {name: multipliers[names == name] for name in program.user_constraints}
+
