@@ -24,7 +24,7 @@ from optid.program import Program, View
 from optid.rank_one import RankOne
 from optid.regressors import Layout, Statistics, collect
 from optid.streams import Stream
-from optid.units import energy_unit, in_units, own_units
+from optid.units import energy_unit, in_units, inner_bases, own_units
 
 
 class Compressed(Protocol):
@@ -217,9 +217,8 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     if own:
         units = own_units(data, [isinstance(one, Linear) for one in bases])
         data = in_units(data, units)
-    inner = tuple(one.mapped(1 / scale, -origin / scale)[0] if isinstance(one, Linear) else one
-                  for one, scale, origin in zip(bases, units.u_scale, units.u_offset))
-    layout = Layout(na=order, nb=nbs, nk=nks, bases=inner, outputs=tuple(outputs), inputs=tuple(inputs))
+    layout = Layout(na=order, nb=nbs, nk=nks, bases=inner_bases(bases, units), outputs=tuple(outputs),
+                    inputs=tuple(inputs))
     if ridge < 0 or curvature < 0:
         raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
     statistics = collect(data, layout, weights=weights)

@@ -20,6 +20,7 @@ from typing import Any
 from formulations.arguments import one_output, per_channel, whole_number
 from formulations.gauges import check_gauge
 from formulations.noise_models import PredictionErrors, extended_least_squares, other_zeros, procedure
+from formulations.output_error_records import in_own_units
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data import Data
@@ -83,11 +84,12 @@ def _posed(name: str, data: Data, basis: Any, free: bool, gauge: str, na: int, n
            constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
     record = one_output(data, "prediction errors")
     inputs = record.inputs
+    record, bases, units = in_own_units(record, fitted_bases(record, basis), offset)
     layout = Layout(whole_number("na", na), per_channel("nb", nb, inputs, low=1), per_channel("nk", nk, inputs, low=0),
-                    fitted_bases(record, basis), record.outputs, inputs)
+                    bases, record.outputs, inputs)
     count = whole_number("starts", starts, 1, "the number of starts")
     plant = Unknowns(layout, record.n_experiments, (free,) * layout.m, bool(offset))
     unknowns = NoiseUnknowns(plant, whole_number("nc", nc))
-    criterion = PredictionErrors(record, unknowns, "norm" if free else "none")
+    criterion = PredictionErrors(record, unknowns, "norm" if free else "none", units)
     found = other_zeros(extended_least_squares(criterion), unknowns, count, seed)
     return procedure(name, criterion, found, constraints, gauge)

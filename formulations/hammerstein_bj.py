@@ -34,6 +34,7 @@ from formulations.output_error_records import check_excited, check_inputs_differ
 from formulations.output_error_starts import RADIUS, with_poles
 from optid.bases import Linear
 from optid.bases.basis import Basis
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import OptidError
 from optid.models.roots import contained
@@ -66,8 +67,8 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns.
     """
-    record, layout = plant_record(one_output(data, "prediction errors"), na, nb, nk, Linear())
-    return _posed("bj.exact", record, layout, False, "none", nc, nd, constraints, offset, starts, seed)
+    record, layout, units = plant_record(one_output(data, "prediction errors"), na, nb, nk, Linear(), offset)
+    return _posed("bj.exact", record, layout, units, False, "none", nc, nd, constraints, offset, starts, seed)
 
 
 def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
@@ -96,19 +97,19 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     check_gauge(gauge)
-    record, layout = plant_record(one_output(data, "prediction errors"), na, nb, nk, basis)
+    record, layout, units = plant_record(one_output(data, "prediction errors"), na, nb, nk, basis, offset)
     check_excited(record, layout)
-    return _posed("hammerstein_bj.exact", record, layout, True, gauge, nc, nd, constraints, offset, starts, seed)
+    return _posed("hammerstein_bj.exact", record, layout, units, True, gauge, nc, nd, constraints, offset, starts, seed)
 
 
-def _posed(name: str, data: Data, layout: Layout, free: bool, gauge: str, nc: int, nd: int,
+def _posed(name: str, data: Data, layout: Layout, units: Transform, free: bool, gauge: str, nc: int, nd: int,
            constraints: Sequence[Any], offset: bool, starts: int, seed: int) -> Procedure:
     count = whole_number("starts", starts, 1, "the number of starts")
     plant = Unknowns(layout, data.n_experiments, (free,) * layout.m, bool(offset))
     unknowns = NoiseUnknowns(plant, whole_number("nc", nc), whole_number("nd", nd))
     check_rows(data, plant)
     check_inputs_differ(data, layout)
-    criterion = PredictionErrors(data, unknowns, "norm" if free else "none")
+    criterion = PredictionErrors(data, unknowns, "norm" if free else "none", units)
     return procedure(name, criterion, _starts(criterion, count, seed), constraints, gauge)
 
 

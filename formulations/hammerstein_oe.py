@@ -32,12 +32,14 @@ from formulations.output_error_starts import (
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
 from optid.bases.basis import Basis
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import RankError
 from optid.models.roots import contained
 from optid.regressors import Layout
 from optid.regressors.sensitivities import Unknowns
 from optid.solving import Procedure
+from optid.units import energy_unit
 
 Array = np.ndarray
 
@@ -68,9 +70,9 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or inputs that the record does not tell apart.
     """
-    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, Linear())
+    record, layout, units = plant_record(one_output(data, "simulation errors"), na, nb, nk, Linear(), offset)
     check_inputs_differ(record, layout)
-    return _procedure("oe.exact", record, layout, False, offset, constraints, "none", starts, seed)
+    return _procedure("oe.exact", record, layout, units, False, offset, constraints, "none", starts, seed)
 
 
 def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str] = "polynomial:3",
@@ -98,21 +100,21 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
             does not tell apart.
     """
     check_gauge(gauge)
-    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis)
+    record, layout, units = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis, offset)
     check_excited(record, layout)
     check_inputs_differ(record, layout)
-    return _procedure("hammerstein_oe.exact", record, layout, True, offset, constraints, gauge, starts, seed)
+    return _procedure("hammerstein_oe.exact", record, layout, units, True, offset, constraints, gauge, starts, seed)
 
 
 # -- the procedure ---------------------------------------------------------------------------------------------------
 
 
-def _procedure(name: str, data: Data, layout: Layout, free: bool, offset: bool, constraints: Sequence[Any], gauge: str,
-               starts: int, seed: int) -> Procedure:
+def _procedure(name: str, data: Data, layout: Layout, units: Transform, free: bool, offset: bool,
+               constraints: Sequence[Any], gauge: str, starts: int, seed: int) -> Procedure:
     count = whole_number("starts", starts, 1, "the number of starts")
     unknowns = Unknowns(layout, data.n_experiments, (free,) * layout.m, bool(offset))
     check_rows(data, unknowns)
-    return _run(name, OutputError(data, unknowns, "norm" if free else "none"), constraints, gauge, count, seed)
+    return _run(name, OutputError(data, unknowns, "norm" if free else "none", units), constraints, gauge, count, seed)
 
 
 def _run(name: str, criterion: OutputError, constraints: Sequence[Any], gauge: str, starts: int, seed: int
@@ -145,8 +147,8 @@ def _searched(criterion: OutputError, count: int, seed: int) -> tuple[Descent, l
     x = np.zeros(criterion.unknowns.size)
     x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
     final = descend(criterion, best.x if part is criterion else x, start=best.start)
-    figures = {"starts": sentence,
-               "simulation errors of the starts": np.array(sorted((one.value for one in found), reverse=True))}
+    values = energy_unit(criterion.units) * np.array(sorted((one.value for one in found), reverse=True))
+    figures = {"starts": sentence, "simulation errors of the starts": values}
     others = [one for one in found[1:] if abs(one.value - best.value) > 1e-3 * best.value] if part is criterion else []
     return replace(final, steps=final.steps + best.steps), others, figures
 

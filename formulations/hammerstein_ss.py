@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from formulations.arguments import one_of
-from formulations.subspace_procedure import NOISES, Plan, identified
+from formulations.subspace_procedure import NOISES, identified, in_record_units, planned
 from optid.data import Data
 from optid.errors import StructureError
 from optid.experiment.expansion import Bases, FeedbackBases
@@ -58,10 +58,10 @@ def sid(
     """
     one_of("noise", noise, NOISES)
     instruments = "inputs+past" if noise == "white" else "inputs"
-    plan = Plan("hammerstein_ss.sid", data, nx, block_rows, basis, None, instruments, weighting=weighting,
+    plan = planned("hammerstein_ss.sid", data, nx, block_rows, basis, None, instruments, weighting=weighting,
                 offset=offset, feedthrough=feedthrough, observer=observer, split=split, stability=stability,
                 constraints=tuple(constraints))
-    return identified(plan)
+    return in_record_units(identified(plan), plan)
 
 
 def sivid(
@@ -102,10 +102,10 @@ def sivid(
     one_of("instruments", instruments, ("past", "inputs", "inputs+past"))
     if not 0 <= tolerance < 1:
         raise StructureError(f"tolerance={tolerance!r}: a number in [0, 1) is needed.")
-    plan = Plan("hammerstein_ss.sivid", data, nx, block_rows, basis, feedback_basis, instruments, form=form,
+    plan = planned("hammerstein_ss.sivid", data, nx, block_rows, basis, feedback_basis, instruments, form=form,
                 tolerance=max(tolerance, 1e-10), weighting=weighting, offset=offset, feedthrough=feedthrough,
                 observer=observer, split=split, stability=stability, constraints=tuple(constraints))
-    return identified(plan)
+    return in_record_units(identified(plan), plan)
 
 
 def asivid(
@@ -145,8 +145,8 @@ def asivid(
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 0:
         raise StructureError(f"iterations={iterations!r}: a whole number from 0 is needed.")
     kind = "simulated" if iterations else "inputs"
-    plan = Plan("hammerstein_ss.asivid", data, nx, block_rows, basis, feedback_basis,
+    plan = planned("hammerstein_ss.asivid", data, nx, block_rows, basis, feedback_basis,
                 kind + ("+past" if noise == "white" else ""), form=form, iterations=int(iterations),
                 weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
                 stability=stability, constraints=tuple(constraints))
-    return identified(plan)
+    return in_record_units(identified(plan), plan)

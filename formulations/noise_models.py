@@ -28,6 +28,7 @@ from optid.regressors.linearised import Linearised
 from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns, linearise, predict
 from optid.regressors.sensitivities import PlantPoint
 from optid.solving import Procedure
+from optid.units import energy_unit
 
 Array = np.ndarray
 
@@ -98,7 +99,8 @@ def procedure(name: str, criterion: PredictionErrors, starts: Mapping[str, Array
     best = descend(criterion, found[0].x, start=found[0].start)
     best = replace(best, steps=best.steps + found[0].steps)
     figures = {"starts": sentence, "starts that agree": agreed,
-               "prediction errors of the starts": np.array(sorted((one.value for one in found), reverse=True))}
+               "prediction errors of the starts":
+                   energy_unit(criterion.units) * np.array(sorted((one.value for one in found), reverse=True))}
     return _refined(name, criterion, best, constraints, gauge, figures)
 
 

@@ -24,7 +24,8 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.arguments import one_of
-from formulations.subspace_procedure import Plan, completed, preliminary, prepared
+from formulations.subspace_procedure import Plan, completed, in_record_units, planned, preliminary, prepared
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.experiment.expansion import Bases, FeedbackBases
@@ -35,6 +36,7 @@ from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
 from optid.subspace.expansion import Expansion
 from optid.subspace.realisation import realise
+from optid.units import energy_unit
 from optid.validation import fit_percent
 
 FORMS = ("predictor", "projection", "instruments")
@@ -140,11 +142,11 @@ def nuclear(
     one_of("form", form, FORMS)
     if not 0 < hold_out < 1:
         raise StructureError(f"hold_out={hold_out!r}: a fraction in (0, 1) is needed")
-    plan = Plan("subspace.nuclear", data, nx, block_rows, basis, feedback_basis, form, offset=offset,
-                feedthrough=feedthrough, observer=observer, split=split, stability=stability,
-                constraints=tuple(constraints))
+    plan = planned("subspace.nuclear", data, nx, block_rows, basis, feedback_basis, form, offset=offset,
+                   feedthrough=feedthrough, observer=observer, split=split, stability=stability,
+                   constraints=tuple(constraints))
     weights = _weights(weight, noise)
-    return _procedure(plan, weights, noise, hold_out)
+    return in_record_units(_procedure(plan, weights, noise, hold_out), plan)
 
 
 def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
@@ -169,8 +171,8 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     expansion, alpha = prepared(plan)
     structured = structure(plan, expansion, alpha)
     if noise is not None:
-        weight = float(np.mean(structured.scale)) ** 2 / noise**2
-    program = nuclear_programme(structured, structured.penalty(weight))
+        weight = float(np.mean(structured.scale)) ** 2 / noise**2 * energy_unit(plan.units)
+    program = nuclear_programme(structured, structured.penalty(weight), plan.units)
     solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
@@ -201,7 +203,7 @@ def _chosen(plan: Plan, weights: tuple[float, ...], hold_out: float
     expansion, alpha = prepared(replace(train, block_rows=prepared(plan)[1]))
     structured = structure(train, expansion, alpha)
     trials: list[tuple[float, float, int]] = []
-    program = nuclear_programme(structured, 1.0)
+    program = nuclear_programme(structured, 1.0, plan.units)
     for weight in weights:
         program.parameters["weight"].value = structured.penalty(weight)
         solution = yield program
@@ -326,7 +328,7 @@ def _inverse_root(gram: np.ndarray) -> np.ndarray:
     return (vectors / np.sqrt(values)) @ vectors.T
 
 
-def nuclear_programme(structured: Structured, penalty: float) -> Program:
+def nuclear_programme(structured: Structured, penalty: float, units: Transform | None = None) -> Program:
     """Pose the convex programme.
 
     Named variables: ``yhat`` (samples, l), outputs of mean zero and unit variance, and, in predictor form, ``T``, one
@@ -335,6 +337,7 @@ def nuclear_programme(structured: Structured, penalty: float) -> Program:
     Args:
         structured: the numbers.
         penalty: lambda.
+        units: from those of ``structured`` to those of the record.
     """
     problem = structured.problem
     yhat = cp.Variable(problem.y.shape, name="yhat")
@@ -355,7 +358,7 @@ def nuclear_programme(structured: Structured, penalty: float) -> Program:
     weight = cp.Parameter(nonneg=True, name="weight", value=penalty)
     constraints = {"structure": (inner == matrix,), "residual": (residual == misfit,)}
     view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
-                 + np.tile(structured.centre, (len(problem.y), 1))}, kind="nuclear")
+                 + np.tile(structured.centre, (len(problem.y), 1))}, kind="nuclear", units=units)
     return Program(
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,

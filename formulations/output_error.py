@@ -1,10 +1,11 @@
 """The sum of squared simulation errors of a Hammerstein or linear model as a function of its unknowns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from optid.channels import Transform
 from optid.data import Data
 from optid.models import HammersteinARX, roots
 from optid.models.gauges import gauge_factor
@@ -27,11 +28,17 @@ class OutputError:
         data: the record.
         unknowns: their order.
         gauge: how the scale between mu and b is fixed; "none" for a linear model.
+        units: from those of the record above (`optid.units`) to those of the model.
     """
 
     data: Data
     unknowns: Unknowns
     gauge: str
+    units: Transform = field(default_factory=lambda: Transform.identity(1, 1))
+
+    def __post_init__(self) -> None:
+        if len(self.units.u_scale) != self.data.m:
+            object.__setattr__(self, "units", Transform.identity(self.data.m, 1))
 
     @property
     def errors(self) -> str:

@@ -21,6 +21,7 @@ from optid.models.roots import contained
 from optid.program import Program, RankOneForm, Values, View
 from optid.regressors import Layout
 from optid.regressors.linearised import Linearised
+from optid.units import energy_unit, outer_bases
 
 Array = np.ndarray
 
@@ -124,7 +125,7 @@ class Posing:
 
     def posed(self) -> Posed:
         """Return what the constrained iteration needs."""
-        return Posed(self.criterion, self.pose, self.pack, self.model)
+        return Posed(self.criterion, self.pose, self.pack, self.model, energy_unit(self.criterion.units))
 
     def key(self, name: str, c: int) -> str:
         """Name of a per-channel variable."""
@@ -186,16 +187,38 @@ class Posing:
             weights = np.sqrt(damping) * np.linalg.norm(at.whole[0], axis=0)
             objective = objective + cp.sum_squares(cp.multiply(weights, stacked - x))
         structural = {"residual": (r == residual,), **({"gauge": tuple(gauges)} if gauges else {})}
+        units = self.criterion.units
+        if unknowns.memory:
+            expressions["x0"] = variables["x0"] + self._before(expressions)
         view = View(expressions, kind="tangent", channels=unknowns.layout.inputs,
-                    bases=dict(zip(unknowns.layout.inputs, unknowns.layout.bases)), gauge=self.criterion.gauge,
-                    reference=values)
+                    bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))),
+                    gauge=self.criterion.gauge, reference=values, units=units)
         start = {**(self.usual or values), "residual": at.whole[1]}
         least = None if damping else RankOneForm(compressed.problem, tuple(self.places), ())
         program = Program(name=self.name, objective=cp.Minimize(objective), constraints=structural, least_squares=least,
                           variables={**variables, "residual": r}, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived={"residual": residual},
-                          scale=self.criterion.energy, compressed=compressed)
+                          scale=self.criterion.energy, compressed=compressed, unit=energy_unit(units))
         return program.subject_to(*self.constraints)
+
+    def _before(self, expressions: Mapping[str, Any]) -> Any:
+        """What the initial state of the record's own units misses: there the time before the record is at the levels.
+
+        In the units of the record it is at zero, as the definition of x0 has it.
+        """
+        units, unknowns = self.criterion.units, self.criterion.unknowns
+        layout, rows = unknowns.layout, np.arange(unknowns.memory)[:, None]
+        total: Any = np.zeros(unknowns.memory)
+        if layout.na and units.y_offset[0]:
+            later = (np.arange(1, layout.na + 1) > rows).astype(float)
+            total = total - units.y_offset[0] / units.y_scale[0] * (later @ expressions["a"])
+        for c, (origin, scale) in enumerate(zip(units.u_offset, units.u_scale)):
+            if origin:
+                later = (np.asarray(layout.lags[c]) > rows).astype(float)
+                total = total + origin / scale * (later @ expressions[self.key("Theta", c)][0])
+        if unknowns.experiments == 1:
+            return total
+        return cp.reshape(total, (unknowns.memory, 1), order="F") @ np.ones((1, unknowns.experiments))
 
     def entry(self, found: Sequence[Descent]) -> Array:
         """Return where to start under the constraints: the best of the optima whose poles are pulled into the region.
@@ -274,4 +297,4 @@ class Posing:
                                nonlinearities=tuple(nonlinearities), nk=unknowns.layout.nk,
                                offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
                                gauge=self.criterion.gauge, **model_meta(self.criterion.data))
-        return self.criterion.with_noise(plant, values)
+        return self.criterion.with_noise(plant, values).with_transform(self.criterion.units)

@@ -9,18 +9,21 @@ from formulations.arguments import ROWS_PER_UNKNOWN, enough_rows, outputs_presen
 from formulations.equation_error import compress
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import RankError
 from optid.regressors import Layout
 from optid.regressors.sensitivities import CHUNK, Unknowns
 from optid.stretches import with_whole_inputs
+from optid.units import in_units, inner_bases, own_units
 
 
-def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str]
-                 ) -> tuple[Data, Layout]:
-    """Return the record with whole inputs and the checked orders of the plant.
+def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str],
+                 offset: bool = True) -> tuple[Data, Layout, Transform]:
+    """Return the record with whole inputs in its own units, the checked orders of the plant, and the way back.
 
     Where inputs are missing the record is cut into stretches, each an experiment with an initial state of its own.
+    Without an offset in the model nothing is centred.
 
     Raises:
         StructureError: impossible orders.
@@ -29,7 +32,15 @@ def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Seq
     """
     reach = plant_layout(data, na, nb, nk, fitted_bases(data, Linear())).first_row
     record = with_whole_inputs(data, 2 * reach + 1)
-    return record, plant_layout(record, na, nb, nk, fitted_bases(record, basis))
+    record, bases, units = in_own_units(record, fitted_bases(record, basis), offset)
+    return record, plant_layout(record, na, nb, nk, bases), units
+
+
+def in_own_units(record: Data, bases: Sequence[Basis], offset: bool = True
+                 ) -> tuple[Data, tuple[Basis, ...], Transform]:
+    """Return the record and its bases in the record's own units (`optid.units`), and the way back."""
+    units = own_units(record, [isinstance(basis, Linear) for basis in bases], bool(offset))
+    return in_units(record, units), inner_bases(bases, units), units
 
 
 def plant_layout(data: Data, na: int, nb: Any, nk: Any, bases: tuple[Basis, ...]) -> Layout:

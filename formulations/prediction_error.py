@@ -223,12 +223,14 @@ class Posed:
         pose: (x, errors near x, damping) -> the programme of one step, with the user's constraints.
         pack: values of the programme's variables -> x.
         model: x -> model.
+        unit: what one unit of the sum of squares is in units of the record.
     """
 
     criterion: Criterion
     pose: Callable[[Array, Linearised, float], Program]
     pack: Callable[[Mapping[str, Array]], Array]
     model: Callable[[Array], Any] = field(repr=False)
+    unit: float = 1.0
 
 
 def refine(posed: Posed, found: Descent, figures: Mapping[str, Any], x: Array | None = None
@@ -391,7 +393,7 @@ def _evidence(posed: Posed, here: _Iterate, status: Status, reason: str, figures
     unknown = NO_BOUND.format(posed.criterion.errors)
     bound = Bound.none(unknown)
     reason = unknown if status is Status.LOCAL else reason
-    return Evidence(posed.model(here.x), here.at.value, bound, status, reason, figures)
+    return Evidence(posed.model(here.x), posed.unit * here.at.value, bound, status, reason, figures)
 
 
 def _quadratic(at: Linearised, step: Array) -> float:

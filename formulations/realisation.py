@@ -24,11 +24,13 @@ import numpy as np
 from formulations.equation_error import flat, residual_programme
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
+from optid.channels import Transform
 from optid.program import Program, RankOneForm, Values, View
 from optid.rank_one import reduce
 from optid.rank_one.bilinear import starts
 from optid.rank_one.whitening import leading_pair
 from optid.subspace.observer import ObserverProblem
+from optid.units import outer_bases
 
 RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
@@ -62,10 +64,12 @@ class Realisation:
     Attributes:
         step: the compressed least squares.
         factored: whether channels are rank one in the programme itself.
+        units: from those of the step to those of the record; None where they are the same.
     """
 
     step: ObserverProblem
     factored: bool
+    units: Transform | None = None
 
     def key(self, name: str, i: int) -> str:
         """Name of a quantity of block i: ``mu[valve]``, ``mu feedback[level]``."""
@@ -119,7 +123,8 @@ def _oriented(mu: np.ndarray, b: np.ndarray, *, linear: bool) -> tuple[np.ndarra
 
 
 def realisation_programme(
-    step: ObserverProblem, name: str, constraints: Sequence[Any] = (), *, factored: bool = True
+    step: ObserverProblem, name: str, constraints: Sequence[Any] = (), *, factored: bool = True,
+    units: Transform | None = None
 ) -> tuple[Realisation, Program]:
     """Pose the step.
 
@@ -128,13 +133,14 @@ def realisation_programme(
         name: name of the formulation.
         constraints: builders, about the coefficients.
         factored: keep every channel rank one; where all are linear there is nothing to keep.
+        units: from those of the step to those of the record, in which the constraints speak.
 
     Returns:
         The names, and the programme, whose ``recover`` gives `Factors`.
     """
     form = step.form
     several = any(min(shape) > 1 for shape in form.blocks)
-    realisation = Realisation(step, factored and several)
+    realisation = Realisation(step, factored and several, units)
     linear: dict[str, cp.Variable] = {"x0": cp.Variable(
         form.n if form.experiments == 1 else (form.n, form.experiments), name="x0")}
     if form.offset:
@@ -175,7 +181,7 @@ def _lumped(realisation: Realisation, name: str, linear: Mapping[str, cp.Variabl
         thetas.append(variables[whole])
     return residual_programme(
         step, name, variables, _residual(step, linear, thetas), start=start, recover=realisation.factors,
-        view=_view(realisation, {**variables}, thetas))
+        view=_view(realisation, {**variables}, thetas), least_squares=RankOneForm(step.problem, tuple(variables), ()))
 
 
 def least_squares_values(realisation: Realisation) -> dict[str, np.ndarray]:
@@ -221,6 +227,8 @@ def _view(realisation: Realisation, expressions: dict[str, Any], thetas: Sequenc
         expressions["Ez"] = cp.hstack(inner[x.m :])
     if all(isinstance(basis, Linear) for basis in x.inputs):
         expressions["B"], expressions["D"] = expressions["Bu"], expressions["Du"]
+    bases = x.inputs if realisation.units is None else outer_bases(x.inputs, realisation.units)
     return View(expressions, kind="realisation", channels=x.input_names, outputs=x.output_names,
-                bases=dict(zip(x.input_names, x.inputs)), gauge="norm" if realisation.factored else "",
-                reference={"A": form.a, "C": form.c})
+                bases=dict(zip(x.input_names, bases)),
+                gauge="norm" if realisation.factored else "", reference={"A": form.a, "C": form.c},
+                units=realisation.units)

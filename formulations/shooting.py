@@ -40,6 +40,7 @@ from optid.models.roots import contained
 from optid.program import Program, Values, View
 from optid.regressors.sensitivities import Unknowns, simulate
 from optid.solution import Bound
+from optid.units import energy_unit, outer_bases
 
 Array = np.ndarray
 
@@ -74,7 +75,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
     check_gauge(gauge)
-    record, layout = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis)
+    record, layout, units = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis, offset)
     if record.n_samples > LIMIT:
         raise StructureError(
             f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "
@@ -83,7 +84,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
     check_inputs_differ(record, layout)
     unknowns = Unknowns(layout, record.n_experiments, (True,) * layout.m, bool(offset))
     check_rows(record, unknowns)
-    return _Shooting(OutputError(record, unknowns, gauge)).program(constraints)
+    return _Shooting(OutputError(record, unknowns, gauge, units)).program(constraints)
 
 
 class _Shooting:
@@ -125,14 +126,16 @@ class _Shooting:
                                     for c in range(layout.m))
         start = self._start()
         reference = {name: start[name] for name in ("a", "offset") if name in start}
-        view = View(expressions, kind="exact", channels=layout.inputs, bases=dict(zip(layout.inputs, layout.bases)),
-                    gauge=gauge, reference=reference)
+        units = self.criterion.units
+        view = View(expressions, kind="exact", channels=layout.inputs,
+                    bases=dict(zip(layout.inputs, outer_bases(layout.bases, units))), gauge=gauge, reference=reference,
+                    units=units)
         objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))
         bound = Bound.none(NO_BOUND)
         program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
                           variables=self.variables, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived=derived, scale=self.criterion.energy,
-                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND)
+                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=energy_unit(units))
         return program.subject_to(*constraints)
 
     def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -215,4 +218,4 @@ class _Shooting:
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(self.layout.bases, pairs)),
             nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
             gauge=self.criterion.gauge, **model_meta(self.data))
-        return HammersteinTF(plant)
+        return HammersteinTF(plant).with_transform(self.criterion.units)

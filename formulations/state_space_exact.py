@@ -29,7 +29,7 @@ from formulations.prediction_error import AGREE, Descent, best_of, descend, refi
 from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.state_space_programme import Posing
-from formulations.subspace_procedure import Plan, feedback_bases, identified
+from formulations.subspace_procedure import Plan, feedback_bases, identified, in_record_units, planned
 from optid.bases import fitted_bases
 from optid.data import Data
 from optid.errors import DataWarning, RankError, StructureError
@@ -41,6 +41,7 @@ from optid.solution import Status
 from optid.solving import Evidence, Procedure
 from optid.stretches import with_whole_inputs
 from optid.subspace.expansion import expand
+from optid.units import energy_unit, inverse
 
 Array = np.ndarray
 
@@ -132,16 +133,17 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
     in_memory(data, f"{criterion} errors")
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
-    data = data.without_transform()
-    plan = Plan(name, data, nx, None, basis, feedback_basis, "inputs+past" if feedback_basis is None else "simulated",
-                offset=bool(offset), feedthrough=feedthrough, stability="free", iterations=2 * (
-                    feedback_basis is not None))
+    plan = planned(name, data, nx, None, basis, feedback_basis,
+                   "inputs+past" if feedback_basis is None else "simulated", offset=bool(offset),
+                   feedthrough=feedthrough, stability="free", iterations=2 * (feedback_basis is not None))
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
+    models = [model.with_transform(inverse(plan.units)) for model in models]
     if criterion == "prediction" and feedback_basis is not None:
         plan = replace(plan, instruments="simulated+past")
     poles, others = _sorted(constraints)
-    return _run(plan, given, criterion, weighting, STABLE if stability == "stable" else np.inf, models,
-                int(iterations), poles, others)
+    run = _run(plan, given, criterion, weighting, STABLE if stability == "stable" else np.inf, models, int(iterations),
+               poles, others)
+    return in_record_units(run, plan)
 
 
 def _sorted(constraints: Sequence[Any]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -186,10 +188,10 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
     error, best, figures = _searched(error, starts, criterion, weighting, iterations)
-    posing = Posing(plan.name, error, constraints)
+    posing = Posing(plan.name, error, constraints, plan.units)
     x = posing.signed(best.x)
     evidence = yield from refine(posing.posed(), replace(best, x=x), {"order": nx, **figures}, x)
-    return _with_bound(_with_noise(evidence, error), error, records)
+    return _with_bound(_with_noise(evidence, error, energy_unit(plan.units)), error, records)
 
 
 def _with_bound(evidence: Evidence | None, error: StateError, records: list[Array]) -> Evidence | None:
@@ -204,11 +206,12 @@ def _with_bound(evidence: Evidence | None, error: StateError, records: list[Arra
     return replace(evidence, bound=bound, reason=bound.reason if evidence.status is Status.LOCAL else evidence.reason)
 
 
-def _with_noise(evidence: Evidence | None, error: StateError) -> Evidence | None:
+def _with_noise(evidence: Evidence | None, error: StateError, unit: float) -> Evidence | None:
     """Add the covariances of the noise: with K as it was fitted, or with one estimated from the simulation errors."""
     if evidence is None or evidence.model is None:
         return evidence
-    figures, model, data = {**evidence.figures, "weight of the outputs": error.weight}, evidence.model, error.data
+    figures = {**evidence.figures, "weight of the outputs": error.weight / unit}
+    model, data = evidence.model, error.data
     try:
         if error.unknowns.innovations:
             errors = np.vstack([e.y for e in data.experiments]) - np.vstack(_listed(model.predict(data)))

@@ -14,10 +14,12 @@ import numpy as np
 from formulations.equation_error import flat, tangent_product
 from formulations.prediction_error import Posed
 from formulations.state_error import StateError
+from optid.channels import Transform
 from optid.judging import measure_violation
 from optid.models import HammersteinSS
 from optid.program import Program, Values, View
 from optid.regressors.linearised import Linearised
+from optid.units import outer_bases
 
 Array = np.ndarray
 
@@ -29,6 +31,7 @@ class Posing:
     name: str
     criterion: StateError
     constraints: tuple[Any, ...]
+    units: Transform | None = None
 
     def posed(self) -> Posed:
         """Return what the constrained iteration needs."""
@@ -82,10 +85,11 @@ class Posing:
         if damping:
             weights = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
             objective = objective + cp.sum_squares(cp.multiply(weights, stacked - x))
-        names = unknowns.expansion.input_names
+        names, bases = unknowns.expansion.input_names, unknowns.expansion.inputs
+        bases = bases if self.units is None else outer_bases(bases, self.units)
         view = View({**variables, **self._theta(variables, values), **self._static(variables, values)}, kind="tangent",
                     channels=names, outputs=unknowns.expansion.output_names,
-                    bases=dict(zip(names, unknowns.expansion.inputs)), gauge="norm", reference=values)
+                    bases=dict(zip(names, bases)), gauge="norm", reference=values, units=self.units)
         program = Program(name=self.name, objective=cp.Minimize(objective), constraints={"residual": (r == residual,)},
                           variables={**variables, "residual": r}, start={**values, "residual": errors},
                           recover=self.recover, view=view, structural=frozenset({"residual"}),

@@ -86,7 +86,11 @@ def output_index(view: View, output: str | None) -> int:
 def offset_of(view: View, output: str | None) -> Any:
     """Return the constant of the curve of an output, times ``1 + sum(a)``."""
     if "C" in view.reference:
-        return view["offset"][output_index(view, output)] if "offset" in view else 0.0
+        level = view["offset"][output_index(view, output)] if "offset" in view else 0.0
+        for channel, origin in zip(view.channels, view.units.u_offset if view.units else ()):
+            if origin:  # the programme counts a linear input from its level
+                level = level - origin * static_theta(view, channel, output)[0]
+        return level
     return view["offset"][0]
 
 

@@ -12,7 +12,8 @@ from formulations.shift import constrained_shift
 from formulations.simulation_bound import simulation_bound
 from formulations.stability import stable
 from formulations.state_models import state_model
-from optid.bases import fitted_bases
+from optid.bases import Linear, UserFunctions, fitted_bases
+from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.experiment.expansion import feedback_bases
@@ -35,6 +36,7 @@ from optid.subspace.methods import (
 )
 from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
 from optid.subspace.realisation import WEIGHTINGS, largest_gap, scaled_pair
+from optid.units import in_units, inner_bases, own_units
 
 OBSERVERS = ("auto", "none", "kalman")
 NOISES = ("white", "coloured")
@@ -53,7 +55,7 @@ INSIDE = 0.999
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a method is asked for."""
+    """What a method is asked for, of a record in its own units; see `planned`."""
 
     name: str
     data: Data
@@ -72,6 +74,7 @@ class Plan:
     split: str = "exact"
     stability: str = "auto"
     constraints: tuple[Any, ...] = ()
+    units: Transform | None = None
     records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
@@ -79,8 +82,6 @@ class Plan:
                                    ("stability", self.stability, STABILITIES),
                                    ("weighting", self.weighting, (*WEIGHTINGS, BEST))):
             one_of(name, value, known)
-        if not isinstance(self.data, Data):
-            raise DataError(f"{self.name} needs records in memory (optid.Data), not a {type(self.data).__name__}.")
         if not (self.nx in ORDERS or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
             raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
         self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
@@ -103,6 +104,41 @@ class Plan:
             raise StructureError(f"feedthrough={self.feedthrough!r}: True or False, or one of them per input "
                                  f"({', '.join(self.data.inputs)}).")
         return tuple(bool(one) for one in given)
+
+
+def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis: Any, feedback_basis: Any,
+            instruments: str, *, offset: bool = True, **settings: Any) -> Plan:
+    """Plan a method on a record taken to its own units (`optid.units`); `in_record_units` brings the model back.
+
+    Args:
+        name: of the formulation.
+        data: the record, in memory.
+        nx: as in `formulations.hammerstein_ss.sid`.
+        block_rows: as there.
+        basis: of the inputs.
+        feedback_basis: of the outputs, None without feedback.
+        instruments: word of the instruments.
+        offset: whether the model has a constant; without one nothing is centred.
+        settings: further fields of the plan.
+    """
+    if not isinstance(data, Data):
+        raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")
+    inputs, outputs = fitted_bases(data, basis), feedback_bases(data, feedback_basis)
+    units = own_units(data, [isinstance(one, Linear) for one in inputs], bool(offset))
+    if any(isinstance(one, UserFunctions) for one in outputs):  # known in the units of the record only
+        units = Transform.identity(data.m, data.l)
+    inner = [one and one.mapped(1 / scale, -level / scale)[0]
+             for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
+    return Plan(name, in_units(data, units), nx, block_rows, inner_bases(inputs, units), inner or None, instruments,
+                offset=bool(offset), units=units, **settings)
+
+
+def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
+    """Run a procedure and return its model in the units of the record that was planned for."""
+    evidence = yield from procedure
+    if evidence is None or evidence.model is None or plan.units is None:
+        return evidence
+    return replace(evidence, model=evidence.model.with_transform(plan.units))
 
 
 def prepared(plan: Plan) -> tuple[Expansion, int]:
@@ -189,7 +225,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
         a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
     step = _step(plan, records, expansion, a, c, scale)
     realisation, program = realisation_programme(step, plan.name, plan.about("coefficients"),
-                                                 factored=plan.split == "exact")
+                                                 factored=plan.split == "exact", units=plan.units)
     solution: Solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)

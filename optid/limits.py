@@ -1,6 +1,6 @@
 """What the bound of a user's constraint is: which rows move with it, how fast, and what a small step of it is."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,11 +76,12 @@ def times(factors: np.ndarray, expression: cp.Expression) -> cp.Expression:
     return cp.multiply(np.reshape(factors, expression.shape, order="F"), expression)
 
 
-def slope_of(limits: tuple[Limit, ...], multipliers: np.ndarray) -> tuple[float, Limit]:
-    """Return the largest derivative of the objective over the bounds of a constraint, and the limit it belongs to.
+def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
+    """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
     Args:
         limits: of the members of the constraint.
+        steps: what a small step of each is: bounds are compared by what such a step gains.
         multipliers: of their rows as they are posed, flat over the members, per unit of the objective.
     """
     position, totals = 0, {}
@@ -89,18 +90,18 @@ def slope_of(limits: tuple[Limit, ...], multipliers: np.ndarray) -> tuple[float,
         part = multipliers[position : position + length]
         position += length
         if not isinstance(limit.member, EQUALITIES | INEQUALITIES):
-            totals[number] = float(np.max(np.abs(part), initial=0.0)), limit
+            totals[number] = float(np.max(np.abs(part), initial=0.0)), number
             continue
         part = part / limit.sizes
         if limit.band is not None and limit.span is not None:
-            totals[number] = _band_slope(part, limit.band, limit.span), limit
+            totals[number] = _band_slope(part, limit.band, limit.span), number
         elif limit.bound is None:
-            totals[number] = float(np.max(np.abs(part * limit.speeds()), initial=0.0)), limit
+            totals[number] = float(np.max(np.abs(part * limit.speeds()), initial=0.0)), number
         else:
-            before = totals.get(limit.bound, (0.0, limit))[0]
-            totals[limit.bound] = before + float(part @ limit.speeds()), limit
-    value, limit = max(totals.values(), key=lambda one: abs(one[0]), default=(np.nan, Limit(cp.Constant(0) <= 0)))
-    return abs(value), limit
+            before = totals.get(limit.bound, (0.0, number))[0]
+            totals[limit.bound] = before + float(part @ limit.speeds()), number
+    value, number = max(totals.values(), key=lambda one: abs(one[0]) * steps[one[1]])
+    return abs(value), number
 
 
 def _band_slope(multipliers: np.ndarray, band: np.ndarray, span: np.ndarray) -> float:

@@ -80,10 +80,10 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
             active += int(np.count_nonzero(gaps <= ACTIVE * term_size(limit.member, usual)))
             slack = min(slack, float(np.min(gaps, initial=np.inf)))
         dual = solution.duals.get(name)
-        slope, limit = slope_of(limits, dual) if dual is not None else (np.nan, limits[0])
-        step = limit.step() if limit.step is not None else 0.01 * term_size(limit.member, usual)
-        found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, step,
-                           limit.words or "the size of what it bounds"))
+        steps = [0.01 * term_size(limit.member, usual) if limit.step is None else limit.step() for limit in limits]
+        slope, chosen = slope_of(limits, steps, dual) if dual is not None else (np.nan, 0)
+        found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, steps[chosen],
+                           limits[chosen].words or "the size of what it bounds"))
     return tuple(found)
 
 

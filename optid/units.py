@@ -18,7 +18,11 @@ if TYPE_CHECKING:
     from optid.data import Data
     from optid.streams import Stream
 
-HEIGHTS = ("mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", "mu feedback", "Theta feedback", "static")
+SIGNALS = ("x", "output")
+"""Named courses of the output, one row per sample."""
+
+HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", "mu feedback", "Theta feedback",
+           "static")
 """Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""
 
 DIGITS = 15.65
@@ -69,6 +73,25 @@ def in_units(data: Any, units: Transform) -> Any:
     return data.mapped((lambda u: u) if same_inputs else units.apply_u, units.apply_y, transform=changed)
 
 
+def inner_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
+    """Return the bases of inputs in other units; those of inputs that keep theirs stay as they are."""
+    return tuple(basis.mapped(1 / scale, -origin / scale)[0]
+                 for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
+
+
+def outer_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
+    """Return the bases of inputs in the units of the record: the inverse of `inner_bases`."""
+    return tuple(basis.mapped(scale, origin)[0] for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
+
+
+def inverse(units: Transform) -> Transform:
+    """Return the way from the units of the record to those of the programme."""
+    scales, offsets = np.array(units.u_scale + units.y_scale), np.array(units.u_offset + units.y_offset)
+    m = len(units.u_scale)
+    gain, shift = (1 / scales).tolist(), (-offsets / scales).tolist()
+    return Transform(tuple(gain[:m]), tuple(shift[:m]), tuple(gain[m:]), tuple(shift[m:]))
+
+
 def energy_unit(units: Transform) -> float:
     """Return what one squared unit of the outputs is in squared units of the record."""
     return units.y_scale[0] ** 2
@@ -89,19 +112,23 @@ def outward(expressions: Mapping[str, Any], kind: str, units: Transform, inputs:
 
     Args:
         expressions: by name, in the units of the programme.
-        kind: that of the view; in a "linear" one b carries the unit of the outputs.
+        kind: that of the view.
         units: from those of the programme to those of the record.
         inputs: names of the inputs.
     """
     r, found = units.y_scale[0], {}
     for name, expression in expressions.items():
         word, _, channel = name.partition("[")
-        factor = r if word in HEIGHTS or (word == "b" and kind == "linear") else 1.0
+        alone = word == "b" and "mu" + name[1:] not in expressions  # of an input that acts linearly
+        factor = r if word in HEIGHTS or alone else 1.0
         if factor != 1.0 and word in ("mu", "Theta", "b", "static"):
             factor /= units.u_scale[_position(channel.rstrip("]"), inputs)]
         found[name] = expression if factor == 1.0 else factor * expression
+        if word in SIGNALS and kind != "shift":
+            level = np.array(units.y_offset)
+            found[name] = found[name] + (level[0] if expression.ndim == 1 else np.tile(level, (expression.shape[0], 1)))
     if "offset" in found:
-        found["offset"] = found["offset"] + _level(found, units, inputs)
+        found["offset"] = found["offset"] + _level(found, kind, units, inputs)
     return found
 
 
@@ -109,9 +136,11 @@ def _position(channel: str, inputs: Sequence[str]) -> int:
     return list(inputs).index(channel) if channel in inputs else 0
 
 
-def _level(found: Mapping[str, Any], units: Transform, inputs: Sequence[str]) -> Any:
+def _level(found: Mapping[str, Any], kind: str, units: Transform, inputs: Sequence[str]) -> Any:
     """What the levels of outputs and linear inputs add to the constants of the equations."""
     level: Any = np.array(units.y_offset)
+    if kind == "realisation" or "C" in found:  # the constant of the output equation
+        return level
     a = found.get("a")
     if a is not None and np.any(level):
         if a.ndim == 1:

@@ -123,6 +123,11 @@ class ObserverProblem:
     instrumented: bool = False
 
     @property
+    def unit(self) -> float:
+        """One: the residuals are relative to the sizes of the outputs."""
+        return 1.0
+
+    @property
     def condition(self) -> float:
         """Estimate of the condition number of the scaled regressors."""
         return conditioning(np.asarray(self.problem.root, dtype=float))
