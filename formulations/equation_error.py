@@ -279,6 +279,7 @@ def lifted_problem(statistics: Statistics, ridge: float, curvature: float, scale
                 position += p
         system = np.vstack([system, extra])
     triangle = np.triu(np.linalg.qr(system, mode="r"))
+    triangle = triangle * np.where(np.diag(triangle[:, : len(triangle)]) < 0, -1.0, 1.0)[:, None]  # one of many signs
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
     scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(ny)))
     return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,

@@ -101,8 +101,7 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         rank_one=RankOneForm(problem.problem, tuple(linear), tuple(blocks), gauge),
         certify=certify_rank_one)
     program = program.subject_to(*constraints)
-    scaled = {v.id for mu, b in blocks for v in (variables[mu], variables[b])}
-    signed = any(v.id in scaled for group in program.user_constraints.values() for c in group for v in c.variables())
+    signed = _speaks_of_factors(program, {variables[name].id for names in blocks for name in names})
 
     def recover(values: Values) -> HammersteinARX:
         return problem.model(values, [values[mu] for mu, _ in blocks], [values[b] for _, b in blocks],
@@ -110,6 +109,14 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
 
     turn = signed and gauge == "norm"
     return replace(program, recover=recover, start=_signed_start(program, blocks) if turn else start)
+
+
+def _speaks_of_factors(program: Program, factors: set[int]) -> bool:
+    """Whether a constraint speaks of a mu or a b itself, and thereby decides their sign, not of ``mu bᵀ`` alone."""
+    stand_in = {id(theta): cp.Variable(theta.shape) for name, theta in program.view.inner.items()
+                if name.partition("[")[0] == "Theta"}
+    return any(v.id in factors for group in program.user_constraints.values() for member in group
+               for v in member.tree_copy(stand_in).variables())
 
 
 def _signed_start(program: Program, blocks: Sequence[tuple[str, str]]) -> dict[str, np.ndarray]:

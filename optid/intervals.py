@@ -18,6 +18,9 @@ from scipy.special import stdtrit
 from optid.bases.basis import Array
 from optid.errors import StructureError
 
+DRAWS = 8192
+"""Random draws of an interval under inequalities: their noise is about 0.7 % of its width."""
+
 REACH = 8.0
 """Inequalities further away than this many standard deviations of their slack cannot move an interval."""
 
@@ -28,12 +31,15 @@ class LocalEstimate:
 
     Attributes:
         centre: (n,) minimum without the inequalities, relative to the fit.
-        scatter: (n, n) S, the centre has covariance S Sᵀ.
+        scatter: (n, n) S, symmetric; the centre has covariance S S.
         dof: degrees of freedom of the noise estimate inside S.
         rows: (r, n) and
         slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
         draws: number of random draws.
         seed: their seed.
+        frame: (m, n) orthonormal columns that place v among m coordinates which do not depend on how the basis of the
+            tangent space was found. The draws are made there, so that every machine makes the same; None where v is
+            such coordinates itself.
 
     Raises:
         StructureError: fewer than 100 draws.
@@ -44,8 +50,9 @@ class LocalEstimate:
     dof: float
     rows: Array
     slack: Array
-    draws: int = 400
+    draws: int = DRAWS
     seed: int = 0
+    frame: Array | None = None
 
     def __post_init__(self) -> None:
         if self.draws < 100:
@@ -64,17 +71,21 @@ class LocalEstimate:
         return bool(np.any(self.in_reach))
 
     @cached_property
-    def samples(self) -> tuple[Array, Array]:
-        """Projected draws (draws, n) around the centre and around the fit, by the same random numbers."""
+    def samples(self) -> tuple[Array, Array, Array]:
+        """Draws (draws, n) around zero, and their projections around the centre and around the fit."""
         rng = np.random.default_rng(self.seed)
-        half = rng.standard_normal((-(-self.draws // 2), self.centre.size))
+        frame = np.eye(self.centre.size) if self.frame is None else self.frame
+        half = rng.standard_normal((-(-self.draws // 2), len(frame))) @ frame
         half *= np.sqrt(self.dof / rng.chisquare(self.dof, (len(half), 1)))
-        spread = np.vstack([half, -half])[: self.draws] @ self.scatter.T
+        spread = np.vstack([half, -half])[: self.draws] @ self.scatter
         rows, slack = self.rows[self.in_reach], self.slack[self.in_reach]
-        return project(self.centre + spread, rows, slack), project(spread, rows, slack)
+        return spread, project(self.centre + spread, rows, slack), project(spread, rows, slack)
 
     def limits(self, slopes: Array, level: float) -> tuple[Array, Array, Array]:
         """Return the standard error and the two ends, relative to the fit, of linear functions of v.
+
+        The quantiles of the projected draws are corrected by what those of the draws themselves miss of Student's,
+        which are known: most of the noise of a finite number of draws is common to both.
 
         Args:
             slopes: (q, n) derivatives of q quantities.
@@ -83,15 +94,18 @@ class LocalEstimate:
         Returns:
             (error, lower, upper), each (q,), lower <= 0 <= upper.
         """
+        error = np.linalg.norm(slopes @ self.scatter, axis=1)
+        half = float(stdtrit(self.dof, 0.5 + level / 2)) * error
         if not self.held:
-            error = np.linalg.norm(slopes @ self.scatter, axis=1)
-            half = float(stdtrit(self.dof, 0.5 + level / 2)) * error
             return error, -half, half
-        posterior, scattered = (points @ slopes.T for points in self.samples)
-        tails = [0.5 - level / 2, 0.5 + level / 2]
-        low, high = np.quantile(posterior, tails, axis=0)
-        down, up = np.quantile(scattered, tails, axis=0)
-        error = np.sqrt(np.mean(scattered**2, axis=0))
+        free, posterior, scattered = (slopes @ points.T for points in self.samples)
+        tails, known = [0.5 - level / 2, 0.5 + level / 2], np.array([-half, half])
+        missed = np.quantile(free, tails, axis=1) - known
+        spread = np.maximum(np.std(free, axis=1), np.finfo(float).tiny)
+        low, high = np.quantile(posterior, tails, axis=1) - np.std(posterior, axis=1) / spread * missed
+        down, up = np.quantile(scattered, tails, axis=1) - np.std(scattered, axis=1) / spread * missed
+        wide = error**2 * (self.dof / (self.dof - 2) if self.dof > 2 else 1.0)  # variance of the draws
+        error = np.sqrt(np.mean(scattered**2, axis=1) * np.where(wide > 0, wide / spread**2, 1.0))
         return error, np.minimum(np.minimum(low, -up), 0.0), np.maximum(np.maximum(high, -down), 0.0)
 
 
@@ -99,18 +113,32 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
     """Project points (K, n) on the polyhedron {v: rows @ v + slack >= 0}, which contains the origin.
 
     Least-distance programming by nonnegative least squares (Lawson and Hanson, Solving Least Squares Problems, 1974,
-    chapter 23).
+    chapter 23) finds the active rows of one point; the same rows are then tried for all points that are left.
     """
     size = max(float(np.max(np.linalg.norm(points, axis=1), initial=0.0)), np.finfo(float).tiny)
     lengths = np.linalg.norm(rows, axis=1)
     rows, slack = rows[lengths > 0] / lengths[lengths > 0, None], slack[lengths > 0] / lengths[lengths > 0]
     projected = points.copy()
-    need = -(points @ rows.T + slack) / size
-    for k in np.flatnonzero(np.any(need > 0, axis=1)):
-        system = np.vstack([rows.T, need[k]])
+    left = np.flatnonzero(np.any(points @ rows.T + slack < 0, axis=1))
+    while left.size:
+        first = left[0]
+        system = np.vstack([rows.T, -(points[first] @ rows.T + slack) / size])
         target = np.zeros(len(system))
         target[-1] = 1.0
         multipliers, _ = nnls(system, target, maxiter=30 * rows.shape[0])
         residual = target - system @ multipliers
-        projected[k] -= size * residual[:-1] / residual[-1]
+        projected[first] -= size * residual[:-1] / residual[-1]
+        left = left[1:]
+        active = np.flatnonzero(multipliers > 0)
+        if not left.size or not 0 < active.size <= points.shape[1]:
+            continue
+        held = rows[active]
+        gram = held @ held.T
+        if np.linalg.cond(gram) > 1e12:
+            continue
+        forces = np.linalg.solve(gram, -(points[left] @ held.T + slack[active]).T).T
+        moved = points[left] + forces @ held
+        fits = np.all(forces >= -1e-12 * size, axis=1) & np.all(moved @ rows.T + slack >= -1e-9 * size, axis=1)
+        projected[left[fits]] = moved[fits]
+        left = left[~fits]
     return projected

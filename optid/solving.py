@@ -10,6 +10,7 @@ import numpy as np
 from optid.backends import Answer, BackEnd, Settings, choose, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.errors import SolverRefused, StructureError
+from optid.infeasibility import satisfiable
 from optid.isolated import run_isolated
 from optid.judging import judge, measure_violation
 from optid.program import Program, Values
@@ -18,6 +19,7 @@ from optid.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, 
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+CONFLICT = "the constraints contradict each other"
 NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
 
 
@@ -86,6 +88,8 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
     if not values:
         status, reason = _without_point(program, answer, back_end.name)
+        if status is Status.FAILED and _contradictory(program):
+            status, reason = Status.INFEASIBLE, f"{CONFLICT}; {reason}"
         return replace(base, status=status, reason=reason).in_units(program.unit)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
@@ -101,6 +105,8 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
+    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
+        status, reason = Status.INFEASIBLE, f"{CONFLICT}; {reason}"
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
         point, bound = _proof(program, back_end, settings, point, separate)
@@ -136,6 +142,12 @@ def _overflowed(program: Program) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         values = [np.asarray(expression.value) for expression in program.derived.values()]
     return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
+
+
+def _contradictory(program: Program) -> bool:
+    """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
+    return program.rank_one is not None and bool(program.user_constraints) and not satisfiable(
+        program, list(program.user_constraints))
 
 
 def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status, str]:

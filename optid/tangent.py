@@ -112,7 +112,8 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     if penalised:
         prior = np.eye(len(centre)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
         covariance = covariance + float(np.trace(noise)) / l * prior
-    local = LocalEstimate(centre, _square_root(covariance), dof, inequalities @ directions, slack, draws, seed)
+    # the symmetric root, and draws in the rows of the root of the problem: neither knows how the tangent was turned
+    local = LocalEstimate(centre, _square_root(covariance), dof, inequalities @ directions, slack, draws, seed, basis)
     meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
     return Tangent(names, shapes, x, directions, local, program.unit * noise, dof, parameters, MEANINGS[meaning])
 
@@ -226,5 +227,6 @@ def _gradient(program: Program, names: tuple[str, ...], name: str, expression: E
 
 
 def _square_root(matrix: Array) -> Array:
+    """Return the symmetric square root, which is unique."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T

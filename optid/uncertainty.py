@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from optid.bases.basis import Array
 from optid.bases.expansions import Linear
 from optid.errors import StructureError
+from optid.intervals import DRAWS
 from optid.tangent import Tangent, linearise
 
 if TYPE_CHECKING:
@@ -251,7 +252,7 @@ class Linearised:
         return aligned(model, self.fit.model)
 
 
-def uncertainty(fit: "Fit", level: float = 0.95, draws: int = 400, seed: int = 0) -> Uncertainty:
+def uncertainty(fit: "Fit", level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
     """Linearise a fit and return its standard errors, intervals and bands.
 
     Args:

@@ -1,15 +1,15 @@
 """Local solution of rank-one least squares: Newton's method on the manifold, and alternating least squares.
 
-The method is Newton's with Levenberg damping on the manifold of rank-one matrices, in Kronecker-whitened coordinates,
-from several starts. :func:`alternate` is the classical alternating least squares (Bai, Automatica 34, 1998), an
-independent method for comparison.
+The method is Newton's with Levenberg damping in one factor, the other one eliminated, in Kronecker-whitened
+coordinates, from several starts. :func:`alternate` is the classical alternating least squares (Bai, Automatica 34,
+1998), an independent method for comparison.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
 
 from optid.rank_one.problem import Array, Core, Point, RankOne, block_slices, matrices, reduce
 
@@ -70,14 +70,15 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
 
 def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e-12, iterations: int = 200,
             alternations: int = 0) -> LocalSolution:
-    """Newton with Levenberg damping from whitened factors; the objective never increases beyond roundoff.
+    """Newton's method in the b alone, every mu the best for them; the objective never increases beyond roundoff.
 
-    A step (d mu_i, d b_i) lives in the tangent space, with d b_i measured in units of ||mu_i|| so that one damping
-    parameter fits all; the curvature of the manifold (residual gradient over ||mu_i||) is included.
+    The mu are eliminated at every step (variable projection, Golub and Pereyra 1973), so that a valley along which
+    large mu of correlated inputs cancel, however narrow, is no obstacle. A step d b_i is measured in units of
+    ||mu_i||; directions of negative curvature are followed downwards.
 
     Args:
         core: the reduced problem; without blocks the answer is exact least squares.
-        mus: whitened starting mu_i.
+        mus: whitened starting mu_i; they count where alternations come first.
         bs: whitened starting b_i.
         tolerance: on the tangent gradient relative to ||R^T s||.
         iterations: at most.
@@ -94,38 +95,105 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
         start += p * nb
     reference = max(float(np.linalg.norm(root.T @ target)), np.finfo(float).tiny)
     noise = 1e-30 * float(target @ target)
-    state = [_unit(mu, b) for mu, b in zip(mus, bs)]
-    for _ in range(max(alternations, 1)):
-        state = _half_steps(pieces, target, state, both=alternations > 0)
+    if alternations:
+        state = [_unit(mu, b) for mu, b in zip(mus, bs)]
+        for _ in range(alternations):
+            state = _half_steps(pieces, target, state)
+        bs = [b for _, _, b in state]
+    here = _Projected.at(pieces, target, bs)
     damping, taken, gradient, settled, promise = 0.0, 0, np.inf, False, np.inf
-    residual = _residual(pieces, target, state)
-    value = float(residual @ residual)
     while True:
-        jacobian, slope, curvature = _linearise(pieces, root, core.shapes, residual, state)
+        slope, hessian = here.curvature(root, core.shapes)
         before, gradient = gradient, float(np.linalg.norm(slope)) / reference
-        settled = promise <= 1e-14 * value + noise and gradient > 0.5 * before  # what is left is rounding
+        settled = promise <= 1e-14 * here.value + noise and gradient > 0.5 * before  # what is left is rounding
         if gradient <= tolerance or taken >= iterations or settled:
             break
-        hessian = jacobian.T @ jacobian + curvature
-        improved, promise = False, np.inf
+        sizes, directions = np.linalg.eigh(hessian)
+        sizes = np.maximum(np.abs(sizes), 1e-14 * np.max(np.abs(sizes)))
+        along, improved, promise = directions.T @ slope, False, np.inf
         while not improved and damping < 1e12:
-            step = _newton_step(hessian, slope, damping)
-            if step is not None:
-                trial = _retract(state, step, core.shapes)
-                trial_residual = _residual(pieces, target, trial)
-                trial_value = float(trial_residual @ trial_residual)
-                improved = trial_value <= value * (1 + 1e-14) + noise
-                promise = min(promise, -float(slope @ step))
+            forces = along / (sizes + damping * float(np.mean(sizes)))
+            trial = _Projected.at(pieces, target, here.moved(-directions @ forces))
+            improved = trial.value <= here.value * (1 + 1e-14) + noise
+            promise = min(promise, float(along @ forces))
             if not improved:
                 damping = max(4 * damping, 1e-3)
         if not improved:
-            settled = promise <= 1e-13 * value + noise
+            settled = promise <= 1e-13 * here.value + noise
             break
-        state, residual, value = trial, trial_residual, trial_value
-        damping = damping / 8 if damping > 1e-3 else 0.0
+        fall, here = here.value - trial.value, trial
+        damping = damping / 8 if damping > 1e-3 and fall > 0.25 * promise else damping if damping > 1e-3 else 0.0
         taken += 1
-    point = core.point([size * unit for size, unit, _ in state], [b for _, _, b in state])
+    point = core.point(here.mus, here.bs)
     return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= tolerance or settled)
+
+
+@dataclass(frozen=True, eq=False)
+class _Projected:
+    """The best mu_i for some b_i of unit length, and the least squares that gave them.
+
+    Attributes:
+        pieces: (nb, k, P) of every block.
+        bs: unit vectors.
+        mus: the best for them.
+        basis: (k, sum P) orthonormal and
+        triangle: with basis @ triangle the regressors of the mu_i.
+        residual: (k,).
+    """
+
+    pieces: list[Array]
+    bs: list[Array]
+    mus: list[Array]
+    basis: Array
+    triangle: Array
+    residual: Array
+
+    @classmethod
+    def at(cls, pieces: list[Array], target: Array, bs: list[Array]) -> "_Projected":
+        units = [_unit(np.ones(1), b)[2] for b in bs]
+        design = np.concatenate([np.tensordot(b, piece, 1) for piece, b in zip(pieces, units)], axis=1)
+        basis, triangle = np.linalg.qr(design)
+        diagonal = np.abs(np.diag(triangle))
+        if not np.min(diagonal) > 1e-13 * np.max(diagonal):  # an input without effect, or two that are one
+            mus = np.linalg.lstsq(design, target, rcond=1e-13)[0]
+        else:
+            mus = solve_triangular(triangle, basis.T @ target)
+        split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
+        return cls(pieces, units, split, basis, triangle, design @ mus - target)
+
+    @property
+    def value(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def sizes(self) -> list[float]:
+        """Length of every mu_i."""
+        return [float(np.linalg.norm(mu)) for mu in self.mus]
+
+    def moved(self, step: Array) -> list[Array]:
+        """Return the b_i after a step in units of the mu_i; those of a mu_i that vanishes stay."""
+        parts = np.split(step, np.cumsum([b.size for b in self.bs])[:-1])
+        return [b + part / size if size > 0 else b for b, part, size in zip(self.bs, parts, self.sizes)]
+
+    def curvature(self, root: Array, shapes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
+        """Gradient and Hessian of half the value in the b_i, definite along each b_i, which changes nothing."""
+        regressors, forces, gauges = [], [], []
+        gradients = matrices(root.T @ self.residual, tuple(shapes))
+        for piece, mu, b, size, gradient in zip(self.pieces, self.mus, self.bs, self.sizes, gradients):
+            scale = 1.0 / size if size > 0 else 0.0
+            regressors.append((piece @ (scale * mu)).T)
+            forces.append(scale * gradient)
+            gauges.append(np.outer(b, b))
+        across = np.concatenate(regressors, axis=1)
+        diagonal = np.abs(np.diag(self.triangle))
+        usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
+        mixed = self.basis.T @ across
+        if usable:
+            mixed = mixed + solve_triangular(self.triangle, block_diag(*forces), trans=1)
+        hessian = across.T @ across - mixed.T @ mixed
+        weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
+        return across.T @ self.residual, hessian + weight * block_diag(*gauges)
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
@@ -136,23 +204,14 @@ def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
     return size_mu * size_b, unit_mu, unit_b
 
 
-def _residual(pieces: list[Array], target: Array, state: list) -> Array:
-    residual = -target
-    for piece, (size, mu, b) in zip(pieces, state):
-        residual = residual + b @ (piece @ (size * mu))
-    return residual
-
-
-def _half_steps(pieces: list[Array], target: Array, state: list, both: bool) -> list:
-    """Least squares for all mu_i with the b_i fixed, then, if asked, for all b_i with the mu_i fixed."""
+def _half_steps(pieces: list[Array], target: Array, state: list) -> list:
+    """Least squares for all mu_i with the b_i fixed, then for all b_i with the mu_i fixed."""
     design = np.concatenate([np.tensordot(b, piece, 1) for piece, (_, _, b) in zip(pieces, state)], axis=1)
     mus = np.split(_normal_equations(design, target), np.cumsum([piece.shape[2] for piece in pieces])[:-1])
     state = [_unit(mu, b) for mu, (_, _, b) in zip(mus, state)]
-    if both:
-        design = np.concatenate([(piece @ mu).T for piece, (_, mu, _) in zip(pieces, state)], axis=1)
-        bs = np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
-        state = [_unit(mu, b) for b, (_, mu, _) in zip(bs, state)]
-    return state
+    design = np.concatenate([(piece @ mu).T for piece, (_, mu, _) in zip(pieces, state)], axis=1)
+    bs = np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
+    return [_unit(mu, b) for b, (_, mu, _) in zip(bs, state)]
 
 
 def _normal_equations(design: Array, target: Array) -> Array:
@@ -160,42 +219,6 @@ def _normal_equations(design: Array, target: Array) -> Array:
     gram = design.T @ design
     gram.flat[::len(gram) + 1] += 1e-13 * np.trace(gram) / len(gram)
     return _posv(gram, design.T @ target)[1]
-
-
-def _linearise(pieces, root, shapes, residual, state) -> tuple[Array, Array, Array]:
-    """Jacobian of the residual, gradient, and what the curvature of the manifold and the gauge add to J^T J."""
-    jacobian = np.concatenate([part for piece, (_, mu, b) in zip(pieces, state)
-                               for part in (np.tensordot(b, piece, 1), (piece @ mu).T)], axis=1)
-    curvature = np.zeros((jacobian.shape[1],) * 2)
-    start = 0
-    slope = jacobian.T @ residual
-    for (p, nb), (size, mu, b), gradient in zip(shapes, state, matrices(root.T @ residual, shapes)):
-        own, other = slice(start, start + p), slice(start + p, start + p + nb)
-        if size > 0:
-            curvature[own, other] = gradient / size
-            curvature[other, own] = gradient.T / size
-        gauge = np.concatenate([mu, -b])
-        start += p + nb
-        curvature[own.start:start, own.start:start] += np.outer(gauge, gauge)
-    return jacobian, slope, curvature
-
-
-def _newton_step(hessian: Array, slope: Array, damping: float) -> Array | None:
-    damped = hessian.copy()
-    damped.flat[::len(damped) + 1] += damping * np.trace(hessian) / len(hessian) + 1e-15
-    step, info = _posv(damped, -slope)[1:]
-    return None if info else step
-
-
-def _retract(state: list, step: Array, shapes) -> list:
-    """Move along the tangent vector and return to rank one."""
-    moved, start = [], 0
-    for (p, nb), (size, mu, b) in zip(shapes, state):
-        new_mu = size * mu + step[start:start + p]
-        new_b = b + step[start + p:start + p + nb] / size if size > 0 else b
-        moved.append(_unit(new_mu, new_b))
-        start += p + nb
-    return moved
 
 
 def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0,
