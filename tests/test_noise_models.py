@@ -76,7 +76,7 @@ def test_optimum_is_that_of_another_optimiser(kind):
     model = fit.model
     start = np.concatenate([model.a, model.b[0], model.nonlinearities[0].mu, model.offset, model.c])
     if kind == "bj":
-        start = np.concatenate([start, model.d, fit.solution.values["x0"]])
+        start = np.concatenate([start, model.d, fit.values["x0"]])
     assert np.sum(innovations(start) ** 2) == pytest.approx(fit.solution.objective, rel=1e-10)
     theirs = least_squares(innovations, start * 1.02, xtol=1e-15, ftol=1e-15, gtol=1e-12)
     assert 2 * theirs.cost == pytest.approx(fit.solution.objective, rel=1e-8)
@@ -239,7 +239,8 @@ def test_outputs_that_never_follow_one_another():
     y[::2] = np.nan
     fit = optid.fit(Data(data.u, y), armax, **ORDERS["armax"][1])
     assert fit.model.a == pytest.approx(A, abs=0.02) and fit.figures["rows"] == 1500 - 10
-    assert np.nansum(fit.model.innovations(Data(data.u, y)) ** 2) == pytest.approx(fit.solution.objective, rel=1e-6)
+    # outputs before the first one are at the level of the record in the fit, at zero in the model
+    assert np.nansum(fit.model.innovations(Data(data.u, y)) ** 2) == pytest.approx(fit.solution.objective, rel=1e-5)
 
 
 def test_unstable_plant_in_a_loop():

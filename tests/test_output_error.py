@@ -81,7 +81,7 @@ def test_experiments_of_unequal_length_with_states_of_their_own_and_missing_outp
         ys.append(y)
     fit = optid.fit(optid.Data(us, ys, dt=true.dt), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
     assert distance(fit.model, true) < 1e-7
-    assert fit.solution.values["x0"].shape == (2, 3)
+    assert fit.values["x0"].shape == (2, 3)
     assert fit.figures["rows"] == sum(int(np.count_nonzero(~np.isnan(y))) for y in ys)
 
 
@@ -155,7 +155,7 @@ def test_constrained_optimum_equals_that_of_ipopt_on_the_same_problem():
     count = BASIS.increments().shape[0] + 3
     solver = ca.nlpsol("s", "ipopt", {"x": z, "f": ca.sumsqr(errors), "g": held},
                        {"print_time": False, "ipopt": {"print_level": 0, "tol": 1e-12, "sb": "yes"}})
-    found = fit.solution.values
+    found = fit.values
     best = np.inf
     for seed in range(4):
         start = np.concatenate([found[name] for name in ("a", "b", "mu", "offset", "x0")])
@@ -286,7 +286,7 @@ def test_constraints_of_the_user_in_named_variables():
     fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS,
                     constraints=[lambda v: {"first": v["a"][0] >= -1.4}, lambda v: {"rest": v["x0"] == 0}])
     assert fit.model.a[0] >= -1.4 - 1e-7
-    assert np.max(np.abs(fit.solution.values["x0"])) < 1e-8
+    assert np.max(np.abs(fit.values["x0"])) < 1e-8
     assert {price.name for price in fit.prices} == {"first", "rest"}
 
 

@@ -49,11 +49,11 @@ def test_random_records(seed):
 def test_gaps_and_several_experiments():
     data = plain((200, 150), gaps=0.2)
     fit = same(data, **ORDERS)
-    assert fit.solution.values["x[2]"].shape == (150,)
+    assert fit.values["x[2]"].shape == (150,)
     # every experiment has a state of its own: the residuals are those of a simulation with the fitted state
     simulated = fit.model.simulate(data, x0="fit")
     for i, x in enumerate(simulated, start=1):
-        assert fit.solution.values[f"x[{i}]"] == pytest.approx(x[:, 0], abs=1e-5)
+        assert fit.values[f"x[{i}]"] == pytest.approx(x[:, 0], abs=1e-5)
 
 
 def test_two_inputs_without_a_constant_and_the_gauges():
@@ -84,11 +84,11 @@ def test_shape_constraints_agree_with_gauss_newton():
 def test_constraints_on_the_simulated_output_and_nonconvex_ones():
     data = plain()
     free = optid.fit(data, shooting.exact, solver="ipopt", **ORDERS)
-    ceiling = 0.9 * float(np.max(free.solution.values["x"]))
+    ceiling = 0.9 * float(np.max(free.values["x"]))
     rules = [lambda v: {"ceiling": v["x"] <= ceiling}, lambda v: {"pole": cp.multiply(v["a"][0], v["a"][0]) >= 1.6}]
     fit = optid.fit(data, shooting.exact, solver="ipopt", constraints=rules, **ORDERS)
     assert np.max(fit.model.simulate(data, x0="fit")) <= ceiling + 1e-2
-    assert np.max(fit.solution.values["x"]) <= ceiling + 1e-6 and fit.model.a[0] ** 2 >= 1.6 - 1e-6
+    assert np.max(fit.values["x"]) <= ceiling + 1e-6 and fit.model.a[0] ** 2 >= 1.6 - 1e-6
     assert fit.solution.objective > free.solution.objective
 
 

@@ -13,6 +13,7 @@ from formulations import shape
 from formulations.stability import central, stable
 from optid.errors import StructureError
 from optid.models import HammersteinARX
+from optid.limits import Limit
 from optid.program import View
 
 
@@ -21,7 +22,8 @@ def build(rule, na, reference=None, kind="linear"):
     a = cp.Variable(na, name="a")
     view = View({"a": a}, kind=kind, channels=("u",), reference={} if reference is None else {"a": reference})
     members = rule.build(view)
-    return a, members if isinstance(members, list) else [members]
+    return a, [member.member if isinstance(member, Limit) else member
+               for member in (members if isinstance(members, list) else [members])]
 
 
 def holds(a, members, value):
