@@ -270,6 +270,8 @@ def _estimated(plan: Plan, expansion: Expansion, alpha: int, records: list[np.nd
     """Return the least-squares model with its noise model of records whose missing outputs are estimated."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
+        if expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last one is consistent
+            plan = replace(plan, instruments=f"{plan.instruments}+past")
         records, expansion, instruments = _instrumented(plan, records, expansion, alpha)
         projection = _projected(plan, records, expansion, alpha, instruments)
         nx, _ = _order(plan, projection, records, expansion)

@@ -17,6 +17,7 @@ from optid.data import Data
 from optid.errors import DataError, RankError
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.stretches import interpolated, runs_of
+from optid.subspace.methods import BEYOND
 
 ROUNDS = 12
 """Models at most."""
@@ -59,6 +60,19 @@ def count_windows(records: Sequence[Array], rows: int) -> tuple[int, int]:
     return complete, whole
 
 
+def _predicted(model: HammersteinSS, data: Data, filled: Sequence[Array]) -> list[Array]:
+    """Return the predictions (N, l); those from the estimates so far where a feedback of predictions runs away."""
+    try:
+        found = model.predict(data)
+    except DataError:
+        try:
+            found = model.predict(Data([e.u for e in data.experiments], list(filled), data.dt, list(data.inputs),
+                                       list(data.outputs)))
+        except DataError as error:
+            raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {error}") from error
+    return list(found) if isinstance(found, tuple) else [found]
+
+
 def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Imputation:
     """Estimate the missing outputs of a record.
 
@@ -75,16 +89,13 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Impu
     stacked = np.vstack(outputs)
     if np.any(np.sum(~np.isnan(stacked), axis=0) < 2):
         raise RankError("an output has fewer than two samples: leave it out")
-    spread = np.nanstd(stacked, axis=0)
+    spread, low, high = np.nanstd(stacked, axis=0), np.nanmin(stacked, axis=0), np.nanmax(stacked, axis=0)
+    low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
     filled, count, change, rounds = [interpolated(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
     while rounds < ROUNDS and change > SETTLED:
         rounds += 1
         model = estimate([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)])
-        try:
-            found = model.predict(data)
-        except DataError as error:
-            raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {error}") from error
-        predicted = list(found) if isinstance(found, tuple) else [found]
+        predicted = [np.clip(p, low, high) for p in _predicted(model, data, filled)]
         new = [np.where(gone, p, y) for gone, p, y in zip(lost, predicted, outputs)]
         moved = np.vstack([a - b for a, b in zip(new, filled)]) / spread
         change = float(np.sqrt(np.nansum(moved**2) / count))

@@ -51,6 +51,8 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
         found = _found(model, data, stretches)
     except (StructureError, DataError) as reason:
         return model, f"none: {reason}"
+    except np.linalg.LinAlgError:
+        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
     spread = np.std(np.concatenate([y.T for _, y in stretches], axis=1), axis=1)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
         return model, "none: the prediction errors vanish, there is no noise to model"
