@@ -37,7 +37,9 @@ def sid(
         data: the record.
         nx: order; "auto" for the smallest order after which the singular values are noise (`optid.model_order`), "gap"
             for the largest gap between them (SLICOT's rule).
-        block_rows: block rows of the future, and as many of the past; more than the order. None chooses.
+        block_rows: block rows of the future, and as many of the past; more than the order. None chooses; where missing
+            outputs then leave few complete windows, they are estimated (`optid.subspace.imputation`), for the choice of
+            A and C only.
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
             alone (consistent under coloured measurement noise).

@@ -292,8 +292,10 @@ def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
     starts = window_starts(lengths, alpha + past, np.split(usable, np.cumsum(lengths)[:-1])) + past
     rows = expansion.p * alpha + 1 + (alpha * l if past else 0)
     if len(starts) <= rows:
+        gaps = any(plan.data.missing[name] for name in plan.data.outputs) and form == "predictor"
+        remedy = ", or form='projection', whose windows may lack outputs" if gaps and not expansion.q else ""
         raise RankError(f"{len(starts)} usable windows of {alpha + past} samples for {rows} known rows: use a longer "
-                        "record, fewer block rows or fewer functions")
+                        f"record, fewer block rows or fewer functions{remedy}")
     outputs = (y - centre) / scale
     windows = np.stack([signals[starts + i].T for i in range(alpha)])
     problem = NuclearProblem(outputs, starts, alpha)

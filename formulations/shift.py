@@ -5,6 +5,10 @@
 that is a linear matrix inequality in (P, Q) takes part (Miller and de Callafon 2013). The weight is then undone by
 convex steps that cannot raise the unweighted residual: A alone with P fixed, and the P that leaves A the largest
 margin. The least-squares residual bounds what any A can reach, so that every answer carries a certified suboptimality.
+
+The programme in P and Q grows with the fourth power of the order, so that large orders are deflated first: in the
+Schur form of the least-squares solution the residual splits into columns, and with its invariant subspaces kept, the
+poles that obey stay as they are and the others are constrained a few at a time. The bound is the same.
 """
 
 from collections.abc import Generator, Sequence
@@ -24,6 +28,8 @@ DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm o
 ROUNDS = 6  # pairs of programmes in A and in P at most
 ENOUGH = 1e-2  # fall of the residual, relative to the suboptimality left, below which rounds stop
 TINY = 1e-9  # suboptimality relative to the size of Gamma that is none
+LARGEST = 16  # states whose A is found by one programme
+AT_ONCE = 8  # poles that are constrained by one programme where there are more states
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +45,7 @@ class Shift:
         status: OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the
             suboptimality is positive, INACCURATE where a back end was or where a pole lies outside its region.
         reason: one sentence for people.
-        certificate: (n, n) P of the inequalities, or None.
+        certificate: (n, n) P of the inequalities; None where no programme had a point, and after a deflation.
     """
 
     a: np.ndarray | None
@@ -89,8 +95,11 @@ def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = 
                              f"got {up.shape} and {down.shape}")
     free = np.linalg.lstsq(up, down, rcond=None)[0]
     bound = float(np.linalg.norm(up @ free - down))
-    if not _disobeyed(free, rules) and all(getattr(rule, "verify", None) is not None for rule in rules):
+    verified = all(getattr(rule, "verify", None) is not None for rule in rules)
+    if not _disobeyed(free, rules) and verified:
         return Shift(free, bound, bound, free, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
+    if len(free) > LARGEST and verified and (blocks := _pole_blocks(free, rules)) is not None:
+        return (yield from _deflated(up, down, free, blocks, rules))
     step = _Step.of(up, down, free)
     solution = yield step.joint(rules)
     if not solution.has_point or not _definite(solution.values["P"]):
@@ -115,8 +124,61 @@ def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = 
     return _judged((best, a, p), bound, free, status, reason, rules, step.size)
 
 
-def _judged(best: tuple[float, np.ndarray, np.ndarray], bound: float, free: np.ndarray, status: Status, reason: str,
-            rules: Sequence[Rule], size: float) -> Shift:
+def _pole_blocks(free: np.ndarray, rules: Sequence[Rule]) -> tuple[np.ndarray, np.ndarray, list[int]] | None:
+    """Return the real Schur form of A, its basis, and the ends of its blocks: poles that obey, then some at a time.
+
+    None where the rules speak of the poles together: none of them disobeys by itself.
+    """
+    from scipy.linalg import schur
+
+    def obeys(re: float, im: float) -> bool:
+        return not _disobeyed_by(np.array([complex(re, im), complex(re, -im)]), rules)
+
+    try:
+        triangle, basis, kept = schur(free, output="real", sort=obeys)
+    except np.linalg.LinAlgError:  # poles too close to be told from each other: all of them are constrained
+        (triangle, basis), kept = schur(free, output="real"), 0
+    n, ends = len(free), [int(kept)]
+    if kept == n:
+        return None
+    while ends[-1] < n:
+        end = min(ends[-1] + AT_ONCE, n)
+        ends.append(end - (end < n and triangle[end, end - 1] != 0))  # a pair stays together
+    return triangle, basis, ends
+
+
+def _deflated(up: np.ndarray, down: np.ndarray, free: np.ndarray, blocks: tuple[np.ndarray, np.ndarray, list[int]],
+              rules: Sequence[Rule]) -> Generator[Program, Solution, Shift]:
+    """Solve the step block by block of a Schur form: A = Z T Z', T block upper triangular.
+
+    The columns of ``(up A - down) Z`` that belong to a block are ``up_1 X + up_2 S - down_2``, with X free: without the
+    range of up_1, a small step in S.
+    """
+    triangle, basis, ends = blocks
+    up_z, down_z = up @ basis, down @ basis
+    t = np.zeros_like(triangle)
+    t[: ends[0], : ends[0]] = triangle[: ends[0], : ends[0]]
+    statuses, reasons = [], []
+    for first, last in zip(ends, ends[1:]):
+        own, before = slice(first, last), slice(0, first)
+        range_before = np.linalg.qr(up_z[:, before])[0]
+        outside = [part - range_before @ (range_before.T @ part) for part in (up_z[:, own], down_z[:, own])]
+        shift = yield from constrained_shift(*outside, rules)
+        if shift.a is None:
+            return replace(shift, bound=float(np.linalg.norm(up @ free - down)), least_squares=free)
+        t[own, own] = shift.a
+        t[before, own] = np.linalg.lstsq(up_z[:, before], down_z[:, own] - up_z[:, own] @ shift.a, rcond=None)[0]
+        statuses.append(shift.status)
+        reasons.append(shift.reason)
+    a, bound = basis @ t @ basis.T, float(np.linalg.norm(up @ free - down))
+    worst = next(((s, r) for s, r in zip(statuses, reasons) if s not in (Status.OPTIMAL, Status.LOCAL)),
+                 (Status.LOCAL, ""))
+    return _judged((float(np.linalg.norm(up @ a - down)), a, None), bound, free, *worst, rules,
+                   float(np.linalg.norm(down)))
+
+
+def _judged(best: tuple[float, np.ndarray, np.ndarray | None], bound: float, free: np.ndarray, status: Status,
+            reason: str, rules: Sequence[Rule], size: float) -> Shift:
     residual, a, p = best
     excess = residual - bound
     said = f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"
@@ -131,7 +193,11 @@ def _judged(best: tuple[float, np.ndarray, np.ndarray], bound: float, free: np.n
 
 
 def _disobeyed(a: np.ndarray, rules: Sequence[Rule]) -> list[str]:
-    poles = _Poles(np.linalg.eigvals(a))
+    return _disobeyed_by(np.linalg.eigvals(a), rules)
+
+
+def _disobeyed_by(values: np.ndarray, rules: Sequence[Rule]) -> list[str]:
+    poles = _Poles(values)
     checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
     return [sentence for check in checks if check is not None and (sentence := check(poles))]
 

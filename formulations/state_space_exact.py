@@ -67,7 +67,8 @@ def linear(
         data: the record. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
         criterion: "simulation" (output error, K = 0) or "prediction" (innovation form, K estimated).
-        block_rows: of the subspace fits to start from, one or several; None chooses three.
+        block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
+            may be estimated as in `formulations.hammerstein_ss.sid`.
         weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
             covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
             likelihood of Gaussian noise) for prediction.
@@ -164,7 +165,8 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
     nx = plan.order
     for rows in block_rows if block_rows is not None else _block_rows(plan):
         try:
-            evidence = yield from _quietly(identified(replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows)))
+            start = replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows, imputes=block_rows is None)
+            evidence = yield from _quietly(identified(start))
         except (RankError, StructureError, np.linalg.LinAlgError) as error:
             refusal = refusal or error
             continue

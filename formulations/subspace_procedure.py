@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from optid.solution import Solution, Status
 from optid.solving import Evidence, Procedure
 from optid.subspace.channels import check_channels
 from optid.subspace.expansion import Expansion, expand
+from optid.subspace.imputation import count_windows, impute
 from optid.subspace.innovations import model_innovations
 from optid.subspace.methods import (
     Projection,
@@ -49,13 +51,25 @@ BEST = "best"
 WEAK = 0.1
 """Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
 
+SCARCE, INTACT = 20, 0.8
+"""Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
+smaller share than this of all windows."""
+
 INSIDE = 0.999
 """Modulus to which poles outside the unit circle are brought by ``stability="auto"``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a method is asked for, of a record in its own units; see `planned`."""
+    """What a method is asked for, of a record in its own units; see `planned`.
+
+    Attributes named as arguments of `formulations.hammerstein_ss.sid` mean the same.
+
+    Attributes:
+        imputes: whether missing outputs may be estimated although ``block_rows`` is given.
+        units: from those of the record to those of the model.
+        records: (N, m + l) raw channels [u | y], one array per experiment.
+    """
 
     name: str
     data: Data
@@ -74,6 +88,7 @@ class Plan:
     split: str = "exact"
     stability: str = "auto"
     constraints: tuple[Any, ...] = ()
+    imputes: bool = False
     units: Transform | None = None
     records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
@@ -160,12 +175,13 @@ def identified(plan: Plan) -> Procedure:
         The model with singular values, condition of R11 and further figures.
     """
     expansion, alpha = prepared(plan)
-    records, instruments = plan.records, plan.instruments
-    if instruments.startswith("simulated"):
-        if expansion.q:
-            records, expansion = _simulated(plan, expansion, alpha)
-        else:
-            instruments = instruments.replace("simulated", "inputs")
+    records, imputed = plan.records, {}
+    if _lacks_windows(plan, expansion, alpha):
+        imputation = impute(plan.data, partial(_estimated, plan, expansion, alpha))
+        records, imputed = imputation.records, {"missing outputs": str(imputation)}
+        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {imputation}. The "
+                      "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
+    records, expansion, instruments = _instrumented(plan, records, expansion, alpha)
     projection = _projected(plan, records, expansion, alpha, instruments)
     nx, reason = _order(plan, projection, records, expansion)
     chosen = {}
@@ -173,7 +189,7 @@ def identified(plan: Plan) -> Procedure:
         projection, word = _best_weighting(plan, records, expansion, projection, nx)
         chosen = {"weighting": word}
     figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-               "windows": projection.statistics.windows, "instruments": instruments, **chosen,
+               "windows": projection.statistics.windows, **imputed, "instruments": instruments, **chosen,
                "singular values": projection.range.values,
                "condition of R11": projection.blocks.condition}
     if expansion.simulated:
@@ -265,6 +281,41 @@ def _block_rows(plan: Plan, expansion: Expansion) -> int:
     return alpha
 
 
+def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
+    """Whether missing outputs cost many of the windows, and those left are few for the rows of the Hankel matrix.
+
+    Block rows that were asked for stay: what is missing is then refused.
+    """
+    gaps = any(plan.data.missing[name] for name in plan.data.outputs)
+    if not gaps or plan.block_rows is not None and not plan.imputes:
+        return False
+    complete, candidates = count_windows(plan.records, 2 * alpha)
+    return complete < INTACT * candidates and complete < SCARCE * 2 * alpha * (expansion.p + expansion.q + expansion.l)
+
+
+def _instrumented(plan: Plan, records: list[np.ndarray], expansion: Expansion, alpha: int
+                  ) -> tuple[list[np.ndarray], Expansion, str]:
+    """Return the records, with simulated outputs where these are instruments, their signals, and the instruments."""
+    if not plan.instruments.startswith("simulated"):
+        return records, expansion, plan.instruments
+    if not expansion.q:
+        return records, expansion, plan.instruments.replace("simulated", "inputs")
+    return *_simulated(plan, records, expansion, alpha), plan.instruments
+
+
+def _estimated(plan: Plan, expansion: Expansion, alpha: int, records: list[np.ndarray]) -> HammersteinSS:
+    """Return the least-squares model with its noise model of records whose missing outputs are estimated."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
+        if expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last one is consistent
+            plan = replace(plan, instruments=f"{plan.instruments}+past")
+        records, expansion, instruments = _instrumented(plan, records, expansion, alpha)
+        projection = _projected(plan, records, expansion, alpha, instruments)
+        nx, _ = _order(plan, projection, records, expansion)
+        model = preliminary(plan, records, expansion, projection.gamma(nx), projection.scale)
+        return model_innovations(model, plan.data)[0]
+
+
 def _projected(plan: Plan, records: list[np.ndarray], expansion: Expansion, alpha: int, instruments: str
                ) -> Projection:
     return project(records, expansion, alpha, instruments=instruments, offset=plan.offset, form=plan.form,
@@ -284,7 +335,7 @@ def _best_weighting(plan: Plan, records: list[np.ndarray], expansion: Expansion,
         a, c, _ = scaled_pair(tried.gamma(nx), tried.scale)
         inside = _inside(a)
         form = _form(plan, records, expansion, inside, c, tried.scale)
-        error = observer_problem(records, form, instruments=False).problem.remainder
+        error = observer_problem(records, form, targets=_targets(plan)).problem.remainder
         found.append((inside is not a, error, word, tried))
     _, _, word, best = min(found, key=lambda one: one[:2])
     return best, f"{word}: the smallest error on the record"
@@ -325,16 +376,22 @@ def _step(plan: Plan, records: list[np.ndarray], expansion: Expansion, a: np.nda
     form = _form(plan, records, expansion, a, c, scale)
     # where past outputs may be instruments, the noise is white and least squares has the smaller variance
     coloured = expansion.simulated and not plan.instruments.endswith("past")
-    return observer_problem(records, form, instruments=coloured)
+    return observer_problem(records, form, instruments=coloured, targets=_targets(plan))
 
 
-def _simulated(plan: Plan, expansion: Expansion, alpha: int) -> tuple[list[np.ndarray], Expansion]:
+def _targets(plan: Plan) -> list[np.ndarray]:
+    """Return the measured outputs of every experiment."""
+    return [record[:, plan.data.m :] for record in plan.records]
+
+
+def _simulated(plan: Plan, raw: list[np.ndarray], expansion: Expansion, alpha: int
+               ) -> tuple[list[np.ndarray], Expansion]:
     """Return the records with outputs simulated by a preliminary model, and the expansion that reads them.
 
     Any preliminary model will do: what it simulates depends on the inputs alone. The first one has past outputs as
     instruments; where the regressors are singular then, it has no feedback.
     """
-    raw, model, records, kind = plan.records, expansion, plan.records, "inputs+past"
+    model, records, kind = expansion, raw, "inputs+past"
     for i in range(plan.iterations):
         try:
             projection = _projected(plan, records, model, alpha, kind)

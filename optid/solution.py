@@ -112,6 +112,7 @@ class Solution:
         iterations: as counted by the solver, -1 where it does not say.
         times: seconds per phase.
         claim: what the solver said, in our words; None where nothing was asked of one.
+        failed: name of the back end chosen first, which gave no usable answer; "" where it did.
     """
 
     status: Status
@@ -128,6 +129,7 @@ class Solution:
     iterations: int = -1
     times: Times = Times()
     claim: Status | None = None
+    failed: str = ""
 
     @property
     def has_point(self) -> bool:

@@ -1,13 +1,13 @@
 """Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, ask for a proof."""
 
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings, choose, find
+from optid.backends import Answer, BackEnd, Settings, choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.errors import SolverRefused, StructureError
 from optid.infeasibility import satisfiable
@@ -64,7 +64,45 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     clock = time.perf_counter()
     answer = _attempt(program, back_end, settings, separate)
     solved = time.perf_counter()
-    return _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
+    solution = _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
+    if chosen and solution.status is Status.FAILED and not options:
+        return _substitute(program, solution, settings, prove, separate)
+    if chosen and solution.status is Status.INACCURATE and not options:
+        return _sharpened(program, back_end, solution, settings, prove, separate)
+    return solution
+
+
+def _sharpened(program: Program, back_end: BackEnd, first: Solution, settings: Settings, prove: bool, separate: bool
+               ) -> Solution:
+    """Return what a hundredth of the tolerance gives where that satisfies our measurements, else the first answer."""
+    clock = time.perf_counter()
+    answer = _attempt(program, back_end, replace(settings, accuracy=settings.accuracy / 100), separate)
+    seconds = first.times.solve + time.perf_counter() - clock
+    again = _verdict(program, back_end, answer, first.chosen, settings, seconds, prove, separate)
+    return again if again.status in (Status.LOCAL, Status.OPTIMAL) else first
+
+
+def _substitute(program: Program, first: Solution, settings: Settings, prove: bool, separate: bool) -> Solution:
+    """Return the first usable answer of another back end of the class, or the failure of the one chosen."""
+    for back_end in fallbacks(program, first.solver):
+        clock = time.perf_counter()
+        answer = _attempt(program, back_end, settings, separate)
+        seconds = time.perf_counter() - clock
+        chosen = f"{back_end.name}: in place of {first.solver}"
+        solution = _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
+        if solution.has_point and solution.status is not Status.FAILED:
+            return replace(solution, failed=first.solver)
+    return first
+
+
+def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
+    """Say in one sentence how many programmes another back end than the one chosen first has solved."""
+    replaced = [solution for _, solution in steps if solution.failed]
+    if not replaced:
+        return {}
+    first, others = replaced[0].failed, ", ".join(dict.fromkeys(solution.solver for solution in replaced))
+    return {"solver fallback": f"{first} gave no usable answer for {len(replaced)} of {len(steps)} programmes, which "
+                               f"{others} solved"}
 
 
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
@@ -281,12 +319,12 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         settings: as in `solve`.
     """
     constrained: dict[str, tuple[Program, Solution]] = {}
+    steps: list[tuple[str, Solution]] = []
     if isinstance(problem, Program):
         solution = solve(problem, solver, **settings)
         model = problem.recover(solution.values) if solution.has_point else None
         constrained = dict.fromkeys(problem.user_constraints, (problem, solution))
         return Outcome(model, solution, problem, ((problem.name, solution),), constrained=constrained)
-    steps: list[tuple[str, Solution]] = []
     clock = time.perf_counter()
     program = next(problem)
     building = time.perf_counter() - clock
@@ -303,7 +341,8 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             building += time.perf_counter() - clock
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
-                return Outcome(found, solution, program, tuple(steps), constrained=constrained)
+                return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
             solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
                                reason=found.reason)
-            return Outcome(found.model, solution, program, tuple(steps), found.figures, constrained, True)
+            figures = {**found.figures, **_substitutions(steps)}
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True)

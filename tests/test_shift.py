@@ -1,9 +1,12 @@
 """The constrained shift step: poles where they were wanted, bounds that hold, and the true optimum by brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import formulations.shift
 import optid
 from formulations.pole_regions import damped, disc, sector, strip
 from formulations.shift import constrained_shift
@@ -122,6 +125,69 @@ def test_any_semidefinite_back_end_gives_the_same_matrix(solver):
     one, _ = solved(up, down, [stable(0.95)])
     other, _ = solved(up, down, [stable(0.95)], solver)
     assert other.residual == pytest.approx(one.residual, rel=2e-3)
+
+
+def spread_poles(n, outside, rng):
+    """A matrix with well separated pairs of poles, some of them outside the unit circle."""
+    sizes, angles = rng.uniform(0.4, 0.9, n // 2), np.linspace(0.2, 2.9, n // 2)
+    sizes[:outside] = rng.uniform(1.001, 1.02, outside)
+    matrix = np.zeros((n, n))
+    for i, (size, angle) in enumerate(zip(sizes, angles)):
+        turn = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        matrix[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = size * np.array(turn)
+    return matrix
+
+
+def posed_orders(outcome):
+    return {len(solution.values["P"]) for _, solution in outcome.steps if "P" in solution.values}
+
+
+@pytest.mark.parametrize(("n", "outside"), [(24, 2), (60, 7)])
+def test_of_a_large_order_only_the_poles_that_disobey_are_moved(n, outside):
+    """One programme for order 60 takes gigabytes and minutes."""
+    rng = np.random.default_rng(n)
+    up, down = observability(spread_poles(n, outside, rng), 28, 6, rng, 1e-4)
+    free = np.linalg.eigvals(np.linalg.lstsq(up, down, rcond=None)[0])
+    moved = np.abs(free) > 0.999
+    shift, outcome = solved(up, down, [stable(0.999)])
+    assert 2 * outside == moved.sum() and max(posed_orders(outcome)) <= 8
+    poles = np.linalg.eigvals(shift.a)
+    assert np.max(np.abs(poles)) <= 0.999
+    assert max(np.min(np.abs(poles - pole)) for pole in free[~moved]) < 1e-8
+    assert shift.status is Status.LOCAL and shift.certificate is None
+    assert shift.residual == pytest.approx(np.linalg.norm(up @ shift.a - down))
+    assert shift.least_squares == pytest.approx(np.linalg.lstsq(up, down, rcond=None)[0])
+    # moving the same poles radially, nothing else changed, costs more
+    values, vectors = np.linalg.eig(shift.least_squares)
+    radial = np.real((vectors * (values * np.minimum(1, 0.999 / np.abs(values)))) @ np.linalg.inv(vectors))
+    assert 0 < shift.suboptimality < np.linalg.norm(up @ radial - down) - shift.bound
+
+
+@pytest.mark.parametrize("rule", [stable(0.8), sector(1.2), disc(0.3, 0.6)], ids=lambda rule: rule.name)
+def test_a_deflated_step_is_nearly_as_good_as_the_whole(rule, monkeypatch):
+    ratios = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        up, down = observability(unstable(6, rng), 2, 10, rng, 0.02)
+        whole, _ = solved(up, down, [rule])
+        with monkeypatch.context() as patch:
+            patch.setattr(formulations.shift, "LARGEST", 3)
+            patch.setattr(formulations.shift, "AT_ONCE", 3)
+            deflated, _ = solved(up, down, [rule])
+        assert rule.verify(type("Model", (), {"poles": np.linalg.eigvals(deflated.a)})) == ""
+        assert deflated.bound == pytest.approx(whole.bound, rel=1e-12)
+        ratios.append(deflated.residual / whole.residual)
+    assert np.median(ratios) < 1.25
+
+
+def test_a_rule_about_all_poles_together_is_not_deflated(monkeypatch):
+    rng = np.random.default_rng(3)
+    up, down = observability(unstable(4, rng), 2, 10, rng, 0.02)
+    together = replace(stable(0.9), verify=lambda model: "too large" if len(model.poles) == 4 and np.max(
+        np.abs(model.poles)) > 0.9 else "")
+    monkeypatch.setattr(formulations.shift, "LARGEST", 2)
+    _, outcome = solved(up, down, [together])
+    assert posed_orders(outcome) == {4}
 
 
 def test_scales_of_the_states_do_not_matter():

@@ -12,8 +12,8 @@ import optid
 from formulations import shape
 from formulations.stability import central, stable
 from optid.errors import StructureError
-from optid.models import HammersteinARX
 from optid.limits import Limit
+from optid.models import HammersteinARX
 from optid.program import View
 
 

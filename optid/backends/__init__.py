@@ -5,7 +5,7 @@ entry-point group ``optid.backends``; the target is a `BackEnd` or a function th
 a claim: `optid.solving` measures the point and decides the status.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
@@ -178,6 +178,18 @@ def choose(program: Program) -> tuple[BackEnd, str]:
         if back_end is not None and back_end.installed and kind in back_end.classes:
             return back_end, f"{name}: class {kind}, {program.size} unknowns"
     raise StructureError(f"no installed back end accepts a programme of class {kind}; see `optid solvers`")
+
+
+FALLBACKS = ("daqp", "qoco", "highs", "cvxopt", "ipopt")
+"""Convex back ends that take over from one chosen automatically, in this order; IPOPT comes with optid."""
+
+
+def fallbacks(program: Program, failed: str) -> Iterator[BackEnd]:
+    """Yield the installed back ends that can solve a convex programme in place of one that gave no usable answer."""
+    for name in FALLBACKS if program.kind != "NLP" and failed in AUTO["convex"] else ():
+        back_end = back_ends().get(name)
+        if back_end is not None and back_end.installed and not back_end.refuses(program):
+            yield back_end
 
 
 def _listed(classes: frozenset[str]) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.bases.basis import Array
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
 from optid.models.roots import spectral_radius
@@ -48,19 +48,35 @@ def model_innovations(model: "HammersteinSS", data: "Data") -> tuple["Hammerstei
             runs = runs_of(~(np.isnan(e.u).any(axis=1) | np.isnan(e.y).any(axis=1)))
         stretches += [(e.u[start:stop], e.y[start:stop]) for start, stop in runs]
     try:
-        regression_lags([len(y) for _, y in stretches], *model.K.shape)
-        if any(data.missing[name] for name in data.inputs):
-            found = _of_stretches(model, stretches)
-        else:
-            from optid.noise import with_noise
-
-            found = with_noise(model, data)
-    except StructureError as reason:
+        found = _found(model, data, stretches)
+    except (StructureError, DataError) as reason:
         return model, f"none: {reason}"
+    except np.linalg.LinAlgError:
+        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
     spread = np.std(np.concatenate([y.T for _, y in stretches], axis=1), axis=1)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
         return model, "none: the prediction errors vanish, there is no noise to model"
     return found, ""
+
+
+def _found(model: "HammersteinSS", data: "Data", stretches: Sequence[tuple[Array, Array]]) -> "HammersteinSS":
+    """Return the model with the innovation form of complete stretches where inputs are missing, else by likelihood.
+
+    The likelihood takes single outputs: what counts there is their number, not how many follow each other.
+
+    Raises:
+        StructureError, DataError: too few for a noise model.
+    """
+    from optid.noise import with_noise
+
+    if any(data.missing[name] for name in data.inputs):
+        try:
+            regression_lags([len(y) for _, y in stretches], *model.K.shape)
+            return _of_stretches(model, stretches)
+        except StructureError:  # outputs are missing, too
+            pass
+    regression_lags([int(np.sum(~np.isnan(e.y)) // e.y.shape[1]) for e in data.experiments], *model.K.shape)
+    return with_noise(model, data)
 
 
 def _of_stretches(model: "HammersteinSS", stretches: Sequence[tuple[Array, Array]]) -> "HammersteinSS":

@@ -165,7 +165,8 @@ class ObserverProblem:
 
 
 def observer_problem(
-    records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK
+    records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
+    targets: Sequence[Array] | None = None
 ) -> ObserverProblem:
     """Compress the step.
 
@@ -175,6 +176,8 @@ def observer_problem(
         instruments: take the feedback functions of the simulated outputs as instruments for those of the measured ones
             (two-stage least squares); the expansion must contain both. For noise that is fed back and not white.
         chunk: samples whose regressors are formed at once.
+        targets: measured outputs (N, l), one per experiment, NaN = missing, where those of the records are partly
+            estimated: feedback and observer read the estimates, which are no equations.
 
     Raises:
         RankError: fewer equations than unknowns.
@@ -185,10 +188,10 @@ def observer_problem(
     root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, 0.0
     own = slice(form.experiments * form.n, total + 1)
     for e, record in enumerate(records):
-        y = record[:, regressors.y]
+        y = record[:, regressors.y] if targets is None else targets[e]
         candidates += y.size
-        for i, run in enumerate(_runs(record, regressors.needed)):
-            part, used, squares = regressors.compress(run)
+        for i, (start, stop) in enumerate(_runs(record, regressors.needed)):
+            part, used, squares = regressors.compress(record[start:stop], y[start:stop])
             rows += used
             energy += squares
             if i == 0:
@@ -216,10 +219,9 @@ def observer_problem(
     return ObserverProblem(form, problem, rows, candidates, bool(extra))
 
 
-def _runs(record: Array, needed: NDArray[np.bool_]) -> Iterator[Array]:
-    """Yield every stretch of samples in which the channels needed are complete."""
-    for start, stop in runs_of(~np.isnan(record[:, needed]).any(axis=1)):
-        yield record[start:stop]
+def _runs(record: Array, needed: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the first and last (exclusive) sample of every stretch in which the channels needed are complete."""
+    return runs_of(~np.isnan(record[:, needed]).any(axis=1))
 
 
 class _Regressors:
@@ -240,29 +242,29 @@ class _Regressors:
         if instruments:
             self.needed[x.m + x.l :] = True
 
-    def compress(self, run: Array) -> tuple[Array, int, float]:
+    def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
         """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy.
 
         Many rows enter by their Gram matrix, unless its condition would cost digits.
         """
         size = self.form.n + self.common + self.extra + 1
-        given = (self.form.weights * run[:, self.y])[~np.isnan(run[:, self.y])]
+        given = (self.form.weights * target)[~np.isnan(target)]
         root = np.zeros((size, size))
         if given.size > MANY * size:
-            root = root_of_gram(sum((rows.T @ rows for rows in self._weighted(run)), root), size - 1)
+            root = root_of_gram(sum((rows.T @ rows for rows in self._weighted(run, target)), root), size - 1)
         if not conditioning(root) <= CONDITION_LIMIT:
-            root = reduce(add_to_root, self._weighted(run), np.zeros((size, size)))
+            root = reduce(add_to_root, self._weighted(run, target), np.zeros((size, size)))
         return root, given.size, float(given @ given)
 
-    def _weighted(self, run: Array) -> Iterator[Array]:
+    def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
         """Yield the weighted rows of a run with their target, some samples of one output at a time."""
         from optid.subspace.kernels import adjoint_responses
 
         form = self.form
         inner, state = np.ascontiguousarray(form.a - form.gain @ form.c), None
         for start in range(0, len(run), self.chunk):
-            raw = run[start : start + self.chunk]
-            y, signals = raw[:, self.y], self._signals(raw)
+            raw, y = run[start : start + self.chunk], target[start : start + self.chunk]
+            signals = self._signals(raw)
             if state is None:
                 state = np.zeros((form.l, signals.shape[1], form.n))
                 state[:, 0] = form.c  # C_o F^k, the effect of x0
