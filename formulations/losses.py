@@ -3,6 +3,13 @@
 Each pass minimises a quadratic that touches the loss at the residuals of the pass before (majorise-minimise), so the
 loss never rises. For the convex formulations the weighted residuals of the last pass are a dual point, which gives a
 lower bound on the loss itself.
+
+A loss of the residuals bounds the influence of a disturbance, not that of a wrong reading of an output: as a past
+output it spoils the next ``na`` rows, in which it is a leverage point (Hampel et al., Robust Statistics, 1986, section
+6.1; Maronna, Martin and Yohai, Robust Statistics, 2006, section 8.4). Rows that hold a wild reading are therefore left
+out, as if it were missing: those that the examination of the record finds, and those that the residuals of a robust
+fit show. The fit names all of them among its findings and figures. The loss, its bound and the one-step fit are those
+of the rows that are left. ``loss="squares"`` leaves nothing out.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -56,6 +63,8 @@ def parse_loss(loss: str) -> tuple[str, float]:
 
 def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Program | Procedure:
     """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
+
+    The other losses leave out the rows that hold a wild reading of an output.
 
     Args:
         loss: see `parse_loss`.

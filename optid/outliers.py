@@ -1,15 +1,16 @@
 """Find isolated wild readings, in a record before it is fitted and by the residuals of a model.
 
 A reading is wild when it leaves the course of its channel by far more than the channel ever moves, and is back a few
-samples later: at most `LONGEST` of them in a row. More in a row are a step, which is a signal. What lies inside the
-scatter of the other readings is not wild, however it came about, and neither are heavy tails, which have no gap.
+samples later: at most `LONGEST` of them in a row. More in a row are a step, which is a signal. Readings inside the
+scatter of the others are not wild, and neither are those of a heavy tail without a gap. Pulses of one to three samples
+on a noisy channel cannot be distinguished from wild readings; on a channel at rest they count as the signal.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
-from scipy.special import fdtrc
+from scipy.special import fdtrc, ndtri
 
 from optid.bases.basis import Array
 
@@ -32,10 +33,10 @@ GAP = 1.2
 """Ratio at least of the smallest wild departure to the largest sound one, so that levels of a quantiser are no gap."""
 
 STEP = 1.5
-"""A wild departure exceeds this many times the steps between sound readings: a channel that switches so far is sound."""
+"""A wild departure is larger than a step between sound readings by this factor: a channel may switch to and fro."""
 
 SWITCHING = 0.25
-"""Number of such steps, relative to that of wild runs, from which a channel switches."""
+"""Larger steps, relative to the number of wild runs, from which on the channel switches and nothing is wild."""
 
 GAP_RISK, TAIL_RISK = 2e-3, 1e-4
 """Probability of as wide a gap, and of as heavy a tail, where the tail goes on as it began."""
@@ -43,14 +44,21 @@ GAP_RISK, TAIL_RISK = 2e-3, 1e-4
 FLATTEST = 0.1
 """Least steepness of a tail: that of a Gaussian one at 3 standard deviations, for signals that are bounded."""
 
+TRIED = 20
+"""Splits into wild and sound readings that are tried, those at the widest gaps."""
+
 TAIL = 0.05
 """Share of the departures that is the tail of any distribution."""
 
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
 
-CRITICAL = 4.0
-"""Standard deviations that a wild reading found by residuals has at least."""
+CHANCE = 1e-3
+"""Probability that residuals of Gaussian noise show a wild reading anywhere in the record."""
+
+
+TIE = 1e-9
+"""Where one row alone tells, a reading that is a past output there counts as wild, for its leverage; the output not."""
 
 
 def find_outliers(records: Sequence[Array]) -> list[np.ndarray]:
@@ -75,9 +83,9 @@ def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Arra
     """Return which readings (N, l) of every experiment are wild by the one-step residuals of an ARX model.
 
     An output read wrong by h leaves h in its own residual and h times the coefficients of A in the following ones; a
-    disturbance of the plant leaves its own residual alone. A reading is wild where the first explains the residuals
-    better than the second, and by more than `CRITICAL` standard deviations (Fox 1972; Chang, Tiao and Chen 1988). Of
-    neighbours within the lags only the likeliest is returned, so the search is repeated without it.
+    disturbance of the plant leaves a single one. A reading is wild where the first explains the residuals better than
+    a disturbance at any of these samples does, and chance does not (Fox 1972; Chang, Tiao and Chen 1988). Of
+    neighbours within the lags only the likeliest is returned, so the search is to be repeated without it.
 
     Args:
         residuals: (N, l) of every experiment, NaN where a row is not used.
@@ -85,10 +93,11 @@ def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Arra
         spread: (l,) robust standard deviations of the residuals.
     """
     signature = np.concatenate([np.eye(spread.size)[None], past]) / spread  # (na + 1, l outputs, l equations)
-    return [_additive(r / spread, signature) for r in residuals]
+    critical = -ndtri(CHANCE / (2 * max(sum(r.size for r in residuals), 1)))
+    return [_additive(r / spread, signature, critical) for r in residuals]
 
 
-def _additive(r: Array, signature: Array) -> np.ndarray:
+def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
     n, lags = len(r), len(signature)
     used = ~np.isnan(r[:, 0])
     padded = np.concatenate([np.where(used[:, None], r, 0.0), np.zeros((lags - 1, r.shape[1]))])
@@ -97,7 +106,9 @@ def _additive(r: Array, signature: Array) -> np.ndarray:
     power = sum(np.outer(weight[i : i + n], np.sum(part**2, axis=1)) for i, part in enumerate(signature))
     size = np.abs(drawn) / np.sqrt(np.where(power > 0, power, np.inf))
     peak = size >= maximum_filter1d(np.max(size, axis=1), 2 * lags - 1)[:, None]
-    return peak & (size > CRITICAL) & (size > np.abs(padded[:n]))
+    rival = np.max(np.abs(padded), axis=1)  # what a disturbance explains
+    later = np.max([rival[i : i + n] * (1 - TIE) for i in range(1, lags)] + [np.zeros(n)], axis=0)
+    return peak & (size > np.maximum(critical, np.maximum(rival[:n] * (1 + TIE), later))[:, None])
 
 
 def _departures(x: Array) -> Array:
@@ -149,7 +160,9 @@ def _splits(top: Array, n: int, below: int) -> np.ndarray:
     tries = k * (k + 1.0)  # the inverses of which add up to one
     wide = (fdtrc(2, 2 * below, k * gap / steepness) < GAP_RISK / tries) & (gap > np.log(GAP))
     heavy = fdtrc(2 * k, 2 * below, excess / (k * steepness)) < TAIL_RISK / tries
-    return k[(wide | heavy) & (top[k - 1] > FAR)][::-1]
+    likely = k[(wide | heavy) & (top[k - 1] > FAR)]
+    widest = likely[np.argsort(-gap[likely - 1])[:TRIED]]
+    return np.unique(np.concatenate([widest, likely[-1:]]))[::-1]
 
 
 def _isolated(x: Array, mask: np.ndarray, size: float) -> np.ndarray:
