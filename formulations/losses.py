@@ -88,7 +88,8 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
         program, problem = pose(used.weights)
     while True:
         unweighted, scale = problem.statistics, program.scale  # the weights of a pass are no unit of the data
-        weights, spread = None, 0.0
+        weights: list[np.ndarray] = []
+        spread = width = 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise
             solution: Solution = yield program
             if not solution.has_point:
@@ -160,7 +161,7 @@ class _Rows:
 
     def _touched(self, wild: np.ndarray) -> np.ndarray:
         """Tell the rows whose output, or one of its past outputs, is wild."""
-        rows = wild.any(axis=1)
+        rows = np.any(wild, axis=1, keepdims=True)[:, 0]
         return np.any([np.concatenate([np.zeros(i, dtype=bool), rows[: rows.size - i]])
                        for i in range(min(self._layout.na, rows.size) + 1)], axis=0)
 

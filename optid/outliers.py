@@ -135,7 +135,7 @@ def _beyond(d: Array, parts: Sequence[Array]) -> np.ndarray:
     if scale <= 8 * np.finfo(float).eps * max(float(np.max(np.abs(x), initial=0.0)) for x in parts):
         return none  # at rest but for pulses: they are the signal
     for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
-        size = top[k - 1] / STEP
+        size = float(top[k - 1]) / STEP
         found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], _edges(parts)))]
         steps = sum(int(np.count_nonzero(np.abs(np.diff(x[~mask])) > size)) for x, mask in zip(parts, found))
         runs = sum(int(np.count_nonzero(np.diff(mask.astype(np.int8), prepend=0) > 0)) for mask in found)
