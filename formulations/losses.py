@@ -3,18 +3,28 @@
 Each pass minimises a quadratic that touches the loss at the residuals of the pass before (majorise-minimise), so the
 loss never rises. For the convex formulations the weighted residuals of the last pass are a dual point, which gives a
 lower bound on the loss itself.
+
+A loss of the residuals bounds the influence of a disturbance, not that of a wrong reading of an output: as a past
+output it spoils the next ``na`` rows, in which it is a leverage point (Hampel et al., Robust Statistics, 1986, section
+6.1; Maronna, Martin and Yohai, Robust Statistics, 2006, section 8.4). Rows that hold a wild reading are therefore left
+out, as if it were missing: those that the examination of the record finds, and those that the residuals of a robust
+fit show. The fit names all of them among its findings and figures. The loss, its bound and the one-step fit are those
+of the rows that are left. ``loss="squares"`` leaves nothing out.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from formulations.equation_error import EquationError
 from optid.data import Data
+from optid.doctor import BY_RESIDUALS, EXAMINED, list_samples
 from optid.errors import StructureError, nearest
+from optid.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
 from optid.program import Program
-from optid.regressors import residuals
+from optid.regressors import Layout, Statistics, residuals
 from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
 from optid.streams import Stream
@@ -60,6 +70,8 @@ def degree(loss: str) -> int:
 def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Program | Procedure:
     """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
 
+    The other losses leave out the rows that hold a wild reading of an output.
+
     Args:
         loss: see `parse_loss`.
         data: the record.
@@ -77,35 +89,118 @@ def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Pr
 
 def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: bool) -> Procedure:
     program, problem = pose(None)
-    record = in_units(data, problem.units)
-    scale, unweighted = program.scale, problem.statistics  # the weights of a pass are no unit of the data
-    weights: list[np.ndarray] | None = None
-    spread = width = 0.0
-    final, best, gap = False, np.inf, np.inf
-    for step in range(PASSES):
-        solution: Solution = yield program
+    used = _Rows(in_units(data, problem.units), problem.layout)
+    if used.weights is not None:
+        program, problem = pose(used.weights)
+    while True:
+        unweighted, scale = problem.statistics, program.scale  # the weights of a pass are no unit of the data
+        weights: list[np.ndarray] = []
+        spread = width = 0.0
+        for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise
+            solution: Solution = yield program
+            if not solution.has_point:
+                return None
+            errors = used.residuals(problem, solution)
+            spread = max(float(np.nanmedian(np.concatenate(_sizes(errors)))) / NORMAL_MEDIAN, 1e-300)
+            width = spread * (1.0 if kind == "l1" else threshold)
+            start = dict(solution.values) if weights else program.start
+            weights = used.only(_weights(r, kind, width) for r in _sizes(errors))
+            program, problem = _weighted(pose, weights, start, scale, unweighted)
+        if not used.leave_out(errors, problem.regression(solution.values)):
+            break
+        program, problem = pose(used.weights)
+    best = gap = np.inf
+    final = width <= spread * threshold
+    for _ in range(PASSES):
+        solution = yield program
         if not solution.has_point:
             return None
-        sizes = _row_sizes(record, problem, solution)
-        if step < SETTLING:  # the scale settles before the loss is fixed; afterwards the objective cannot rise
-            spread = max(float(np.nanmedian(np.concatenate(sizes))) / 0.6745, 1e-300)
-            width = spread * (1.0 if kind == "l1" else threshold)
-        elif kind == "l1" and weights is not None and _steady(sizes, weights):
+        sizes = _sizes(used.residuals(problem, solution))
+        if kind == "l1" and _steady(sizes, weights):
             width = max(width / 3, spread * threshold)  # the kink sharpens as the rounded problem is solved
         found = _evidence(program, solution, sizes, weights, kind, width, convex)
         stalled = final and best - found.objective <= 1e-12 * max(abs(found.objective), 1e-300)
         now = relative_gap(found.objective, found.bound.value, scale * program.unit)
-        if (convex and step >= SETTLING and now <= CLOSED) or (stalled and not now < 0.9 * gap):
+        if (convex and now <= CLOSED) or (stalled and not now < 0.9 * gap):
             break
         best, gap = min(best, found.objective) if final else np.inf, now
-        final = step >= SETTLING and width <= spread * threshold
-        weights = [_weights(r, kind, width) for r in sizes]
-        program, problem = pose(weights)
-        # the answer of the pass before is the best start, and no proof belongs to a weighted pass
-        start = dict(solution.values) if step else program.start
-        program = replace(program, start=start, certify=None, scale=scale,
-                          compressed=replace(problem, unweighted=unweighted))
-    return found
+        final = width <= spread * threshold
+        weights = used.only(_weights(r, kind, width) for r in sizes)
+        program, problem = _weighted(pose, weights, dict(solution.values), scale, unweighted)
+    return replace(found, figures=used.figures(kind, problem.units.y_scale[0] * width))
+
+
+def _weighted(pose: Pose, weights: list[np.ndarray], start: Mapping[str, np.ndarray], scale: float,
+              unweighted: Statistics) -> tuple[Program, EquationError]:
+    """Pose a weighted pass: the answer before is the best start, and no proof belongs to it."""
+    program, problem = pose(weights)
+    compressed = replace(problem, unweighted=unweighted)
+    return replace(program, start=start, certify=None, scale=scale, compressed=compressed), problem
+
+
+class _Rows:
+    """The rows of a record without those that hold a wild reading of an output.
+
+    Such a reading spoils the row in which it is the output and, far worse, those in which it is a past output: their
+    leverage grows with it, so that no loss of the residuals alone bounds its influence. It is treated as missing.
+    """
+
+    def __init__(self, data: Data, layout: Layout) -> None:
+        self._data, self._layout = data, layout
+        self._wild = [np.zeros(e.y.shape, dtype=bool) for e in data.experiments]
+        for o in range(layout.l):
+            for wild, samples in zip(self._wild, find_outliers([e.y[:, o] for e in data.experiments])):
+                wild[samples, o] = True
+        self._examined = [wild.copy() for wild in self._wild]
+
+    @property
+    def weights(self) -> list[np.ndarray] | None:
+        """One for every row that counts, zero for the others; None where all of them count."""
+        return self.only(np.ones(len(wild)) for wild in self._wild) if self._count() else None
+
+    def only(self, weights: Iterable[np.ndarray]) -> list[np.ndarray]:
+        """Return weights with zeros in the rows that do not count."""
+        return [w * ~self._touched(wild) for w, wild in zip(weights, self._wild)]
+
+    def _count(self) -> int:
+        return sum(int(wild.sum()) for wild in self._wild)
+
+    def _touched(self, wild: np.ndarray) -> np.ndarray:
+        """Tell the rows whose output, or one of its past outputs, is wild."""
+        rows = np.any(wild, axis=1, keepdims=True)[:, 0]
+        return np.any([np.concatenate([np.zeros(i, dtype=bool), rows[: rows.size - i]])
+                       for i in range(min(self._layout.na, rows.size) + 1)], axis=0)
+
+    def residuals(self, problem: EquationError, solution: Solution) -> list[np.ndarray]:
+        """Return the one-step residuals (N, l), NaN in rows that do not count."""
+        errors = residuals(self._data, self._layout, problem.regression(solution.values))
+        for error, wild in zip(errors, self._wild):
+            error[self._touched(wild)] = np.nan
+        return errors
+
+    def leave_out(self, errors: list[np.ndarray], theta: np.ndarray) -> bool:
+        """Leave out the readings that are wild by these residuals; tell whether there are any."""
+        na, l = self._layout.na, self._layout.l  # noqa: E741
+        spread = np.nanmedian(np.abs(np.concatenate(errors)), axis=0) / NORMAL_MEDIAN
+        found = find_additive_outliers(errors, theta[: na * l].reshape(na, l, l), np.maximum(spread, 1e-300))
+        found = [new & ~wild & ~np.isnan(e.y) for new, wild, e in zip(found, self._wild, self._data.experiments)]
+        more = sum(int(new.sum()) for new in found)
+        if not 0 < more <= MOST * self._data.n_samples - self._count():
+            return False
+        for wild, new in zip(self._wild, found):
+            wild |= new
+        return True
+
+    def figures(self, kind: str, width: float) -> dict[str, Any]:
+        """Return what the fit prints: the threshold of the loss, and the readings left out by where they were found."""
+        found: dict[str, Any] = {"threshold of the loss": width} if kind == "huber" else {}
+        by_residuals = [wild & ~known for wild, known in zip(self._wild, self._examined)]
+        for o, name in enumerate(self._layout.outputs):
+            for word, masks in ((EXAMINED, self._examined), (BY_RESIDUALS, by_residuals)):
+                samples = [np.flatnonzero(mask[:, o]) for mask in masks]
+                if any(part.size for part in samples):
+                    found[f"{word} of {name}"] = list_samples(samples)
+        return found
 
 
 def _steady(sizes: list[np.ndarray], weights: list[np.ndarray]) -> bool:
@@ -113,10 +208,9 @@ def _steady(sizes: list[np.ndarray], weights: list[np.ndarray]) -> bool:
     return all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.03 for w, r in zip(weights, sizes))
 
 
-def _row_sizes(data: Data, problem: EquationError, solution: Solution) -> list[np.ndarray]:
-    """Euclidean size of the residual of every row (over the outputs), NaN where a row is not used."""
-    theta = problem.regression(solution.values)
-    return [np.sqrt(np.sum(r * r, axis=1)) for r in residuals(data, problem.layout, theta)]
+def _sizes(errors: list[np.ndarray]) -> list[np.ndarray]:
+    """Euclidean size of the residual of every row (over the outputs), NaN where a row does not count."""
+    return [np.sqrt(np.sum(r * r, axis=1)) for r in errors]
 
 
 def _loss(sizes: np.ndarray, kind: str, width: float) -> float:

@@ -11,9 +11,12 @@ from optid.bases.basis import Basis
 from optid.data import Data
 from optid.errors import DataError, DataWarning
 from optid.experiment.rules import Check, check_condition, check_instruments, check_levels, check_lines
+from optid.outliers import find_outliers
 
-OUTLIER = 10.0  # robust standard deviations
 LEAST_KEPT = 0.5
+NAMED = 5  # samples that a finding names
+EXAMINED = "wild readings"  # of the figures of a fit with a robust loss
+BY_RESIDUALS = "readings wild by their residuals"
 BLOCK_ROWS = 10  # of a subspace method that chooses them itself
 
 
@@ -42,7 +45,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         forced = arguments.get("tolerance") is not None
         found += _lines(name, [e.u[:, c] for e in data.experiments], basis, _lags(arguments, c), forced)
         found += _range(name, u, basis)
-        found += _outliers("input", name, u)
+        found += _outliers("input", name, [e.u[:, c] for e in data.experiments], arguments)
     for o, name in enumerate(data.outputs):
         y = np.concatenate([e.y[:, o] for e in data.experiments])
         y = y[~np.isnan(y)]
@@ -50,7 +53,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
             raise DataError(f"output {name!r} has no sample at all; choose another column or drop the output")
         if np.ptp(y) == 0:
             raise DataError(f"output {name!r} is constant ({y[0]:g}): there is nothing to explain; check the column")
-        found += _outliers("output", name, y)
+        found += _outliers("output", name, [e.y[:, o] for e in data.experiments], arguments)
         found += _units(name, y)
     return _warned(found)
 
@@ -111,20 +114,38 @@ def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:
             f"basis; there the basis is set to {basis.outside!r}"]
 
 
-def _outliers(role: str, name: str, x: np.ndarray) -> list[str]:
-    if x.size < 50:
+def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Mapping[str, Any]) -> list[str]:
+    found = find_outliers(records)
+    count = sum(part.size for part in found)
+    if not count:
         return []
-    step = max(1, x.size // 20_000)  # the quartiles of a long record need no more samples
-    low, middle, high = np.percentile(x[::step], [25, 50, 75])
-    spread = (high - low) / 1.349
-    if spread <= 0:
-        return []
-    count = int(np.count_nonzero(np.abs(x - middle) > OUTLIER * spread))
-    if not 0 < count <= 0.01 * x.size:
-        return []  # heavy tails are the signal itself, not outliers
-    advice = "consider loss='huber'" if role == "output" else "check the record"
-    return [f"{count} samples of {role} {name!r} lie more than {OUTLIER:g} robust standard deviations from the median; "
-            f"{advice}"]
+    loss = str(arguments.get("loss", "")).partition(":")[0]
+    advice = f"mark {'it' if count == 1 else 'them'} as missing (NaN)"
+    if role == "output" and loss in ("huber", "l1"):
+        advice = f"loss={loss!r} leaves out every row that holds one, as output or as past output"
+    elif role == "output" and loss:
+        advice += ", or use loss='huber', which leaves out every row that holds one"
+    else:
+        advice = f"check the record and {advice}"
+    return [f"{_counted(count)} of {role} {name!r} ({list_samples(found)}) "
+            f"{'is' if count == 1 else 'are'} wild, isolated and far off the others: {advice}"]
+
+
+def _counted(count: int) -> str:
+    return "1 reading" if count == 1 else f"{count} readings"
+
+
+def list_samples(found: Sequence[np.ndarray]) -> str:
+    """Name the first samples of every experiment, as in "samples 3, 17, 40 and 5 more"."""
+    places = [f"{k} of experiment {e + 1}" if len(found) > 1 else str(k) for e, part in enumerate(found) for k in part]
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return f"{'sample' if len(places) == 1 else 'samples'} {', '.join(places[:NAMED])}{more}"
+
+
+def examine_residuals(figures: Mapping[str, Any]) -> list[str]:
+    """Say which readings a robust loss has left out because their residuals show that they are wild."""
+    return _warned([f"{key}, {samples}, were left out with every row that holds one"
+                    for key, samples in figures.items() if key.startswith(BY_RESIDUALS)])
 
 
 def _units(name: str, y: np.ndarray) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from optid.bases import Linear, fitted_bases
 from optid.data import Data
-from optid.doctor import examine, examine_instruments, examine_rows
+from optid.doctor import examine, examine_instruments, examine_residuals, examine_rows
 from optid.errors import (
     DataError,
     DataWarning,
@@ -229,6 +229,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
         findings = findings + examine_rows(statistics.rows, statistics.candidates, statistics.condition)
     if "condition of R11" in figures:
         findings = findings + examine_instruments(figures["condition of R11"])
+    findings = findings + examine_residuals(figures)
     return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),

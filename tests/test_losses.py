@@ -9,15 +9,15 @@ from systems import by_hand
 import optid
 from formulations import losses
 from optid.bases import Linear
-from optid.errors import StructureError
+from optid.errors import DataWarning, StructureError
 
 
 def soiled():
-    """A record with gross errors in some outputs."""
-    data = record(noise=0.3, count=200, seed=1)
-    y = data.y.copy()
-    y[::17] += 4
-    return optid.Data(u=data.u, y=y)
+    """A record of a plant that is disturbed grossly in some samples; its outputs are read right."""
+    rng = np.random.default_rng(3)
+    u, noise = rng.uniform(-1, 1, (200, 1)), 0.3 * rng.standard_normal((200, 1))
+    noise[::17] += 4
+    return optid.Data(u=u, y=by_hand(plant(), u, noise=noise))
 
 
 def threshold(fit, kind, number):
@@ -125,3 +125,69 @@ def test_without_outliers_a_wide_huber_is_least_squares():
 def test_unknown_losses(loss, words):
     with pytest.raises(StructureError, match=words):
         losses.parse_loss(loss)
+
+
+CONTAMINATED = [("hammerstein_arx.exact", 1.0, False), ("hammerstein_arx.exact", 1e-6, True),
+                ("hammerstein_arx.overparametrised", 1e6, True), ("arx", 1.0, True)]
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+@pytest.mark.parametrize("formulation, unit, both_signs", CONTAMINATED)
+@pytest.mark.parametrize("loss", ["huber", "l1"])
+def test_outputs_read_wrong_cost_no_more_than_two_points(formulation, unit, both_signs, loss, monkeypatch):
+    monkeypatch.setattr(losses, "PASSES", 15)
+    structure = {"na": 2, "nb": 2} if formulation == "arx" else {"na": 2, "nb": 2, "basis": BASIS}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        pair = rng.uniform(0.3, 0.85) * np.exp(1j * rng.uniform(0.3, 2))
+        true = plant(a=np.poly([pair, pair.conj()]).real[1:], b=rng.normal(size=2))
+        clean, new = (record(0, 500, 0.1, seed=100 * seed + i, model=true) for i in range(2))
+        y = clean.y.copy()
+        places = rng.choice(500, 8, replace=False)
+        y[places, 0] += 50 * (rng.choice([-1, 1], 8) if both_signs else 1)
+        fits = []
+        for part, word in ((clean.y, "squares"), (y, loss)):
+            read = optid.Data(u=clean.u, y=unit * part)
+            model = optid.fit(read, formulation, loss=word, prove=False, **structure).model
+            for shown in (model.predict(optid.Data(u=new.u, y=unit * new.y))[4:], model.simulate(new.u)[4:]):
+                misfit = unit * new.y[4:] - shown.reshape(-1, 1)
+                fits.append(100 * (1 - np.linalg.norm(misfit) / np.linalg.norm(unit * (new.y - new.y.mean()))))
+        assert fits[2] > fits[0] - 2 and fits[3] > fits[1] - 2, (seed, fits)
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+def test_readings_left_out_are_named_and_squares_keeps_them():
+    data = record(noise=0.3, count=400, seed=2)
+    y = data.y.copy()
+    y[[40, 90, 91, 250]] += 60
+    y[300] += 4  # within the scatter of the output, far outside that of the residuals
+    wild = optid.Data(u=data.u, y=y)
+    plain = optid.fit(wild, na=2, nb=2, basis=BASIS)
+    robust = optid.fit(wild, na=2, nb=2, basis=BASIS, loss="huber")
+    assert plain.figures["rows"] == 398 and "marked" not in plain.findings[0] and "NaN" in plain.findings[0]
+    assert robust.figures["rows"] == 398 - 3 - 4 - 3 - 3
+    assert robust.figures["wild readings of y"] == "samples 40, 90, 91, 250"
+    assert robust.findings[0].endswith("leaves out every row that holds one, as output or as past output")
+    assert robust.findings[1].startswith("readings wild by their residuals of y, sample 300, were left out")
+
+
+def test_a_disturbance_of_the_plant_is_no_wrong_reading():
+    rng, true = np.random.default_rng(4), plant()
+    noise = 0.1 * rng.normal(size=(400, 1))
+    noise[rng.choice(400, 12, replace=False)] += 2
+    u = rng.uniform(-1, 1, (400, 1))
+    fit = optid.fit(optid.Data(u=u, y=by_hand(true, u, noise=noise)), na=2, nb=2, basis=BASIS, loss="huber")
+    assert fit.findings == () and fit.figures["rows"] == 398
+
+
+def test_several_outputs_leave_out_the_rows_of_each():
+    rng = np.random.default_rng(5)
+    u = rng.uniform(-1, 1, (600, 1))
+    first, second = (by_hand(plant(gain), u, noise=0.1 * rng.normal(size=(600, 1))) for gain in (1.0, -0.5))
+    y = np.hstack([first, second])
+    y[[50, 300], 0] = 999
+    y[[77, 301], 1] = -999
+    with pytest.warns(DataWarning, match="leaves out every row"):
+        fit = optid.fit(optid.Data(u=u, y=y), "arx", na=2, nb=2, loss="huber")
+    assert fit.figures["rows"] == 598 - 3 - 3 - 4
+    assert fit.figures["wild readings of y2"] == "samples 77, 301"
