@@ -117,7 +117,8 @@ def positive_real(margin: float = 0.0) -> Rule:
         p = view.auxiliary("P of positive_real", (n, n), symmetric=True)
         corner = b - a @ p @ c.T
         lmi = cp.bmat([[p - a @ p @ a.T, corner], [corner.T, d + d.T - c @ p @ c.T - 2 * margin * np.eye(l)]])
-        return [lmi - REAL * np.linalg.norm(c) * np.eye(n + l) >> 0]
+        lowered = np.diag(np.repeat([0.0, 2.0], [n, l])).ravel()
+        return [Limit(lmi - REAL * np.linalg.norm(c) * np.eye(n + l) >> 0, lowered)]
 
     return Rule("positive_real" + (f":{margin:g}" if margin else ""), build)
 

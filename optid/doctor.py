@@ -14,6 +14,7 @@ from optid.experiment.rules import Check, check_condition, check_instruments, ch
 from optid.outliers import find_outliers
 
 LEAST_KEPT = 0.5
+FEW_DIGITS = 8.0  # beside the level of an output
 NAMED = 5  # samples that a finding names
 EXAMINED = "wild readings"  # of the figures of a fit with a robust loss
 BY_RESIDUALS = "readings wild by their residuals"
@@ -54,7 +55,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         if np.ptp(y) == 0:
             raise DataError(f"output {name!r} is constant ({y[0]:g}): there is nothing to explain; check the column")
         found += _outliers("output", name, [e.y[:, o] for e in data.experiments], arguments)
-        found += _units(name, y)
+        found += _digits(name, y)
     return _warned(found)
 
 
@@ -148,15 +149,14 @@ def examine_residuals(figures: Mapping[str, Any]) -> list[str]:
                     for key, samples in figures.items() if key.startswith(BY_RESIDUALS)])
 
 
-def _units(name: str, y: np.ndarray) -> list[str]:
-    size, offset = float(np.std(y)), abs(float(np.mean(y)))
-    if offset > 1e5 * size:
-        return [f"output {name!r} varies by {size:.1e} around {offset:.1e}: its digits are spent on the mean; "
-                "use data.detrend()"]
-    if not 1e-9 < size < 1e9:
-        return [f"output {name!r} has a standard deviation of {size:.1e}; state it in a more suitable unit "
-                "or use data.scale()"]
-    return []
+def _digits(name: str, y: np.ndarray) -> list[str]:
+    """Say how many digits the samples have left beside their level, once these are few."""
+    size, level = float(np.std(y)), abs(float(np.mean(y)))
+    digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
+    if digits >= FEW_DIGITS:
+        return []
+    return [f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal digits of its "
+            "variation: no result is more accurate; record it about its level"]
 
 
 def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:

@@ -24,7 +24,8 @@ class Limit:
 
     Attributes:
         member: the constraint as the user wrote it.
-        shift: by how much every row moves per unit of the bound: a number or an expression.
+        shift: by how much every row moves per unit of the bound: a number or an expression; for a cone an array,
+            flat, or a number where that is not known.
         bound: name of the bound; rows of one name move together. None: every row has a bound of its own.
         band: (rows, entries) for an equality that stands for ``|rows @ x| <= t`` with t = 0: the rows.
         span: (independent rows, entries) the equalities that the constraint poses in their place.
@@ -90,7 +91,8 @@ def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.
         part = multipliers[position : position + length]
         position += length
         if not isinstance(limit.member, EQUALITIES | INEQUALITIES):
-            totals[number] = float(np.max(np.abs(part), initial=0.0)), number
+            known = isinstance(limit.shift, np.ndarray)
+            totals[number] = float(part @ limit.shift if known else np.max(np.abs(part), initial=0.0)), number
             continue
         part = part / limit.sizes
         if limit.band is not None and limit.span is not None:

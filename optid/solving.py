@@ -19,6 +19,7 @@ from optid.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, 
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
 CONFLICT = "the constraints contradict each other"
 NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
 
@@ -242,8 +243,23 @@ def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judg
             lower = point.objective - 1e-10 * abs(point.objective)
             if again.objective < lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
                 bound, _ = program.certify(program, again.values, again.duals)
-                return again, bound
+                point = again
         program.assign(point.values)
+    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
+        wider = replace(settings, options={**back_end.thorough, **settings.options})
+        point, bound = _better(program, back_end, wider, point, bound, separate)
+    return point, bound
+
+
+def _better(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound, separate: bool
+            ) -> tuple[_Judged, Bound]:
+    """Search further for a local optimum that lies lower, and certify it."""
+    answer = _attempt(program, back_end, settings, separate)
+    again = _judged(program, answer) if answer.values else point
+    lower = again.objective < point.objective - 1e-10 * abs(point.objective)
+    if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9) and program.certify is not None:
+        return again, program.certify(program, again.values, again.duals)[0]
+    program.assign(point.values)
     return point, bound
 
 

@@ -25,12 +25,6 @@ HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", 
            "static")
 """Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""
 
-DIGITS = 15.65
-"""Decimal digits of a double."""
-
-FEW = 6.0
-"""Digits of the variation of an output below which its level is worth a word."""
-
 
 def own_units(data: "Data | Stream", linear: Sequence[bool] = (), centred: bool = True) -> Transform:
     """Return the units in which outputs, and inputs that act linearly, have mean zero and variance one.
@@ -95,16 +89,6 @@ def inverse(units: Transform) -> Transform:
 def energy_unit(units: Transform) -> float:
     """Return what one squared unit of the outputs is in squared units of the record."""
     return units.y_scale[0] ** 2
-
-
-def digits_left(data: Any, units: Transform) -> list[tuple[str, float]]:
-    """Return (output, decimal digits of its variation) of the outputs whose level leaves them few."""
-    found = []
-    for name, level in zip(data.outputs, units.y_offset):
-        digits = DIGITS - np.log10(max(abs(level) / units.y_scale[0], 1.0))
-        if digits < FEW:
-            found.append((name, float(digits)))
-    return found
 
 
 def outward(expressions: Mapping[str, Any], kind: str, units: Transform, inputs: Sequence[str]) -> dict[str, Any]:

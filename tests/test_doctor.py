@@ -74,12 +74,16 @@ def test_outliers_are_counted_and_heavy_tails_are_not():
 
 
 @pytest.mark.parametrize("y, words", [
-    (1e7 + Y, "digits are spent on the mean; use data.detrend"),
-    (1e-12 * Y, "standard deviation of .*data.scale"),
+    (1e9 + Y, "leaves 6.* decimal digits"),
+    (1e-6 * (3e9 - Y), "leaves 6.* decimal digits"),
 ])
-def test_units_that_cost_digits(y, words):
+def test_levels_that_cost_digits(y, words):
     with pytest.warns(DataWarning, match=words):
         examined(y=y)
+
+
+def test_units_cost_nothing():
+    assert examined(y=1e-12 * Y) == examined(y=1e12 * Y) == examined(y=1e6 + Y) == []
 
 
 def test_a_constant_output_is_an_error():

@@ -73,6 +73,7 @@ class BackEnd:
         pip: what to install where it cannot.
         duals: whether it returns multipliers.
         warm: whether it can start from a given point.
+        thorough: options with which it searches further for a better local optimum, for where the proof fails.
         about: one line for the table of solvers.
         broken: why its entry point cannot be loaded, "" where it can.
     """
@@ -84,6 +85,7 @@ class BackEnd:
     pip: str = ""
     duals: bool = True
     warm: bool = False
+    thorough: Mapping[str, Any] = field(default_factory=dict)
     about: str = ""
     broken: str = ""
 

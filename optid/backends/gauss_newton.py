@@ -23,14 +23,16 @@ from optid.rank_one.bilinear import minimise, starts
 from optid.solution import Status
 
 STEPS = 100
-CANDIDATES = 4  # different directions b that are tried, each with both signs, before the full steps
+DIRECTIONS = 4  # different directions b that are tried, each with both signs, before the full steps
+DESCENTS = 2  # how many of these are followed to the end
 
 
 def run(program: Program, settings: Settings) -> Answer:
     """Solve a programme that carries a `RankOneForm`.
 
     Options: ``inner`` (conic back end of the step QPs, default clarabel), ``starts`` (number of starts, default 8),
-    ``seed`` of the random ones.
+    ``seed`` of the random ones; under constraints ``directions`` (different b that are settled first, default 4) and
+    ``descents`` (how many of these are then followed to their end, default 2).
     """
     form = program.rank_one
     if form is None:
@@ -39,7 +41,8 @@ def run(program: Program, settings: Settings) -> Answer:
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
     if not program.user_constraints:
         return _unconstrained(program, form, count, seed)
-    return _Constrained(program, form, settings, str(options.get("inner", "clarabel"))).solve(count, seed)
+    whole = _Constrained(program, form, settings, str(options.get("inner", "clarabel")))
+    return whole.solve(count, seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
 
 
 def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
@@ -89,34 +92,39 @@ class _Constrained:
         sizes = self.at.sizes(self.at.pack(to_values(program, form, point)))
         self.half, self.full = StepQP(self.at, sizes, pinned=True), StepQP(self.at, sizes, pinned=False)
 
-    def solve(self, count: int, seed: int) -> Answer:
+    def solve(self, count: int, seed: int, directions: int, descents: int) -> Answer:
         free = minimise(self.problem, count=count, seed=seed).point
         idle = self._idle(free)
         if idle is not None:
             return idle
-        points = self._candidates(free, seed)
+        points = self._candidates(free, seed, directions)
         tried = [t for t in map(self._settle, points) if t is not None]
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
             return self._no_start()
         tried.sort(key=lambda pair: pair[0])
-        first = tried[0][1]
-        other = [x for _, x in tried[1:] if not np.allclose(self._lift(x), self._lift(first), 1e-3, 1e-6)]
-        ends = [self._iterate(x) for x in [first, *other[:1]]]
-        return min(ends, key=lambda end: end[0])[1]
+        distinct: list[np.ndarray] = []
+        for _, x in tried:
+            if not any(np.allclose(self._lift(x), self._lift(kept), 1e-3, 1e-6) for kept in distinct):
+                distinct.append(x)
+        return min((self._iterate(x) for x in distinct[:descents]), key=lambda end: end[0])[1]
 
-    def _candidates(self, free: Point, seed: int) -> list[Point]:
+    def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
         core = reduce(self.problem)
         points = [start_point(self.form, self.program.start)] if self.program.start else []
-        points += [free, *(core.point(*pair) for pair in starts(core, count=CANDIDATES, seed=seed))]
+        points += [free, *(core.point(*pair) for pair in starts(core, count=DIRECTIONS, seed=seed))]
+        if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
+            points += [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
+                       for i, b in enumerate(free.bs) for axis in np.eye(b.size)]
+            points += [core.point(*pair) for pair in starts(core, count=most, seed=seed)[DIRECTIONS:]]
         distinct: list[Point] = []
         for point in points:
             directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
             if not any(all(abs(float(d @ e)) > 0.999 for d, e in zip(directions, kept.bs)) for kept in distinct):
                 distinct.append(Point(point.w, point.mus, tuple(directions)))
-        return [signed for point in distinct[:CANDIDATES] for signed in _signed(point)]
+        return [signed for point in distinct[:most] for signed in _signed(point)]
 
     def _idle(self, free: Point) -> Answer | None:
         """The unconstrained solution, where it happens to satisfy every constraint with one of its signs."""
@@ -275,5 +283,6 @@ def _distance(z: np.ndarray, reached: np.ndarray) -> float:
 
 
 back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
+                   thorough={"starts": 32, "directions": 16, "descents": 12},
                    about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints")
 

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 CONDITION_LIMIT = 1e7
 """Condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left."""
 
+LEAST_REMAINDER = 1e-6
+"""Share of an output that least squares leaves, below which its difference of sums has too few digits left."""
+
 RETAINED = 1 << 23
 """Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
 long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
@@ -92,6 +95,14 @@ class Statistics:
         n = self.layout.n_columns
         return conditioning(self._triangle[:n, :n])
 
+    @cached_property
+    def remainder(self) -> float:
+        """Sum of squares that least squares leaves of an output, as a share of the output; the smallest of them."""
+        n = self.layout.n_columns
+        energy = np.sum(self._triangle[:, n:] ** 2, axis=0)
+        rest = np.sum(self._triangle[n:, n:] ** 2, axis=0)
+        return float(np.min(np.where(energy > 0, rest / np.maximum(energy, np.finfo(float).tiny), 1.0)))
+
     def check(self) -> None:
         """Refuse a record that does not determine the parameters.
 
@@ -144,7 +155,8 @@ def collect(
         layout: the columns.
         weights: one array (N,) per experiment, weight >= 0 of the row of each sample; None for ones. Not for streams.
         method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next rows, slower and
-            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7.
+            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or what no
+            parameter explains is a share of the outputs that rounding reaches.
             `Statistics.method` says which it was.
         chunk: samples evaluated at a time.
         threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
@@ -166,7 +178,7 @@ def collect(
         return statistics
     statistics = accumulate(data, layout, weights, chunk, threads)
     statistics.check()
-    if method == "auto" and statistics.condition > CONDITION_LIMIT:
+    if method == "auto" and (statistics.condition > CONDITION_LIMIT or statistics.remainder < LEAST_REMAINDER):
         statistics = factorise(data, layout, weights, chunk)
         _ = statistics.root  # refuses dependent columns by name
     return statistics
