@@ -30,7 +30,7 @@ from optid.rank_one import reduce
 from optid.rank_one.bilinear import starts
 from optid.rank_one.whitening import leading_pair
 from optid.subspace.observer import ObserverProblem
-from optid.units import outer_bases
+from optid.units import energy_unit, outer_bases
 
 RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
@@ -147,7 +147,8 @@ def realisation_programme(
         linear["offset"] = cp.Variable(form.l, name="offset")
     pose = _factored if realisation.factored else _lumped
     program = pose(realisation, name, linear)
-    return realisation, replace(program.subject_to(*constraints), recover=realisation.factors)
+    unit = 1.0 if units is None else energy_unit(units)
+    return realisation, replace(program.subject_to(*constraints), recover=realisation.factors, unit=unit)
 
 
 def _factored(realisation: Realisation, name: str, linear: Mapping[str, cp.Variable]) -> Program:

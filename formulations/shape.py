@@ -54,12 +54,12 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
 
 def convex(channel: str | None = None) -> Rule:
     """The nonlinearity is convex over the interval of its basis."""
-    return _cone("convex", "", channel, lambda basis: basis.curvature(), power=2)
+    return _cone("convex", "", channel, lambda basis: basis.curvature(), heights=False)
 
 
 def concave(channel: str | None = None) -> Rule:
     """The nonlinearity is concave over the interval of its basis."""
-    return _cone("concave", "", channel, lambda basis: -basis.curvature(), power=2)
+    return _cone("concave", "", channel, lambda basis: -basis.curvature(), heights=False)
 
 
 def odd(channel: str | None = None) -> Rule:
@@ -264,8 +264,9 @@ def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list
     return [member for part in parts for member in (part if isinstance(part, list) else [part])]
 
 
-def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], power: int = 0) -> Rule:
-    words = RANGE if power == 0 else f"{RANGE} over the squared width of its interval"
+def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
+          ) -> Rule:
+    """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
 
     def build(view: View, one: str) -> Any:
         basis = basis_of(view, one)
@@ -275,8 +276,8 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
         else:
             outputs = view.outputs if view.kind == "realisation" else (None,)
             coefficients = [static_theta(view, one, output) for output in outputs or (None,)]
-        return [Limit(matrix @ each >= 0, bound=one, step=_range_of(basis, each, power=power), words=words)
-                for each in coefficients]
+        return [Limit(matrix @ each >= 0, bound=one, step=_range_of(basis, each) if heights else None,
+                      words=RANGE if heights else "") for each in coefficients]
 
     return Rule(_label(f"{word}:{direction}" if direction else word, channel),
                 lambda view: _every(view, channel, lambda one: build(view, one)))

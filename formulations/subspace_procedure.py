@@ -190,7 +190,7 @@ def identified(plan: Plan) -> Procedure:
         chosen = {"weighting": word}
     figures = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
                "windows": projection.statistics.windows, **imputed, "instruments": instruments, **chosen,
-               "singular values": projection.range.values,
+               "singular values": _height(plan) * projection.range.values,
                "condition of R11": projection.blocks.condition}
     if expansion.simulated:
         share, output = weakest_feedback(projection, expansion)
@@ -202,6 +202,11 @@ def identified(plan: Plan) -> Procedure:
     if projection.blocks.discarded:
         figures["regressor directions left out"] = projection.blocks.discarded
     return (yield from completed(plan, records, expansion, projection.gamma(nx), projection.scale, figures))
+
+
+def _height(plan: Plan) -> float:
+    """Unit of the singular values: that of the outputs, unless their weighting takes it away."""
+    return 1.0 if plan.units is None or plan.weighting == "cva" else plan.units.y_scale[0]
 
 
 def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma: np.ndarray, scale: np.ndarray,
@@ -251,7 +256,9 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     if remark:
         figures["noise model"] = remark
     status, reason = (Status.INACCURATE, doubt) if doubt else (_status(solution), solution.reason)
-    bound = simulation_bound(plan.records, step, solution.objective, len(gamma) // data.l, _said(solution))
+    bound = simulation_bound(plan.records, step, solution.objective / program.unit, len(gamma) // data.l,
+                             _said(solution))
+    bound = replace(bound, value=program.unit * bound.value)
     return Evidence(model, solution.objective, bound, status, reason, figures)
 
 

@@ -105,7 +105,8 @@ class LocalEstimate:
         low, high = np.quantile(posterior, tails, axis=1) - np.std(posterior, axis=1) / spread * missed
         down, up = np.quantile(scattered, tails, axis=1) - np.std(scattered, axis=1) / spread * missed
         wide = error**2 * (self.dof / (self.dof - 2) if self.dof > 2 else 1.0)  # variance of the draws
-        error = np.sqrt(np.mean(scattered**2, axis=1) * np.where(wide > 0, wide / spread**2, 1.0))
+        exact = np.divide(wide, spread**2, out=np.ones_like(wide), where=spread**2 > 0)
+        error = np.sqrt(np.mean(scattered**2, axis=1) * exact)
         return error, np.minimum(np.minimum(low, -up), 0.0), np.maximum(np.maximum(high, -down), 0.0)
 
 

@@ -116,26 +116,29 @@ def measure_violation(program: Program) -> tuple[float, str]:
 def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
     """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
 
-    Every variable of an equality or inequality counts with its largest entry, so that the measure does not depend on
-    units. The size of a cone constraint is its largest argument.
+    Every variable counts with its largest entry, so that the measure does not depend on units.
 
     Args:
         member: the constraint.
         usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
     """
-    largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0) or 1.0
-    if not isinstance(member, Equality | Zero | Inequality | NonPos):
-        return largest
-    slopes = jacobians(member.expr)
+    expressions = [member.expr] if isinstance(member, Equality | Zero | Inequality | NonPos) else member.args
+    sizes = [_terms(expression, usual or {}) for expression in expressions]
+    largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
+    return max([size for size in sizes if size is not None], default=largest) or largest or 1.0
+
+
+def _terms(expression: cp.Expression, usual: Mapping[int, float]) -> float | None:
+    """Largest sum of the magnitudes of the terms of an entry; None where CVXPY knows no gradient."""
+    slopes = jacobians(expression)
     if slopes is None:
-        return largest
-    total, inner = np.zeros(member.size), -flat_value(member.expr)
+        return None
+    total, inner = np.zeros(expression.size), -flat_value(expression)
     for variable, slope in slopes.items():
-        total += abs(slope).sum(axis=1) * max(float(np.max(np.abs(flat_value(variable)), initial=0.0)),
-                                              (usual or {}).get(variable.id, 0.0))
+        size = max(float(np.max(np.abs(flat_value(variable)), initial=0.0)), usual.get(variable.id, 0.0))
+        total += abs(slope).sum(axis=1) * size
         inner += slope @ flat_value(variable)
-    size = float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine constraint
-    return size or largest
+    return float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine expression
 
 
 def has_bounds(variable: cp.Variable) -> bool:

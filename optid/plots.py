@@ -197,6 +197,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     Inputs whose Theta is a vector are left out.
     """
     compressed, found = fit.program.compressed, {}
+    heights = fit.program.view.units
     if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
         return found
     if fit.program.view.kind == "exact":
@@ -207,9 +208,10 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
             position += rows * columns
     else:
         thetas = compressed.matrices(fit.solution.values)
+    unit = 1.0 if heights is None else heights.y_scale[0]  # of Theta in the units of the record
     for name, theta in zip(fit.model.inputs, thetas):
         if min(theta.shape) > 1:
-            found[name] = np.linalg.svd(theta, compute_uv=False)
+            found[name] = unit * np.linalg.svd(theta, compute_uv=False)
     return found
 
 

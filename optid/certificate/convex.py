@@ -8,7 +8,8 @@ x bounds the optimum from below, however inaccurate w is: bad multipliers give a
   constraints are computed here by least-distance programming (Lawson and Hanson, Solving Least Squares Problems, 1974,
   chapter 23).
 * Any other smooth convex F: L is convex, so that its tangent at the point bounds it from below; what is left of its
-  gradient there counts over a box of `REACH` times the size of every variable around the point.
+  gradient there counts over a box of `REACH` times the size of every variable around the point. Of a quadratic F in
+  few variables only the part of the gradient counts so that its curvature does not catch.
 """
 
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ Array = np.ndarray
 
 CLOSED = 1e-6
 """Relative gap up to which a convex programme counts as solved to its optimum."""
+
+FEW = 64
+"""Scalar variables up to which the curvature of a quadratic objective is formed."""
 
 TANGENT = "tangent"
 """Method of a bound from a tangent: it may be weak at a good point, so that it proves but does not refute."""
@@ -95,13 +99,47 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> float |
     lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
     if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
         return None
-    loose = 0.0
-    for variable in program.variables.values():
-        part = lagrangian.free_part(variable)
-        if part is None:
-            return None
-        loose += float(np.sum(part)) * _width(variable)
-    return objective + lagrangian.value - loose
+    variables = list(program.variables.values())
+    parts = [lagrangian.free_part(variable) for variable in variables]
+    if any(part is None for part in parts):
+        return None
+    widths = np.concatenate([np.full(v.size, _width(v)) for v in variables])
+    magnitudes = np.concatenate([part for part in parts if part is not None])
+    plain = float(magnitudes @ widths)
+    gradient = np.concatenate([lagrangian.total[v.id] for v in variables])
+    if program.kind == "QP" and gradient.size <= FEW and np.array_equal(magnitudes, np.abs(gradient)):
+        sizes, directions = np.linalg.eigh(_hessian(program))
+        curved = sizes > 1e-12 * max(float(sizes[-1]), np.finfo(float).tiny)
+        along = directions.T @ gradient
+        caught = float(np.sum(along[curved] ** 2 / sizes[curved])) / 2
+        plain = min(plain, caught + float(np.abs(directions[:, ~curved] @ along[~curved]) @ widths))
+    return objective + lagrangian.value - plain
+
+
+def _hessian(program: Program) -> Array:
+    """Second derivatives of a quadratic objective: differences of its gradient, which are exact."""
+    variables = list(program.variables.values())
+    point = [np.array(v.value, dtype=float) for v in variables]
+    edges = np.cumsum([0, *(v.size for v in variables)])
+
+    def gradient() -> Array:
+        found = np.zeros(edges[-1])
+        for variable, slope in (jacobians(program.objective.expr) or {}).items():
+            place = next(i for i, v in enumerate(variables) if v.id == variable.id)
+            found[edges[place] : edges[place + 1]] = slope.toarray().ravel()
+        return found
+
+    columns, base = [], gradient()
+    for variable, value in zip(variables, point):
+        size = float(np.max(np.abs(value), initial=0.0)) or 1.0
+        for j in range(variable.size):
+            moved = np.ravel(value, order="F")
+            moved[j] += size
+            variable.save_value(moved.reshape(variable.shape, order="F"))
+            columns.append((gradient() - base) / size)
+        variable.save_value(value)
+    matrix = np.array(columns)
+    return (matrix + matrix.T) / 2
 
 
 def _width(variable: object) -> float:

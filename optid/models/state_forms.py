@@ -193,12 +193,15 @@ def in_raw_units(model: "HammersteinSS", transform: Transform) -> "HammersteinSS
         )
     functions, constants = _mapped(model.nonlinearities, model.input_of, transform.u_scale, transform.u_offset)
     feedback, fed = _mapped(model.feedback, model.output_of, transform.y_scale, transform.y_offset)
-    injection = model.L / gain
+    # the states take the unit that all outputs share: C, and with it what a norm of B means, stays as it is then
+    state = gain[0] if np.all(gain == gain[0]) else 1.0
+    injection = state * model.L / gain
     raw = replace(
-        model, C=gain[:, None] * model.C, D=gain[:, None] * model.D, L=injection, K=model.K / gain,
-        offset_x=model.offset_x + model.B @ constants + model.E @ fed - injection @ shift,
+        model, B=state * model.B, C=gain[:, None] * model.C / state, D=gain[:, None] * model.D, E=state * model.E,
+        L=injection, K=state * model.K / gain,
+        offset_x=state * (model.offset_x + model.B @ constants + model.E @ fed) - injection @ shift,
         offset_y=gain * (model.offset_y + model.D @ constants) + shift, nonlinearities=functions, feedback=feedback,
-        noise=None if model.noise is None else model.noise.mapped(np.eye(model.nx), np.diag(gain)),
+        noise=None if model.noise is None else model.noise.mapped(state * np.eye(model.nx), np.diag(gain)),
     )
     # units do not turn signs: what a constraint decided about them stays
     return regauged(raw, model.gauge, signs=False)
