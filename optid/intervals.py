@@ -28,7 +28,7 @@ class LocalEstimate:
 
     Attributes:
         centre: (n,) minimum without the inequalities, relative to the fit.
-        scatter: (n, n) S, the centre has covariance S Sᵀ.
+        scatter: (n, m) S, the centre has covariance S Sᵀ.
         dof: degrees of freedom of the noise estimate inside S.
         rows: (r, n) and
         slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
@@ -67,7 +67,7 @@ class LocalEstimate:
     def samples(self) -> tuple[Array, Array]:
         """Projected draws (draws, n) around the centre and around the fit, by the same random numbers."""
         rng = np.random.default_rng(self.seed)
-        half = rng.standard_normal((-(-self.draws // 2), self.centre.size))
+        half = rng.standard_normal((-(-self.draws // 2), self.scatter.shape[1]))
         half *= np.sqrt(self.dof / rng.chisquare(self.dof, (len(half), 1)))
         spread = np.vstack([half, -half])[: self.draws] @ self.scatter.T
         rows, slack = self.rows[self.in_reach], self.slack[self.in_reach]

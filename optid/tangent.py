@@ -112,7 +112,9 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     if penalised:
         prior = np.eye(len(centre)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
         covariance = covariance + float(np.trace(noise)) / l * prior
-    local = LocalEstimate(centre, _square_root(covariance), dof, inequalities @ directions, slack, draws, seed)
+    # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
+    scatter = _square_root(covariance) @ basis.T
+    local = LocalEstimate(centre, scatter, dof, inequalities @ directions, slack, draws, seed)
     meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
     return Tangent(names, shapes, x, directions, local, noise, dof, parameters, MEANINGS[meaning])
 
@@ -226,5 +228,6 @@ def _gradient(program: Program, names: tuple[str, ...], name: str, expression: E
 
 
 def _square_root(matrix: Array) -> Array:
+    """Return the symmetric square root, the only one that does not depend on the eigenvectors chosen."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
