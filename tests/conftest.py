@@ -12,6 +12,22 @@ settings.register_profile("optid", derandomize=True, deadline=None, max_examples
                           suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("optid")
 
+CORE = """bases certificate cli data fitting infeasibility models prices rank_one readers readme registry regressors
+report solving study_database validation""".split()
+NUMERICAL = """backends certificate fault_pairs fault_profile fault_scan fault_signature fitting formulations
+gauss_newton group_sparse hammerstein_ss hankel_bound infeasibility lifting noise_models nuclear_norm
+nuclear_subspace output_error prices rank_one readme shift shooting solving state_space_exact subspace
+uncertainty""".split()
+
+
+def pytest_collection_modifyitems(items):
+    """Give the tests of these modules the marks by which the oldest versions and other processors select them."""
+    for item in items:
+        module = item.path.stem.removeprefix("test_")
+        for mark, modules in {"core": CORE, "numerical": NUMERICAL}.items():
+            if module in modules:
+                item.add_marker(mark)
+
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:

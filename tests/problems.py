@@ -52,7 +52,7 @@ def raw_problem(phi, y, na, shapes, loss, weight=0.0, constrain=lambda a, thetas
     z = cp.hstack([a, *(cp.vec(t, order="F") for t in thetas), d])
     penalty = 2 * weight * sum(cp.normNuc(t) for t in thetas) if weight else 0.0
     problem = cp.Problem(cp.Minimize(loss(y[:, 0] - phi @ z) + penalty), constrain(a, thetas, d))
-    problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+    problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-8, tol_gap_rel=1e-8, tol_feas=1e-8)
     return float(problem.value), [t.value for t in thetas]
 
 
@@ -66,7 +66,7 @@ def search(program, points=72):
         with warnings.catch_warnings():  # on a direction that a constraint all but forbids the solver may give up
             warnings.simplefilter("ignore")
             try:
-                problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+                problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-8, tol_gap_rel=1e-8, tol_feas=1e-8)
             except cp.SolverError:
                 return 1e300
         return float(problem.value) if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else 1e300

@@ -117,7 +117,7 @@ def test_nuclear_equals_the_raw_sample_problem(weight):
     assert fit.solution.objective == pytest.approx(value, rel=1e-7)
     assert np.allclose(fit.values["Theta"], theta, atol=1e-5)
     assert fit.solution.proof
-    assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-9)
+    assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-8)
 
 
 def test_bound_of_the_constrained_nuclear_problem_stays_below_its_optimum():

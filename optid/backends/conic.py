@@ -38,6 +38,9 @@ UNFIT = {
 
 WITHOUT_DUALS = {"scip"}  # none for quadratic programmes, wrong ones for linear programmes (its presolve is not undone)
 
+AMBIGUOUS = {"sdpa"}
+"""Solvers whose "infeasible" can mean "unbounded": SDPA's pdINF says that the primal or the dual is infeasible."""
+
 LEFT_OUT = {"glpk_mi", "diffcp"}  # other doors to glpk (for integers) and to clarabel and scs (for derivatives)
 
 
@@ -59,11 +62,14 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
         "daqp": {"primal_tol": max(eps, 1e-12), "dual_tol": max(eps, 1e-12)},
         "qoco": {"abstol": eps, "reltol": eps, "max_iters": 500},
         "highs": {"primal_feasibility_tolerance": max(eps, 1e-10), "dual_feasibility_tolerance": max(eps, 1e-10)},
-        # a gap of 1e-8 leaves multipliers that are good to 1e-5 only
-        "cvxopt": {"abstol": 0.01 * eps, "reltol": 0.01 * eps, "feastol": eps, "max_iters": 200},
+        # a gap of 1e-8 leaves multipliers that are good to 1e-5 only. Such a gap is out of reach of the factorisation
+        # that CVXPY chooses, "chol", on half of all small quadratic programmes; "qr" is CVXOPT's own default for cones
+        "cvxopt": {"abstol": 0.01 * eps, "reltol": 0.01 * eps, "feastol": max(eps, 1e-7), "max_iters": 200,
+                   "kktsolver": "qr", "refinement": 2},
         "ecos": {"abstol": eps, "reltol": eps, "feastol": eps, "max_iters": 500},
-        # in several threads its answers, and now and then its verdict, change from run to run
-        "sdpa": {"epsilonStar": eps, "epsilonDash": eps, "numThreads": 1},
+        # its documented accuracy is 1e-7; beyond it rounding errors decide whether its Cholesky factorisation fails.
+        # In several threads its answers, and now and then its verdict, change from run to run
+        "sdpa": {"epsilonStar": max(eps, 1e-7), "epsilonDash": max(eps, 1e-7), "numThreads": 1},
         # feastol above 1e-9 makes badly scaled programmes run for minutes
         "scip": {"scip_params": {"numerics/feastol": 1e-9,
                                  **({"limits/time": float(limit)} if limit is not None else {})}},
@@ -105,6 +111,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     statistics = problem.solver_stats
     compiling = float("nan") if problem.compilation_time is None else float(problem.compilation_time)
     iterations = getattr(statistics, "num_iters", None)
+    if status is Status.INFEASIBLE and name in AMBIGUOUS and not _has_no_point(problem, name, options):
+        return Answer(Status.FAILED, "infeasible_or_unbounded", compile=compiling)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT) or any(
         v.value is None for v in program.variables.values()
     ):
@@ -113,6 +121,18 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     duals = {} if name in WITHOUT_DUALS else program.duals()
     return Answer(status, problem.status, program.values(), duals,
                   int(iterations) if iterations is not None else -1, compiling)
+
+
+def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bool:
+    """Return whether the solver finds the constraints infeasible without an objective, where the dual is feasible."""
+    bare = cp.Problem(cp.Minimize(0), problem.constraints)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            bare.solve(solver=name.upper(), **options)
+    except Exception:  # no answer confirms nothing
+        return False
+    return STATUS.get(bare.status) is Status.INFEASIBLE
 
 
 def family() -> list[BackEnd]:

@@ -1,0 +1,54 @@
+"""The outputs printed in the README are what its commands print, whatever the processor."""
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from optid.cli.app import app
+
+README = Path(__file__).parent.parent / "README.md"
+MEASURED = re.compile(r"(?<![\w.])[\d.]+(e[-+]\d+)? (ms|s|µs)\b|(?<=gap )\d\.\de-\d+")
+"""Times, and the gap, which is a rounding error of the bound."""
+
+
+def printed(command: str) -> str:
+    """Return the block of the README that shows the output of a command, by its first words."""
+    blocks = re.findall(r"```text\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    return next(block for block in blocks if command in block)
+
+
+def figures(text: str) -> list[str]:
+    """Return words and numbers, without times, file names and the way lines are filled."""
+    text = re.sub(r"\s+", " ", re.sub(r"(report|diagnosis) written to \S+", "", text))
+    return MEASURED.sub("#", text).split()
+
+
+def output(*words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "thruster.json"
+    output("fit", "--example", "thruster", "--formulation", "hammerstein_ss.exact", "--nx", 2, "--set",
+           "criterion=prediction", "--model", path)
+    return path
+
+
+def test_the_main_example_prints_the_figures_of_the_readme(tmp_path):
+    shown = output("fit", "--example", "thruster", "--report", tmp_path / "thruster.html")
+    assert figures(shown) == figures(printed("Hammerstein ARX model"))
+
+
+def test_the_sizes_of_isolable_faults_are_those_of_the_readme(model):
+    assert figures(output("isolability", model)) == figures(printed("window 100 samples"))
+
+
+def test_the_diagnosis_is_that_of_the_readme(model, tmp_path):
+    shown = output("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out",
+                   tmp_path / "d.json")
+    assert figures(shown) == figures(printed("faulty: actuator:current loss"))
