@@ -31,15 +31,13 @@ class LocalEstimate:
 
     Attributes:
         centre: (n,) minimum without the inequalities, relative to the fit.
-        scatter: (n, n) S, symmetric; the centre has covariance S S.
+        scatter: (n, m) S, the centre has covariance S Sᵀ. Draws are made in the m coordinates, which should not depend
+            on how a basis of the tangent space was found: every machine then makes the same.
         dof: degrees of freedom of the noise estimate inside S.
         rows: (r, n) and
         slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
         draws: number of random draws.
         seed: their seed.
-        frame: (m, n) orthonormal columns that place v among m coordinates which do not depend on how the basis of the
-            tangent space was found. The draws are made there, so that every machine makes the same; None where v is
-            such coordinates itself.
 
     Raises:
         StructureError: fewer than 100 draws.
@@ -52,7 +50,6 @@ class LocalEstimate:
     slack: Array
     draws: int = DRAWS
     seed: int = 0
-    frame: Array | None = None
 
     def __post_init__(self) -> None:
         if self.draws < 100:
@@ -74,10 +71,9 @@ class LocalEstimate:
     def samples(self) -> tuple[Array, Array, Array]:
         """Draws (draws, n) around zero, and their projections around the centre and around the fit."""
         rng = np.random.default_rng(self.seed)
-        frame = np.eye(self.centre.size) if self.frame is None else self.frame
-        half = rng.standard_normal((-(-self.draws // 2), len(frame))) @ frame
+        half = rng.standard_normal((-(-self.draws // 2), self.scatter.shape[1]))
         half *= np.sqrt(self.dof / rng.chisquare(self.dof, (len(half), 1)))
-        spread = np.vstack([half, -half])[: self.draws] @ self.scatter
+        spread = np.vstack([half, -half])[: self.draws] @ self.scatter.T
         rows, slack = self.rows[self.in_reach], self.slack[self.in_reach]
         return spread, project(self.centre + spread, rows, slack), project(spread, rows, slack)
 

@@ -112,8 +112,9 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     if penalised:
         prior = np.eye(len(centre)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
         covariance = covariance + float(np.trace(noise)) / l * prior
-    # the symmetric root, and draws in the rows of the root of the problem: neither knows how the tangent was turned
-    local = LocalEstimate(centre, _square_root(covariance), dof, inequalities @ directions, slack, draws, seed, basis)
+    # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
+    scatter = _square_root(covariance) @ basis.T
+    local = LocalEstimate(centre, scatter, dof, inequalities @ directions, slack, draws, seed)
     meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
     return Tangent(names, shapes, x, directions, local, program.unit * noise, dof, parameters, MEANINGS[meaning])
 
