@@ -223,9 +223,9 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
     statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
-    penalties = energy_unit(units) / unit * np.array([ridge, curvature])
-    return EquationError(statistics, lifted_problem(statistics, *penalties, units.u_scale), model_meta(data),
-                         units, bases, unit)
+    share = energy_unit(units) / unit
+    problem = lifted_problem(statistics, share * ridge, share * curvature, units.u_scale)
+    return EquationError(statistics, problem, model_meta(data), units, bases, unit)
 
 
 def model_meta(data: Data | Stream) -> dict[str, Any]:

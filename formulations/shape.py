@@ -324,7 +324,7 @@ def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) ->
     def step() -> float:
         matrix = np.asarray(coefficients.value, dtype=float)
         curve = basis.values(basis.grid()) @ (matrix if matrix.ndim == 1 else matrix.sum(axis=1))
-        scale = float(size.value) if isinstance(size, cp.Expression) else float(size)
+        scale = float(np.asarray(size.value if isinstance(size, cp.Expression) else size))
         low, high = basis.interval or (0.0, 1.0)
         return 0.01 * float(np.ptp(curve)) / abs(scale) / (high - low) ** power
 

@@ -135,11 +135,12 @@ def _pole_blocks(free: np.ndarray, rules: Sequence[Rule]) -> tuple[np.ndarray, n
         return not _disobeyed_by(np.array([complex(re, im), complex(re, -im)]), rules)
 
     try:
-        triangle, basis, kept = schur(free, output="real", sort=obeys)
+        found: Any = schur(free, output="real", sort=obeys)
     except np.linalg.LinAlgError:  # poles too close to be told from each other: all of them are constrained
-        (triangle, basis), kept = schur(free, output="real"), 0
+        found = (*schur(free, output="real"), 0)
+    triangle, basis, kept = found
     n, ends = len(free), [int(kept)]
-    if kept == n:
+    if ends[0] == n:
         return None
     while ends[-1] < n:
         end = min(ends[-1] + AT_ONCE, n)
@@ -163,7 +164,7 @@ def _deflated(up: np.ndarray, down: np.ndarray, free: np.ndarray, blocks: tuple[
         own, before = slice(first, last), slice(0, first)
         range_before = np.linalg.qr(up_z[:, before])[0]
         outside = [part - range_before @ (range_before.T @ part) for part in (up_z[:, own], down_z[:, own])]
-        shift = yield from constrained_shift(*outside, rules)
+        shift = yield from constrained_shift(outside[0], outside[1], rules)
         if shift.a is None:
             return replace(shift, bound=float(np.linalg.norm(up @ free - down)), least_squares=free)
         t[own, own] = shift.a

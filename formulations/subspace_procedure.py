@@ -67,7 +67,7 @@ class Plan:
 
     Attributes:
         imputes: whether missing outputs may be estimated although ``block_rows`` is given.
-        units: from those of the record to those of the model.
+        units: from those of the data above to those of the record; the identity where not given.
         records: (N, m + l) raw channels [u | y], one array per experiment.
     """
 
@@ -89,7 +89,7 @@ class Plan:
     stability: str = "auto"
     constraints: tuple[Any, ...] = ()
     imputes: bool = False
-    units: Transform | None = None
+    units: Transform = Transform((), (), (), ())
     records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
@@ -99,6 +99,8 @@ class Plan:
             one_of(name, value, known)
         if not (self.nx in ORDERS or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
             raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
+        if not self.units.y_scale:
+            object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))
         self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
 
     @property
@@ -151,7 +153,7 @@ def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis:
 def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
     """Run a procedure and return its model in the units of the record that was planned for."""
     evidence = yield from procedure
-    if evidence is None or evidence.model is None or plan.units is None:
+    if evidence is None or evidence.model is None:
         return evidence
     return replace(evidence, model=evidence.model.with_transform(plan.units))
 
@@ -206,7 +208,7 @@ def identified(plan: Plan) -> Procedure:
 
 def _height(plan: Plan) -> float:
     """Unit of the singular values: that of the outputs, unless their weighting takes it away."""
-    return 1.0 if plan.units is None or plan.weighting == "cva" else plan.units.y_scale[0]
+    return 1.0 if plan.weighting == "cva" else plan.units.y_scale[0]
 
 
 def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma: np.ndarray, scale: np.ndarray,

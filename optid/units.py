@@ -7,16 +7,12 @@ constraints still speak in the units of the record: `outward` gives them the nam
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from optid.channels import Transform
-
-if TYPE_CHECKING:
-    from optid.data import Data
-    from optid.streams import Stream
 
 SIGNALS = ("x", "output")
 """Named courses of the output, one row per sample."""
@@ -26,17 +22,18 @@ HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", 
 """Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""
 
 
-def own_units(data: "Data | Stream", linear: Sequence[bool] = (), centred: bool = True) -> Transform:
+def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> Transform:
     """Return the units in which outputs, and inputs that act linearly, have mean zero and variance one.
 
     Of a stream the first chunk with samples decides; any fixed choice near the record serves.
 
     Args:
-        data: the record.
+        data: the record, a `Data` or a `Stream`.
         linear: whether each input acts linearly; the others keep their units, which their bases take care of.
         centred: subtract the means; False for a model without a constant.
     """
-    arrays = [(e.u, e.y) for e in data.experiments] if hasattr(data, "experiments") else [data.first_chunk()]
+    experiments = getattr(data, "experiments", None)
+    arrays = [(e.u, e.y) for e in experiments] if experiments else [data.first_chunk()]
     means = [_moments([pair[side] for pair in arrays], centred) for side in (0, 1)]
     (u_level, u_size), (y_level, y_size) = means
     chosen = np.array([*linear, *[False] * (data.m - len(linear))], dtype=bool)

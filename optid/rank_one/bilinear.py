@@ -188,9 +188,9 @@ class _Projected:
         across = np.concatenate(regressors, axis=1)
         diagonal = np.abs(np.diag(self.triangle))
         usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
-        mixed = self.basis.T @ across
+        mixed: Array = self.basis.T @ across
         if usable:
-            mixed = mixed + solve_triangular(self.triangle, block_diag(*forces), trans=1)
+            mixed = np.add(mixed, solve_triangular(self.triangle, block_diag(*forces), trans=1))
         hessian = across.T @ across - mixed.T @ mixed
         weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
         return across.T @ self.residual, hessian + weight * block_diag(*gauges)
