@@ -147,7 +147,8 @@ def realisation_programme(
         linear["offset"] = cp.Variable(form.l, name="offset")
     pose = _factored if realisation.factored else _lumped
     program = pose(realisation, name, linear)
-    unit = 1.0 if units is None else energy_unit(units)
+    relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
+    unit = 1.0 if units is None or relative else energy_unit(units)
     return realisation, replace(program.subject_to(*constraints), recover=realisation.factors, unit=unit)
 
 

@@ -15,6 +15,9 @@ from optid.program import Program, RankOneForm, Values
 from optid.solution import Residuals
 
 
+ZERO = 1e-9  # a variable without a start that is smaller than this has no size of its own to measure by
+
+
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
     """Measure a point: objective, violation, stationarity and complementarity.
 
@@ -67,9 +70,11 @@ def _rank_one_residuals(program: Program, form: RankOneForm) -> tuple[float, flo
 
 
 def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
-    """Largest entry of a variable, of its start where it vanishes, one where both do."""
+    """Largest entry of a variable or of its start; one where there is no start and nothing but rounding."""
     size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
-    return max(size, usual.get(variable.id, 0.0)) or 1.0
+    if variable.id in usual:
+        return max(size, usual[variable.id])
+    return size if size > ZERO else 1.0
 
 
 def _relative(gradient: np.ndarray, terms: np.ndarray, yardstick: float, size: float) -> float:

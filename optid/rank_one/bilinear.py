@@ -191,9 +191,9 @@ class _Projected:
         mixed: Array = self.basis.T @ across
         if usable:
             mixed = np.add(mixed, solve_triangular(self.triangle, block_diag(*forces), trans=1))
-        hessian = across.T @ across - mixed.T @ mixed
+        hessian = np.subtract(across.T @ across, mixed.T @ mixed)
         weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
-        return across.T @ self.residual, hessian + weight * block_diag(*gauges)
+        return across.T @ self.residual, np.add(hessian, weight * block_diag(*gauges))
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
