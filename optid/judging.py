@@ -14,7 +14,6 @@ from optid.gradients import flat_value, jacobians
 from optid.program import Program, RankOneForm, Values
 from optid.solution import Residuals
 
-
 ZERO = 1e-9  # a variable without a start that is smaller than this has no size of its own to measure by
 
 

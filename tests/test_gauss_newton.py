@@ -142,3 +142,41 @@ def test_it_refuses_what_is_not_rank_one():
     assert run(program, Settings()).status is Status.FAILED
     with pytest.raises(optid.errors.StructureError, match="gauss_newton solves rank-one"):
         optid.fit(record(), "arx", na=1, nb=1, solver="gauss_newton")
+
+
+@pytest.mark.parametrize("seed", [0, 14, 18, 35])
+def test_nearly_collinear_inputs_are_no_obstacle(seed):
+    """Large mu that nearly cancel: descents in both factors stopped at their limit up to 1 % above the optimum."""
+    from scripts import benchmark
+
+    excess, status = benchmark("local_optima").excess_of_collinear(seed)
+    assert excess < 1e-9 and status == "locally optimal"
+
+
+@pytest.mark.parametrize("seed", [5, 26, 29, 33])
+def test_an_optimum_on_one_lag_is_found_where_mu_vanishes_all_around(seed):
+    rules = [shape.monotone(), shape.sign("b", ["positive", "negative"][seed // 2 % 2])]
+    gain = [1.0, -1.0][seed % 2]
+    fit = optid.fit(record(gain, count=60, noise=1.0, seed=seed), na=2, nb=2, basis=BASIS, constraints=rules)
+    assert fit.solution.objective <= search(fit.program, 36) * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("solver", ["gauss_newton", "ipopt", "alternating"])
+@pytest.mark.parametrize("seed", range(3))
+def test_contradictions_are_infeasible_whoever_solves(solver, seed):
+    fit = optid.fit(record(seed=seed), na=2, nb=2, basis=BASIS, solver=solver, raises=False,
+                    constraints=[shape.slope(low=2.0), shape.gain(1.0)])
+    assert fit.solution.status is Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+@pytest.mark.parametrize("rule", [shape.slope(-0.5, 3.0), shape.gain(1.5), shape.through(0.5, 1.0),
+                                  shape.value_range(-3.0, 3.0)], ids=lambda rule: rule.name)
+def test_constraints_on_the_curve_leave_the_sign_to_the_gauge(gain, rule):
+    fit = optid.fit(record(gain), na=2, nb=2, basis=BASIS, constraints=[rule])
+    assert fit.model.b[0][0] > 0 and "its first coefficient positive" in str(fit)
+
+
+def test_a_constraint_on_f_decides_the_sign():
+    fit = optid.fit(record(-1.0), na=2, nb=2, basis=BASIS, constraints=[shape.monotone()])
+    assert fit.model.b[0][0] < 0 and "its sign follows from the constraints" in str(fit)

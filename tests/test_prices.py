@@ -4,6 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from problems import BASIS, record
+from scripts import benchmark
 
 import optid
 from formulations import shape
@@ -94,3 +95,11 @@ def test_without_a_point_there_are_no_prices():
 def test_equalities_are_active():
     fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[shape.fixed("a", [-1.1, 0.4])])
     assert (fit.prices[0].active, fit.prices[0].rows, fit.prices[0].slack) == (2, 2, 0.0)
+
+
+@pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised"])
+@pytest.mark.parametrize("word", sorted(benchmark("prices").cases(1.0, 1.0)))
+def test_every_word_has_the_price_that_moving_its_bound_gains(word, form):
+    seed = 0 if form.endswith("exact") else 1
+    multiplier, slope = benchmark("prices").checked(word, seed, form, r=1e3, s=1e-2)
+    assert multiplier == pytest.approx(slope, rel=1e-2) and slope > 0
