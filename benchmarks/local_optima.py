@@ -44,7 +44,7 @@ def excess_of_collinear(seed: int) -> tuple[float, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         data, orders = collinear(seed), {"na": 2, "nb": 3, "basis": optid.Triangular(5)}
-        fit = optid.fit(data, prove=False, **orders)
+        fit = optid.fit(data, **orders)
         other = optid.fit(data, prove=False, solver="ipopt", raises=False, **orders)
     core = fit.program.compressed.problem.core
     tries = [fit.program.unit * best_of(core, 24, seed=7, iterations=2000).value, other.solution.objective]

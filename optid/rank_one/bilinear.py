@@ -68,7 +68,7 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     return found
 
 
-def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e-12, iterations: int = 200,
+def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e-12, iterations: int = 1000,
             alternations: int = 0) -> LocalSolution:
     """Newton's method in the b alone, every mu the best for them; the objective never increases beyond roundoff.
 
@@ -222,7 +222,7 @@ def _normal_equations(design: Array, target: Array) -> Array:
 
 
 def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0,
-             tolerance: float = 1e-12, iterations: int = 200) -> LocalSolution:
+             tolerance: float = 1e-12, iterations: int = 1000) -> LocalSolution:
     """Best local minimiser over several starts, or the one reached from a given start.
 
     Args:
@@ -243,7 +243,7 @@ def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, se
     return best_of(core, count, seed, tolerance, iterations)
 
 
-def best_of(core: Core, count: int = 8, seed: int = 0, tolerance: float = 1e-12, iterations: int = 200,
+def best_of(core: Core, count: int = 8, seed: int = 0, tolerance: float = 1e-12, iterations: int = 1000,
             first: int = 0) -> LocalSolution:
     """Best local minimiser of a reduced problem over the starts ``first .. count - 1``."""
     if not core.shapes:
