@@ -34,9 +34,9 @@ def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> T
     """
     experiments = getattr(data, "experiments", None)
     arrays = [(e.u, e.y) for e in experiments] if experiments else [data.first_chunk()]
-    means = [_moments([pair[side] for pair in arrays], centred) for side in (0, 1)]
-    (u_level, u_size), (y_level, y_size) = means
+    y_level, y_size = _moments([y for _, y in arrays], centred)
     chosen = np.array([*linear, *[False] * (data.m - len(linear))], dtype=bool)
+    u_level, u_size = _moments([u for u, _ in arrays], centred) if chosen.any() else np.zeros((2, data.m))
     spread = float(np.sqrt(np.mean(y_size**2))) or 1.0
     return Transform(tuple(np.where(chosen, np.where(u_size > 0, u_size, 1.0), 1.0).tolist()),
                      tuple(np.where(chosen, u_level, 0.0).tolist()),
