@@ -109,7 +109,7 @@ def main(argv=None) -> dict:
     optid.fit(data, "hammerstein_arx.nuclear", **arguments)
     seconds, fit = best(lambda: optid.fit(data, "hammerstein_arx.nuclear", **arguments), 3)
     raw, theta = nuclear_raw(data, 2, 10, structure["basis"], weight)
-    difference = float(np.linalg.norm(theta - fit.solution.values["Theta"]) / np.linalg.norm(theta))
+    difference = float(np.linalg.norm(theta - fit.values["Theta"]) / np.linalg.norm(theta))
     print(f"nuclear, N = {options.nuclear}: {1e3 * seconds:.0f} ms; raw samples in CVXPY {raw:.1f} s, "
           f"{raw / seconds:.0f} times as long; Theta agrees to {difference:.0e} (relative)")
     figures.update(nuclear_ratio=raw / seconds, nuclear_agreement=difference)

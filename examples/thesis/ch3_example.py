@@ -23,7 +23,7 @@ def main(folder: Path) -> dict[str, float]:
     for (name, basis), (left, right), hint in zip(bases(-1, 1).items(), grid, (0.0207, 0.0206)):
         fit = optid.fit(data, "hammerstein_arx.overparametrised", na=2, nb=2, basis=basis, svd="plain")
         best = optid.fit(data, "hammerstein_arx.exact", na=2, nb=2, basis=basis)
-        sizes = np.linalg.svd(fit.solution.values["Theta"], compute_uv=False)
+        sizes = np.linalg.svd(fit.values["Theta"], compute_uv=False)
         predicted, f, b = fit.model.predict(data), BETA * fit.model.f(u), fit.model.b[0] / BETA
         errors = []
         for other in (example("dead_zone", seed=seed).data for seed in range(RECORDS)):
