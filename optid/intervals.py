@@ -21,6 +21,9 @@ from optid.errors import StructureError
 DRAWS = 8192
 """Random draws of an interval under inequalities: their noise is about 0.7 % of its width."""
 
+SETS = 64
+"""Sets of active rows that are tried for all points; where there are many more, each point finds its own."""
+
 REACH = 8.0
 """Inequalities further away than this many standard deviations of their slack cannot move an interval."""
 
@@ -116,7 +119,7 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
     lengths = np.linalg.norm(rows, axis=1)
     rows, slack = rows[lengths > 0] / lengths[lengths > 0, None], slack[lengths > 0] / lengths[lengths > 0]
     projected = points.copy()
-    left = np.flatnonzero(np.any(points @ rows.T + slack < 0, axis=1))
+    left, tried = np.flatnonzero(np.any(points @ rows.T + slack < 0, axis=1)), 0
     while left.size:
         first = left[0]
         system = np.vstack([rows.T, -(points[first] @ rows.T + slack) / size])
@@ -127,8 +130,9 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
         projected[first] -= size * residual[:-1] / residual[-1]
         left = left[1:]
         active = np.flatnonzero(multipliers > 0)
-        if not left.size or not 0 < active.size <= points.shape[1]:
+        if tried == SETS or not left.size or not 0 < active.size <= points.shape[1]:
             continue
+        tried += 1
         held = rows[active]
         gram = held @ held.T
         if np.linalg.cond(gram) > 1e12:
