@@ -7,6 +7,7 @@ coordinates, from several starts. :func:`alternate` is the classical alternating
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
@@ -188,12 +189,14 @@ class _Projected:
         across = np.concatenate(regressors, axis=1)
         diagonal = np.abs(np.diag(self.triangle))
         usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
-        mixed: Array = self.basis.T @ across
+        mixed = self.basis.T @ across
         if usable:
-            mixed = np.add(mixed, solve_triangular(self.triangle, block_diag(*forces), trans=1))
-        hessian = np.subtract(across.T @ across, mixed.T @ mixed)
+            forced: Any = solve_triangular(self.triangle, block_diag(*forces), trans=1)
+            mixed = mixed + forced
+        hessian = across.T @ across - mixed.T @ mixed
         weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
-        return across.T @ self.residual, np.add(hessian, weight * block_diag(*gauges))
+        gauge: Any = block_diag(*gauges)
+        return across.T @ self.residual, hessian + weight * gauge
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
