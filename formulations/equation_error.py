@@ -20,11 +20,12 @@ from optid.data import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
-from optid.program import Program, View
+from optid.program import Program
 from optid.rank_one import RankOne
 from optid.regressors import Layout, Statistics, collect
 from optid.streams import Stream
 from optid.units import energy_unit, in_units, inner_bases, own_units
+from optid.view import View
 
 
 class Compressed(Protocol):

@@ -23,9 +23,10 @@ from optid.errors import StructureError, nearest
 from optid.faults.consistency.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
 from optid.faults.search.scanning import Scan
 from optid.group_sparse import GroupProblem
-from optid.program import GroupForm, Program, View
+from optid.program import GroupForm, Program
 from optid.solution import Bound, Solution, Status
 from optid.solving import Evidence, Procedure
+from optid.view import View
 
 PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
 """Penalties tried, as shares of the one at which nothing is left."""

@@ -24,9 +24,10 @@ from optid.faults.search.calibration import Thresholds
 from optid.faults.search.scanning import Scan
 from optid.faults.search.sparse import ActiveGroup, SparseResult
 from optid.group_sparse import GroupProblem
-from optid.program import GroupForm, Program, View
+from optid.program import GroupForm, Program
 from optid.solution import Bound, Solution, Status
 from optid.solving import Evidence, Procedure
+from optid.view import View
 
 
 def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constraints: Sequence[Any] = ()) -> Procedure:

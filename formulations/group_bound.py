@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 import cvxpy as cp
 import numpy as np
 
+from optid.gradients import flat_value, jacobians
 from optid.judging import multiplier_terms
 from optid.program import GroupForm, Program, Values
 from optid.solution import Bound, relative_gap
@@ -81,13 +82,13 @@ def _affine(terms: Iterable[tuple[cp.Expression, np.ndarray]], variables: Mappin
     for expression, weights in terms:
         if not expression.is_affine():
             return None
-        constant += float(np.ravel(np.asarray(expression.value), order="F") @ weights)
-        for variable, jacobian in expression.grad.items():
-            if variable.id not in known or jacobian is None:
-                return None
-            jacobian = jacobian if np.ndim(jacobian) else np.full((1, 1), jacobian)
-            part = np.asarray(jacobian @ weights).ravel()
+        constant += float(flat_value(expression) @ weights)
+        found = jacobians(expression)
+        if found is None or any(variable.id not in known for variable in found):
+            return None
+        for variable, jacobian in found.items():
+            part = jacobian.T @ weights
             name = known[variable.id]
             slopes[name] = slopes[name] + part.reshape(form.blocks[name], order="F")
-            constant -= float(np.ravel(np.asarray(variable.value), order="F") @ part)
+            constant -= float(flat_value(variable) @ part)
     return np.concatenate([part.ravel() for part in slopes.values()]), constant

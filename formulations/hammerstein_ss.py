@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from formulations.arguments import one_of
-from formulations.subspace_procedure import NOISES, identified, in_record_units, planned
+from formulations.subspace_plan import in_record_units, planned
+from formulations.subspace_procedure import NOISES, identified
 from optid.data import Data
 from optid.errors import StructureError
 from optid.experiment.expansion import Bases, FeedbackBases
@@ -61,8 +62,8 @@ def sid(
     one_of("noise", noise, NOISES)
     instruments = "inputs+past" if noise == "white" else "inputs"
     plan = planned("hammerstein_ss.sid", data, nx, block_rows, basis, None, instruments, weighting=weighting,
-                offset=offset, feedthrough=feedthrough, observer=observer, split=split, stability=stability,
-                constraints=tuple(constraints))
+                   offset=offset, feedthrough=feedthrough, observer=observer, split=split, stability=stability,
+                   constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)
 
 
@@ -105,8 +106,8 @@ def sivid(
     if not 0 <= tolerance < 1:
         raise StructureError(f"tolerance={tolerance!r}: a number in [0, 1) is needed.")
     plan = planned("hammerstein_ss.sivid", data, nx, block_rows, basis, feedback_basis, instruments, form=form,
-                tolerance=max(tolerance, 1e-10), weighting=weighting, offset=offset, feedthrough=feedthrough,
-                observer=observer, split=split, stability=stability, constraints=tuple(constraints))
+                   tolerance=max(tolerance, 1e-10), weighting=weighting, offset=offset, feedthrough=feedthrough,
+                   observer=observer, split=split, stability=stability, constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)
 
 
@@ -148,7 +149,7 @@ def asivid(
         raise StructureError(f"iterations={iterations!r}: a whole number from 0 is needed.")
     kind = "simulated" if iterations else "inputs"
     plan = planned("hammerstein_ss.asivid", data, nx, block_rows, basis, feedback_basis,
-                kind + ("+past" if noise == "white" else ""), form=form, iterations=int(iterations),
-                weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
-                stability=stability, constraints=tuple(constraints))
+                   kind + ("+past" if noise == "white" else ""), form=form, iterations=int(iterations),
+                   weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
+                   stability=stability, constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)

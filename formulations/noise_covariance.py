@@ -22,9 +22,10 @@ from optid.errors import StructureError, nearest
 from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
-from optid.program import Program, View
+from optid.program import Program
 from optid.solution import Bound, Solution, Status
 from optid.solving import Evidence, Procedure
+from optid.view import View
 
 FORMS = ("places", "full")
 

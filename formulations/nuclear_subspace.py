@@ -24,20 +24,22 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.arguments import one_of
-from formulations.subspace_procedure import Plan, completed, in_record_units, planned, preliminary, prepared
+from formulations.subspace_plan import Plan, in_record_units, planned
+from formulations.subspace_procedure import completed, preliminary, prepared
 from optid.channels import Transform
 from optid.data import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.experiment.expansion import Bases, FeedbackBases
 from optid.nuclear_norm import NuclearProblem, Predictor
 from optid.nuclear_norm.problem import window_starts
-from optid.program import NuclearForm, Program, Values, View
+from optid.program import NuclearForm, Program, Values
 from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
 from optid.subspace.expansion import Expansion
 from optid.subspace.realisation import realise
 from optid.units import energy_unit
 from optid.validation import fit_percent
+from optid.view import View
 
 FORMS = ("predictor", "projection", "instruments")
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))

@@ -18,10 +18,11 @@ from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.models.roots import contained
-from optid.program import Program, RankOneForm, Values, View
+from optid.program import Program, RankOneForm, Values
 from optid.regressors import Layout
 from optid.regressors.linearised import Linearised
 from optid.units import energy_unit, outer_bases
+from optid.view import View
 
 Array = np.ndarray
 

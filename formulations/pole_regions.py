@@ -19,7 +19,7 @@ from scipy.optimize import root_scalar
 
 from formulations.rule import Rule
 from optid.errors import StructureError
-from optid.program import View
+from optid.view import View
 
 __all__ = ["damped", "disc", "sector", "strip"]
 

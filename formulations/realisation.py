@@ -25,12 +25,13 @@ from formulations.equation_error import flat, residual_programme
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.channels import Transform
-from optid.program import Program, RankOneForm, Values, View
+from optid.program import Program, RankOneForm, Values
 from optid.rank_one import reduce
 from optid.rank_one.bilinear import starts
 from optid.rank_one.whitening import leading_pair
 from optid.subspace.observer import ObserverProblem
 from optid.units import energy_unit, outer_bases
+from optid.view import View
 
 RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""

@@ -22,7 +22,8 @@ import cvxpy as cp
 import numpy as np
 
 from optid.faults.repair.allocation_problem import AllocationProblem, Member
-from optid.program import Program, Values, View
+from optid.program import Program, Values
+from optid.view import View
 
 TIE = 1e-8
 """Weight of the distance of v from the middle of its range, to decide between resting points of the same outputs."""

@@ -21,10 +21,11 @@ import numpy as np
 from formulations.rule import Rule
 from optid.errors import StructureError
 from optid.faults.repair.refitting import Refitting
-from optid.program import Program, Values, View
+from optid.program import Program, Values
 from optid.registry import named_constraint
 from optid.solution import Bound, Status
 from optid.solving import Evidence, Procedure
+from optid.view import View
 
 Array = np.ndarray
 

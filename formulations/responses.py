@@ -14,7 +14,7 @@ from formulations.rule import Rule
 from formulations.static_curve import output_index, through_matrices
 from optid.errors import StructureError
 from optid.limits import Limit
-from optid.program import View
+from optid.view import View
 
 __all__ = ["impulse_response", "no_effect", "positive_real", "step_response"]
 

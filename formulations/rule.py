@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from optid.program import View
+from optid.view import View
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,10 @@ from optid.faults.consistency.bounded_noise import (
     parity_proof,
 )
 from optid.faults.signatures import Candidate, Dictionary
-from optid.program import Program, Values, View
+from optid.program import Program, Values
 from optid.solution import Bound, Solution, Status, relative_gap
 from optid.solving import Evidence, Procedure
+from optid.view import View
 
 Array = np.ndarray
 

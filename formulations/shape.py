@@ -27,7 +27,7 @@ from formulations.static_curve import basis_of, denominator, offset_of, settles,
 from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.limits import Limit
-from optid.program import View
+from optid.view import View
 
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]

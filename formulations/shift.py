@@ -21,8 +21,9 @@ from cvxpy.constraints.psd import PSD
 
 from formulations.rule import Rule
 from optid.errors import StructureError
-from optid.program import Program, Values, View
+from optid.program import Program, Values
 from optid.solution import Solution, Status
+from optid.view import View
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
 ROUNDS = 6  # pairs of programmes in A and in P at most

@@ -37,10 +37,11 @@ from optid.errors import StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.roots import contained
-from optid.program import Program, Values, View
+from optid.program import Program, Values
 from optid.regressors.sensitivities import Unknowns, simulate
 from optid.solution import Bound
 from optid.units import energy_unit, outer_bases
+from optid.view import View
 
 Array = np.ndarray
 

@@ -21,7 +21,7 @@ from optid.errors import StructureError
 from optid.limits import Limit
 from optid.models.roots import pulled, roots_of
 from optid.models.roots import radius as root_radius
-from optid.program import View
+from optid.view import View
 
 FREQUENCIES = 128
 MARGIN = 1e-6  # by how much of the radius the disc is shrunk, so that a binding constraint leaves a stable model

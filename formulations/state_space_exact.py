@@ -29,8 +29,8 @@ from formulations.prediction_error import AGREE, Descent, best_of, descend, refi
 from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.state_space_programme import Posing
-from formulations.subspace_procedure import Plan, feedback_bases, identified, in_record_units, planned
-from optid.bases import fitted_bases
+from formulations.subspace_plan import Plan, in_record_units, planned
+from formulations.subspace_procedure import identified
 from optid.data import Data
 from optid.errors import DataWarning, RankError, StructureError
 from optid.experiment.expansion import Bases
@@ -40,7 +40,6 @@ from optid.regressors.state_sensitivities import StateUnknowns
 from optid.solution import Status
 from optid.solving import Evidence, Procedure
 from optid.stretches import with_whole_inputs
-from optid.subspace.expansion import expand
 from optid.units import energy_unit, inverse
 
 Array = np.ndarray
@@ -175,8 +174,7 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
             found[f"{evidence.figures['block rows']} block rows"] = evidence.model
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
-    expansion = expand(plan.records, fitted_bases(data, plan.basis), feedback_bases(data, plan.feedback_basis),
-                       data.inputs, data.outputs)
+    expansion = plan.expansion()
     data = with_whole_inputs(data, 2 * nx + 1)
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), criterion == "prediction", plan.offset)

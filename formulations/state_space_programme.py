@@ -17,9 +17,10 @@ from formulations.state_error import StateError
 from optid.channels import Transform
 from optid.judging import measure_violation
 from optid.models import HammersteinSS
-from optid.program import Program, Values, View
+from optid.program import Program, Values
 from optid.regressors.linearised import Linearised
 from optid.units import outer_bases
+from optid.view import View
 
 Array = np.ndarray
 

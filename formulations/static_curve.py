@@ -10,7 +10,7 @@ import numpy as np
 
 from optid.errors import StructureError
 from optid.limits import Limit
-from optid.program import View
+from optid.view import View
 
 SETTLES = 1e-6
 """Least ``1 + sum(a)`` of a model that has a static characteristic."""

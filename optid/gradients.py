@@ -31,6 +31,20 @@ def jacobians(expression: cp.Expression) -> dict[cp.Variable, sp.csr_array] | No
     return found
 
 
+def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, sp.csr_array], np.ndarray] | None:
+    """Return the Jacobians of an affine expression, as `jacobians` does, and its constant, flat; None if not affine.
+
+    The constant is the value at the origin, so that one that is zero is exactly zero.
+    """
+    if not expression.is_affine():
+        return None
+    with _values_kept(expression.variables()) as variables:
+        for variable in variables:
+            variable.save_value(np.zeros(variable.shape))
+        slopes = jacobians(expression)
+        return None if slopes is None else (slopes, flat_value(expression))
+
+
 def row_sizes(expression: cp.Expression, usual: Mapping[int, float]) -> np.ndarray:
     """Return how much every entry of an expression changes when its variables have their usual size; never zero.
 
@@ -39,8 +53,7 @@ def row_sizes(expression: cp.Expression, usual: Mapping[int, float]) -> np.ndarr
         usual: {id of a variable: usual size of its entries}; one where it is not named.
     """
     rng = np.random.default_rng(0)
-    variables = expression.variables()
-    with _values_kept(variables):
+    with _values_kept(expression.variables()) as variables:
         for variable in variables:
             variable.save_value(np.zeros(variable.shape))
         origin, largest = flat_value(expression), np.zeros(expression.size)
@@ -56,10 +69,10 @@ def row_sizes(expression: cp.Expression, usual: Mapping[int, float]) -> np.ndarr
 
 
 @contextmanager
-def _values_kept(variables: list[cp.Variable]) -> Iterator[None]:
+def _values_kept(variables: list[cp.Variable]) -> Iterator[list[cp.Variable]]:
     saved = [variable.value for variable in variables]
     try:
-        yield
+        yield variables
     finally:
         for variable, value in zip(variables, saved):
             variable.save_value(value)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import cvxpy as cp
-import numpy as np
 
 from optid.certificate.lifting import lift_exact, places
+from optid.gradients import flat_value, jacobians
 from optid.limits import EQUALITIES
 from optid.program import Program
 
@@ -82,10 +82,9 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
 
 def _linearised(member: Any) -> Any:
     expression = member.expr
-    linear: Any = np.ravel(expression.value, order="F")
-    for variable, gradient in expression.grad.items():
-        slope = gradient.toarray() if hasattr(gradient, "toarray") else np.asarray(gradient)
-        flat = variable if variable.ndim <= 1 else cp.vec(variable, order="F")
-        linear = linear + np.reshape(slope, (variable.size, -1)).T @ (flat - np.ravel(variable.value, order="F"))
+    linear: Any = flat_value(expression)
+    for variable, slope in (jacobians(expression) or {}).items():
+        flat = variable if variable.ndim == 1 else cp.vec(variable, order="F")
+        linear = linear + slope @ (flat - flat_value(variable))
     equal = isinstance(member, EQUALITIES)
     return linear == 0 if equal else linear <= 0

@@ -110,13 +110,11 @@ def _band_slope(multipliers: np.ndarray, band: np.ndarray, span: np.ndarray) -> 
     """Gain per unit of t where ``span @ x = 0`` is replaced by ``|band @ x| <= t``, over the columns of x."""
     from scipy.optimize import linprog
 
-    columns = multipliers.reshape(-1, len(span))
+    columns, weights = multipliers.reshape(-1, len(span)), band @ np.linalg.pinv(span)
     if len(band) == len(span):
-        return float(np.sum(np.abs(np.linalg.solve((band @ np.linalg.pinv(span)).T, columns.T))))
-    total = 0.0
+        return float(np.sum(np.abs(np.linalg.solve(weights.T, columns.T))))
+    total, rows = 0.0, np.vstack([weights, -weights])
     for column in columns:  # the most that the multipliers gain over all x inside the band, in coordinates span @ x
-        weights = band @ np.linalg.pinv(span)
-        rows = np.vstack([weights, -weights])
         found = linprog(-column, A_ub=rows, b_ub=np.ones(len(rows)), bounds=(None, None))
         total += -float(found.fun) if found.status == 0 else np.nan
     return total

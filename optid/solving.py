@@ -128,7 +128,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     if not values:
         status, reason = _without_point(program, answer, back_end.name)
         if status is Status.FAILED and _contradictory(program):
-            status, reason = Status.INFEASIBLE, f"{CONFLICT}; {reason}"
+            return _conflict(program, base, reason)
         return replace(base, status=status, reason=reason).in_units(program.unit)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
@@ -145,7 +145,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     judged = time.perf_counter()
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
-        status, reason = Status.INFEASIBLE, f"{CONFLICT}; {reason}"
+        return _conflict(program, base, reason)
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
         point, bound = _proof(program, back_end, settings, point, separate)
@@ -158,6 +158,11 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
                    values=point.values, duals=point.duals, objective=point.objective, bound=bound,
                    residuals=point.residuals,
                    times=replace(base.times, judge=judged - clock, prove=done - judged)).in_units(program.unit)
+
+
+def _conflict(program: Program, base: Solution, reason: str) -> Solution:
+    """Say that no point satisfies the constraints; where a solver stopped is then nothing to go on with."""
+    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}").in_units(program.unit)
 
 
 @dataclass(frozen=True)

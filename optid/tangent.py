@@ -18,6 +18,7 @@ from cvxpy.expressions.expression import Expression
 
 from optid.bases.basis import Array
 from optid.errors import RankError, StructureError
+from optid.gradients import jacobians
 from optid.intervals import LocalEstimate
 from optid.program import Program
 
@@ -212,19 +213,13 @@ def _one_sided(name: str, member: Constraint) -> tuple[Expression | None, float]
 
 
 def _gradient(program: Program, names: tuple[str, ...], name: str, expression: Expression) -> Array:
-    gradients = {variable.id: part for variable, part in expression.grad.items()}
-    parts = []
-    for key in names:
-        variable = program.variables[key]
-        if variable.id not in gradients:
-            parts.append(np.zeros((expression.size, variable.size)))
-            continue
-        part: Any = gradients[variable.id]
-        if part is None:
-            raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap instead")
-        dense = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
-        parts.append(dense.reshape(variable.size, expression.size).T)
-    return np.hstack(parts)
+    slopes = jacobians(expression)
+    if slopes is None:
+        raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap instead")
+    by_id = {variable.id: slope for variable, slope in slopes.items()}
+    variables = [program.variables[key] for key in names]
+    return np.hstack([by_id[v.id].toarray() if v.id in by_id else np.zeros((expression.size, v.size))
+                      for v in variables])
 
 
 def _square_root(matrix: Array) -> Array:

@@ -105,7 +105,7 @@ def outward(expressions: Mapping[str, Any], kind: str, units: Transform, inputs:
         if factor != 1.0 and word in ("mu", "Theta", "b", "static"):
             factor /= units.u_scale[_position(channel.rstrip("]"), inputs)]
         found[name] = expression if factor == 1.0 else factor * expression
-        if word in SIGNALS and kind != "shift":
+        if word in SIGNALS:
             level = np.array(units.y_offset)
             found[name] = found[name] + (level[0] if expression.ndim == 1 else np.tile(level, (expression.shape[0], 1)))
     if "offset" in found:

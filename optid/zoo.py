@@ -12,7 +12,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.program import GroupForm, NuclearForm, Program, RankOneForm, View
+from optid.program import GroupForm, NuclearForm, Program, RankOneForm
+from optid.view import View
 
 SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 

@@ -71,7 +71,8 @@ def test_failures_are_values_on_request():
 
 
 def test_an_unbounded_programme_says_so():
-    from optid.program import Program, View
+    from optid.program import Program
+    from optid.view import View
 
     def falling(data):
         x = cp.Variable(1, name="x")

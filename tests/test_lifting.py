@@ -93,8 +93,9 @@ def test_products_of_two_cones():
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
     z = np.concatenate([np.zeros(3), np.kron(b, mu)])
-    assert np.corrcoef(-rows @ z, np.kron(b, BASIS.increments() @ mu))[0, 1] > 0.9  # rows are divided by their size
-    assert np.array_equal(np.sign(-rows @ z), np.sign(np.kron(b, BASIS.increments() @ mu)))
+    (curve,), (sign,) = program.limits["monotone:increasing"], program.limits["sign:b:positive"]
+    ratio = -rows @ z / np.kron(b / sign.sizes, BASIS.increments() @ mu / curve.sizes)
+    assert ratio[0] > 0 and np.allclose(ratio, ratio[0])  # one factor, that of the units
 
 
 def test_places_read_bilinear_constraints_only():

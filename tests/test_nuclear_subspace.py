@@ -9,7 +9,8 @@ import pytest
 
 import optid
 from formulations.nuclear_subspace import certify, held_out_fit, nuclear_programme, order_of, structure
-from formulations.subspace_procedure import Plan, prepared
+from formulations.subspace_plan import Plan
+from formulations.subspace_procedure import prepared
 from optid.backends import Answer, Settings, choose, find
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.solution import Status

@@ -10,8 +10,8 @@ from formulations import pole_regions
 from formulations.pole_regions import damping_sides, disc, disc_side, sector, strip, wedge_side
 from formulations.stability import stable
 from optid.errors import StructureError
-from optid.program import View
 from optid.registry import named_constraint
+from optid.view import View
 
 
 def admits(rule, matrix):

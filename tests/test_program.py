@@ -6,9 +6,10 @@ import pytest
 from zoo import CASES, case, pose
 
 from optid.errors import StructureError
-from optid.program import View, named
+from optid.program import named
 from optid.solution import Status
 from optid.solving import solve
+from optid.view import View
 
 
 def bilinear():

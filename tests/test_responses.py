@@ -8,10 +8,11 @@ import optid
 from formulations import responses, shape
 from optid.data import Data
 from optid.errors import StructureError
-from optid.program import Program, View
+from optid.program import Program
 from optid.registry import named_constraint
 from optid.solution import Status
 from optid.solving import solve
+from optid.view import View
 
 INPUTS, OUTPUTS, N = ("u1", "u2"), ("y1", "y2"), 3
 

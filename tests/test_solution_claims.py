@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from optid.backends import Answer, BackEnd
-from optid.program import Program, View
+from optid.program import Program
 from optid.solution import Solution, Status
 from optid.solving import solve
+from optid.view import View
 
 
 def _program():

@@ -14,7 +14,7 @@ from formulations.stability import central, stable
 from optid.errors import StructureError
 from optid.limits import Limit
 from optid.models import HammersteinARX
-from optid.program import View
+from optid.view import View
 
 
 def build(rule, na, reference=None, kind="linear"):

@@ -3,24 +3,24 @@
 For multipliers w in the dual cone of the constraints ``g(x) in K`` the minimum of ``L(x) = F(x) + <w, g(x)>`` over all
 x bounds the optimum from below, however inaccurate w is: bad multipliers give a weak bound, never a wrong one.
 
-* Least squares ``F = ‖R z - s‖² + remainder`` with affine constraints: the minimum is known in closed form,
-  ``L(z0) - ‖R^-T grad L(z0)‖² / 4`` for any z0. Where the solver gives no multipliers, or poor ones, those of linear
-  constraints are computed here by least-distance programming (Lawson and Hanson, Solving Least Squares Problems, 1974,
-  chapter 23).
+* Least squares ``F = ‖R z - s‖² + remainder``: with the constraints taken by their tangents at z0, which bound convex
+  ones from below, the minimum is known in closed form, ``L(z0) - ‖R^-T grad L(z0)‖² / 4`` for any z0. Where the solver
+  gives no multipliers, or poor ones, those of linear constraints are computed here by least-distance programming
+  (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
 * Any other smooth convex F: L is convex, so that its tangent at the point bounds it from below; what is left of its
-  gradient there counts over a box of `REACH` times the size of every variable around the point. Of a quadratic F in
-  few variables only the part of the gradient counts so that its curvature does not catch.
+  gradient there counts over a box of `REACH` times the size of every variable around the point, as far as bounds that
+  the variable carries let it go. Of a quadratic F in few variables only the part of the gradient counts that its
+  curvature does not catch.
 """
 
-from dataclasses import dataclass
-
+import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
+from optid.certificate.lifting import lift_linear
 from optid.gradients import flat_value, jacobians
-from optid.judging import Lagrangian
-from optid.limits import EQUALITIES, INEQUALITIES
+from optid.judging import Lagrangian, has_bounds
 from optid.program import Program, RankOneForm, Values
 from optid.solution import Bound, relative_gap
 
@@ -89,7 +89,7 @@ def _quadratic_bound(program: Program, form: RankOneForm, duals: Values, objecti
     pull = pull + np.concatenate([*(gradient[program.variables[name].id] for name in form.linear), np.zeros(0)])
     step = solve_triangular(root, pull, trans=1)
     others = [v for v in program.variables.values() if v.id not in inner]  # those that constraints brought with them
-    loose = sum(float(np.abs(gradient[v.id]) @ np.full(v.size, _width(v))) for v in others)
+    loose = sum(float(np.sum(np.abs(gradient[v.id]))) * _width(v) for v in others)
     return objective + lagrangian.value - float(step @ step) / 4 - loose
 
 
@@ -100,14 +100,12 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> float |
     if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
         return None
     variables = list(program.variables.values())
-    parts = [lagrangian.free_part(variable) for variable in variables]
-    if any(part is None for part in parts):
+    if any(lagrangian.free_part(variable) is None for variable in variables):
         return None
-    widths = np.concatenate([np.full(v.size, _width(v)) for v in variables])
-    magnitudes = np.concatenate([part for part in parts if part is not None])
-    plain = float(magnitudes @ widths)
+    plain = sum(_descent(lagrangian, variable) for variable in variables)
     gradient = np.concatenate([lagrangian.total[v.id] for v in variables])
-    if program.kind == "QP" and gradient.size <= FEW and np.array_equal(magnitudes, np.abs(gradient)):
+    if program.kind == "QP" and gradient.size <= FEW:
+        widths = np.concatenate([np.full(v.size, _width(v)) for v in variables])
         sizes, directions = np.linalg.eigh(_hessian(program))
         curved = sizes > 1e-12 * max(float(sizes[-1]), np.finfo(float).tiny)
         along = directions.T @ gradient
@@ -142,65 +140,44 @@ def _hessian(program: Program) -> Array:
     return (matrix + matrix.T) / 2
 
 
-def _width(variable: object) -> float:
-    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))  # type: ignore[arg-type]
+def _width(variable: cp.Variable) -> float:
+    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
     return REACH * (size or 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Linear constraints ``rows @ z <= right`` (or ``=``) of one programme, in order."""
-
-    rows: Array
-    right: Array
-    equal: Array
-    names: tuple[str, ...]
-
-
-def _linear_rows(program: Program, form: RankOneForm) -> _Rows | None:
-    """Read the user's constraints as rows on z; None where one of them is no linear equality or inequality in z."""
-    columns, position = {}, 0
-    for name in form.linear:
-        columns[program.variables[name].id] = position
-        position += program.variables[name].size
-    rows, right, equal, names = [], [], [], []
-    for name, group in program.user_constraints.items():
-        for member in group:
-            if not isinstance(member, EQUALITIES | INEQUALITIES) or not member.expr.is_affine():
-                return None
-            slopes = jacobians(member.expr)
-            if slopes is None or any(v.id not in columns for v in slopes):
-                return None
-            part, level = np.zeros((member.size, position)), -flat_value(member.expr)
-            for variable, slope in slopes.items():
-                part[:, columns[variable.id] : columns[variable.id] + variable.size] = slope.toarray()
-                level += slope @ flat_value(variable)
-            rows.append(part)
-            right.append(level)
-            equal += [isinstance(member, EQUALITIES)] * member.size
-            names += [name] * member.size
-    if not rows:
-        return None
-    return _Rows(np.vstack(rows), np.concatenate(right), np.array(equal), tuple(names))
+def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
+    """By how much the gradient can lower the Lagrangian inside the box and the bounds that the variable carries."""
+    gradient = np.reshape(lagrangian.total[variable.id], variable.shape, order="F")
+    if variable.attributes["symmetric"]:
+        gradient = (gradient + gradient.T) / 2
+    room = np.full(variable.shape, _width(variable))
+    if has_bounds(variable):
+        lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+        value = np.asarray(variable.value, dtype=float)
+        room = np.clip(np.where(gradient > 0, value - lower, upper - value), 0.0, room)
+    return float(np.sum(np.abs(gradient) * room))
 
 
 def _own_multipliers(program: Program, form: RankOneForm) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
-    found = _linear_rows(program, form)
-    if found is None:
-        return None
     problem = form.problem
+    found = lift_linear(program, form.linear, len(problem.target))
+    linear = found.linear()
+    if found.refused or linear is None:
+        return None
+    rows, right, equal = linear
     estimate = solve_triangular(problem.root, problem.target)
-    slopes = solve_triangular(problem.root, found.rows.T, trans=1).T
+    slopes = solve_triangular(problem.root, rows.T, trans=1).T
     lengths = np.linalg.norm(slopes, axis=1)
     lengths[lengths == 0] = 1.0
-    slopes, need = slopes / lengths[:, None], (found.rows @ estimate - found.right) / lengths
+    slopes, need = slopes / lengths[:, None], (rows @ estimate - right) / lengths
     size = float(np.max(np.abs(need), initial=0.0))
+    counts = [sum(member.size for member in group) for group in program.user_constraints.values()]
     if not size:
-        return {name: np.zeros(found.names.count(name)) for name in program.user_constraints}
+        return {name: np.zeros(count) for name, count in zip(program.user_constraints, counts)}
     # x = R (z - estimate): minimise |x|² subject to slopes x + need <= 0, equalities as two inequalities
-    both = np.vstack([-slopes, slopes[found.equal]])
-    wanted = np.concatenate([need, -need[found.equal]]) / size
+    both = np.vstack([-slopes, slopes[equal]])
+    wanted = np.concatenate([need, -need[equal]]) / size
     target = np.zeros(both.shape[1] + 1)
     target[-1] = 1.0
     try:
@@ -212,8 +189,6 @@ def _own_multipliers(program: Program, form: RankOneForm) -> dict[str, Array] | 
         return None
     weights = 2.0 * size * weights / residual[-1]
     multipliers = weights[: len(slopes)].copy()
-    multipliers[found.equal] -= weights[len(slopes) :]
-    multipliers /= lengths
-    names = np.array(found.names)
-    return {name: multipliers[names == name] for name in program.user_constraints}
+    multipliers[equal] -= weights[len(slopes) :]
+    return dict(zip(program.user_constraints, np.split(multipliers / lengths, np.cumsum(counts)[:-1])))
 

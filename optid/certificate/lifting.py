@@ -12,6 +12,7 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
+from optid.gradients import affine_parts
 from optid.limits import EQUALITIES, INEQUALITIES
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, RankOne
@@ -136,6 +137,25 @@ def _block_starts(problem: RankOne) -> list[int]:
     return [int(v) for v in problem.linear + np.cumsum([0, *(p * q for p, q in problem.blocks)])]
 
 
+def _columns(program: Program, names: Sequence[str]) -> dict[int, int]:
+    """First column of every named variable, by id, where they follow one another from column 0."""
+    variables = [program.variables[name] for name in names]
+    return dict(zip((v.id for v in variables), np.cumsum([0, *(v.size for v in variables)]).tolist()))
+
+
+def lift_linear(program: Program, names: Sequence[str], size: int) -> Lifted:
+    """Bring the user constraints of a programme in which no product is left into rows on the named variables."""
+    lifted, columns = Lifted(size), _columns(program, names)
+    for name, group in program.user_constraints.items():
+        for member in group:
+            found = _rows(member, columns, size) if isinstance(member, EQUALITIES | INEQUALITIES) else None
+            if found is None:
+                lifted.refused = lifted.refused or name
+            else:
+                lifted.add(*found, isinstance(member, EQUALITIES))
+    return lifted
+
+
 @dataclass(frozen=True)
 class Places:
     """Where the variables of a bilinear programme stand in the lifted vector z.
@@ -158,11 +178,7 @@ class Places:
 def places(program: Program, form: RankOneForm) -> Places:
     """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
     problem = form.problem
-    columns, position = {}, 0
-    for name in form.linear:
-        columns[program.variables[name].id] = position
-        position += program.variables[name].size
-    stand_in = {}
+    columns, stand_in = _columns(program, form.linear), {}
     for shape, start, (mu, _) in zip(problem.blocks, _block_starts(problem), form.blocks):
         theta = cp.Variable(shape)
         stand_in[id(program.view.inner["Theta" + mu[len("mu"):]])] = theta
@@ -185,9 +201,9 @@ def lift_exact(program: Program, form: RankOneForm) -> Lifted:
             equal = isinstance(member, EQUALITIES)
             ids = {v.id for v in member.variables()}
             only = next(iter(ids)) if len(ids) == 1 else None
-            if only in mus and _affine(member):
+            if only in mus and member.expr.is_affine():
                 fits = _lift_mu(lifted, member, problem, starts, mus[only], equal, form.gauge)
-            elif only in bs and _affine(member):
+            elif only in bs and member.expr.is_affine():
                 fits = _lift_b(lifted, member, problem, starts, bs[only], equal)
             else:
                 found = where.rows(member)
@@ -199,41 +215,29 @@ def lift_exact(program: Program, form: RankOneForm) -> Lifted:
     return lifted
 
 
-def _affine(member: Constraint) -> bool:
-    return member.expr.is_affine()
-
-
-def _jacobian(member: Constraint, variables: Sequence[cp.Variable]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Jacobians (rows, size) of an affine constraint and its constant."""
-    saved = [v.value for v in variables]
-    for variable in variables:
-        variable.value = np.zeros(variable.shape)
-    constant = np.ravel(member.expr.value, order="F").astype(float)
-    gradients = member.expr.grad
-    found = []
-    for variable in variables:
-        part = gradients[variable]
-        dense = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
-        found.append(np.reshape(dense, (variable.size, constant.size)).T)
-    for variable, value in zip(variables, saved):
-        variable.value = value
-    return found, constant
-
-
 def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np.ndarray, np.ndarray] | None:
-    variables = member.variables()
-    if not _affine(member) or any(v.id not in columns for v in variables):
+    found = affine_parts(member.expr)
+    if found is None or any(v.id not in columns for v in found[0]):
         return None
-    jacobians, constant = _jacobian(member, variables)
+    slopes, constant = found
     rows = np.zeros((constant.size, size))
-    for variable, jacobian in zip(variables, jacobians):
-        rows[:, columns[variable.id] : columns[variable.id] + variable.size] = jacobian
+    for variable, slope in slopes.items():
+        rows[:, columns[variable.id] : columns[variable.id] + variable.size] = slope.toarray()
     return rows, -constant
+
+
+def _of_one_variable(member: Constraint) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian (rows, size) and constant of an affine constraint in one variable."""
+    found = affine_parts(member.expr)
+    assert found is not None
+    slopes, constant = found
+    (slope,) = slopes.values()
+    return slope.toarray(), constant
 
 
 def _lift_mu(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[int], i: int, equal: bool,
              gauge: str) -> bool:
-    (jacobian,), constant = _jacobian(member, member.variables())
+    jacobian, constant = _of_one_variable(member)
     p, q = problem.blocks[i]
     homogeneous = not np.any(constant)
     if homogeneous and not equal:
@@ -251,7 +255,7 @@ def _lift_mu(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[
 
 
 def _lift_b(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[int], i: int, equal: bool) -> bool:
-    (jacobian,), constant = _jacobian(member, member.variables())
+    jacobian, constant = _of_one_variable(member)
     p, q = problem.blocks[i]
     if np.any(constant):
         return False
@@ -279,22 +283,14 @@ def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, val
         duals: multipliers by constraint.
     """
     taus = heights * float(np.asarray(program.parameters["weight"].value))
-    lifted = Lifted(len(problem.target))
-    columns, position = {}, 0
     names = [name for name in program.variables if name != "residual"]
-    for name in names:
-        columns[program.variables[name].id] = position
-        position += program.variables[name].size
-    multipliers = []
-    for name, group in program.user_constraints.items():
-        for member in group:
-            found = _rows(member, columns, lifted.size) if isinstance(member, EQUALITIES | INEQUALITIES) else None
-            if found is None:
-                return Bound.none(f"no proof: constraint {name!r} is not linear"), None
-            lifted.add(*found, isinstance(member, EQUALITIES))
+    lifted = lift_linear(program, names, len(problem.target))
+    if lifted.refused:
+        return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear"), None
+    for name in program.user_constraints:
         if name not in duals:
             return Bound.none(f"no proof: the solver gave no multiplier of {name!r}"), None
-        multipliers.append(duals[name])
+    multipliers = [duals[name] for name in program.user_constraints]
     z = np.concatenate([np.ravel(values[name], order="F") for name in names])
     nu = 2.0 * (problem.root @ z - problem.target)
     linear = lifted.linear()

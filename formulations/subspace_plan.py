@@ -1,0 +1,128 @@
+"""What a subspace method is asked for, on a record in its own units."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from formulations.arguments import one_of
+from optid.bases import Linear, UserFunctions, fitted_bases
+from optid.channels import Transform
+from optid.data import Data
+from optid.errors import DataError, StructureError
+from optid.experiment.expansion import feedback_bases
+from optid.solving import Procedure
+from optid.subspace.expansion import Expansion, expand
+from optid.subspace.realisation import WEIGHTINGS
+from optid.units import in_units, inner_bases, own_units
+
+OBSERVERS = ("auto", "none", "kalman")
+SPLITS = ("exact", "lumped")
+ORDERS = ("auto", "gap")
+STABILITIES = ("auto", "free")
+BEST = "best"
+"""Word for the weighting that fits the record best."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a method is asked for, of a record in its own units; see `planned`.
+
+    Attributes named as arguments of `formulations.hammerstein_ss.sid` mean the same.
+
+    Attributes:
+        imputes: whether missing outputs may be estimated although ``block_rows`` is given.
+        units: from those of the data above to those of the record; the identity where not given.
+        records: (N, m + l) raw channels [u | y], one array per experiment.
+    """
+
+    name: str
+    data: Data
+    nx: int | str
+    block_rows: int | None
+    basis: Any
+    feedback_basis: Any
+    instruments: str
+    form: str = "projection"
+    tolerance: float | None = None
+    iterations: int = 0
+    weighting: str = "moesp"
+    offset: bool = True
+    feedthrough: Any = True
+    observer: str = "auto"
+    split: str = "exact"
+    stability: str = "auto"
+    constraints: tuple[Any, ...] = ()
+    imputes: bool = False
+    units: Transform = Transform((), (), (), ())
+    records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("observer", self.observer, OBSERVERS), ("split", self.split, SPLITS),
+                                   ("stability", self.stability, STABILITIES),
+                                   ("weighting", self.weighting, (*WEIGHTINGS, BEST))):
+            one_of(name, value, known)
+        if not (self.nx in ORDERS or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
+            raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
+        if not self.units.y_scale:
+            object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))
+        self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
+
+    @property
+    def order(self) -> int | None:
+        """The order asked for; None where it is to be found."""
+        return None if isinstance(self.nx, str) else int(self.nx)
+
+    def expansion(self) -> Expansion:
+        """Return the signals of the record, expanded in its bases."""
+        return expand(self.records, fitted_bases(self.data, self.basis),
+                      feedback_bases(self.data, self.feedback_basis), self.data.inputs, self.data.outputs)
+
+    def about(self, what: str) -> tuple[Any, ...]:
+        """Constraints about "poles" or about "coefficients"."""
+        return tuple(rule for rule in self.constraints
+                     if what in getattr(rule, "about", frozenset({"coefficients"})))
+
+    def direct(self) -> tuple[bool, ...]:
+        """Feedthrough of every input."""
+        m = self.data.m
+        given = [self.feedthrough] * m if isinstance(self.feedthrough, bool) else list(self.feedthrough)
+        if len(given) != m or not all(isinstance(one, bool | np.bool_) for one in given):
+            raise StructureError(f"feedthrough={self.feedthrough!r}: True or False, or one of them per input "
+                                 f"({', '.join(self.data.inputs)}).")
+        return tuple(bool(one) for one in given)
+
+
+def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis: Any, feedback_basis: Any,
+            instruments: str, *, offset: bool = True, **settings: Any) -> Plan:
+    """Plan a method on a record taken to its own units (`optid.units`); `in_record_units` brings the model back.
+
+    Args:
+        name: of the formulation.
+        data: the record, in memory.
+        nx: as in `formulations.hammerstein_ss.sid`.
+        block_rows: as there.
+        basis: of the inputs.
+        feedback_basis: of the outputs, None without feedback.
+        instruments: word of the instruments.
+        offset: whether the model has a constant; without one nothing is centred.
+        settings: further fields of the plan.
+    """
+    if not isinstance(data, Data):
+        raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")
+    inputs, outputs = fitted_bases(data, basis), feedback_bases(data, feedback_basis)
+    units = own_units(data, [isinstance(one, Linear) for one in inputs], bool(offset))
+    if any(isinstance(one, UserFunctions) for one in outputs):  # known in the units of the record only
+        units = Transform.identity(data.m, data.l)
+    inner = [one and one.mapped(1 / scale, -level / scale)[0]
+             for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
+    return Plan(name, in_units(data, units), nx, block_rows, inner_bases(inputs, units), inner or None, instruments,
+                offset=bool(offset), units=units, **settings)
+
+
+def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
+    """Run a procedure and return its model in the units of the record that was planned for."""
+    evidence = yield from procedure
+    if evidence is None or evidence.model is None:
+        return evidence
+    return replace(evidence, model=evidence.model.with_transform(plan.units))
