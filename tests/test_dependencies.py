@@ -13,8 +13,8 @@ ROOT = Path(optid.__file__).parent
 HEAVY = ("cvxpy", "casadi", "numba", "matplotlib", "typer", "rich", "jinja2", "narwhals", "dask",
          "distributed")
 # the only modules of the engine that may know CVXPY: programmes, what reads their constraints, proofs, test problems
-CVXPY = {"program", "limits", "units", "gradients", "judging", "prices", "infeasibility", "tangent", "zoo",
-         "conformance", "certificate/lifting", "certificate/sdp", "rank_one/cones"}
+CVXPY = {"program", "view", "limits", "units", "gradients", "judging", "prices", "infeasibility", "tangent", "zoo",
+         "conformance", "certificate/convex", "certificate/lifting", "certificate/sdp", "rank_one/cones"}
 
 
 def modules():
