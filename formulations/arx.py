@@ -23,6 +23,8 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0) -> Program | Procedure:
     """Pose ``min ‖Y - Phi_y a - Phi_u b - d‖²``.
 
+    Named variables: ``a``, ``b``, ``offset``.
+
     Args:
         data: the record.
         na: number of past outputs in A.

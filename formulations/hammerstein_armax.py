@@ -34,6 +34,8 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nk: int | S
            constraints: Sequence[Any] = (), offset: bool = True, starts: int = 3, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear ARMAX model.
 
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``offset``.
+
     Args:
         data: the record; one output; samples may be missing.
         na: order of A.
@@ -57,6 +59,8 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int,
           constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 3, seed: int = 0
           ) -> Procedure:
     """Minimise the innovations of a Hammerstein ARMAX model.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``.
 
     Args:
         data: the record; one output; samples may be missing.

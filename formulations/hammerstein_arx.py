@@ -43,6 +43,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
           curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
     """Pose the bilinear least-squares problem ``min ‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
 
+    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``.
+
     Args:
         data: the record (or a stream larger than memory).
         na: number of past outputs in A.
@@ -152,6 +154,8 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
     shrinks Theta, so a rank-one answer is a start for `exact` rather than its solution.
 
+    Named variables: ``Theta``, ``a``, ``offset``.
+
     Args:
         data: the record.
         na: number of past outputs in A.
@@ -179,6 +183,8 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
                      constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
                      curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
     """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
+
+    Named variables: ``Theta``, ``a``, ``offset``.
 
     Args:
         data: the record.

@@ -50,6 +50,8 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk
            constraints: Sequence[Any] = (), offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear Box-Jenkins model.
 
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``.
+
     Args:
         data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles of the plant.
@@ -76,6 +78,8 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
           constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 4, seed: int = 0
           ) -> Procedure:
     """Minimise the innovations of a Hammerstein Box-Jenkins model.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``mu``, ``offset``, ``x0``.
 
     Args:
         data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.

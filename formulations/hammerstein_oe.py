@@ -54,6 +54,8 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
            constraints: Sequence[Any] = (), offset: bool = True, starts: int = 6, seed: int = 0) -> Procedure:
     """Minimise the simulation error of a linear model.
 
+    Named variables: ``Theta``, ``a``, ``b``, ``offset``, ``x0``.
+
     Args:
         data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles.
@@ -79,6 +81,8 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True,
           starts: int = 6, seed: int = 0) -> Procedure:
     """Minimise the simulation error of a Hammerstein model.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
         data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.

@@ -34,6 +34,8 @@ def sid(
 ) -> Procedure:
     """Identify an open-loop system from projections on past inputs and outputs.
 
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+
     Args:
         data: the record.
         nx: order; "auto" for the smallest order after which the singular values are noise (`optid.model_order`), "gap"
@@ -78,6 +80,8 @@ def sivid(
     With past instruments the correlation of instruments and regressors loses rank as the record grows; the directions
     below `tolerance` are dropped (pseudo-inverse), which is what distinguishes the method from `asivid`.
 
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+
     Args:
         data: the record.
         nx: as in `sid`.
@@ -118,6 +122,8 @@ def asivid(
     split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
 ) -> Procedure:
     """Identify a system with nonlinear feedback with instruments augmented by simulated, noise-free feedback.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
         data: the record.

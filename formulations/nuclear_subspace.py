@@ -116,6 +116,8 @@ def nuclear(
 ) -> Procedure:
     """Identify a state-space model from a low-rank Hankel matrix found by convex optimisation.
 
+    Named variables: ``output``, ``yhat``.
+
     Args:
         data: the record; missing outputs are estimated, windows with missing inputs left out.
         nx: order, or "auto": chosen with the weight by simulation of the parts held out; with one weight, the number

@@ -59,6 +59,8 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
           ) -> Program:
     """Pose the least squares of the simulation errors with the simulated outputs as variables.
 
+    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
+
     Args:
         data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         na: number of poles.

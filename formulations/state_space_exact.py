@@ -62,6 +62,8 @@ def linear(
 ) -> Procedure:
     """Minimise the simulation or prediction error of a linear state-space model.
 
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``.
+
     Args:
         data: the record. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
         nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
@@ -99,6 +101,8 @@ def exact(
 
     Every input acts through one nonlinearity (rank one). The feedback functions are taken in coordinates without a
     part that is linear in the outputs of the record, which A would repeat.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
         data: as in `linear`.

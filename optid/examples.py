@@ -9,6 +9,7 @@ import numpy as np
 from optid import plants, signals
 from optid.data import Data
 from optid.errors import LookupFailed, nearest
+from optid.models.recursions import lfilter
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,9 +215,7 @@ def _currents(n: int, seed: int) -> np.ndarray:
 
 
 def _filter(b: np.ndarray, a: np.ndarray, x: np.ndarray) -> np.ndarray:
-    from scipy.signal import lfilter
-
-    return np.asarray(lfilter(b, np.concatenate([[1.0], a]), x))
+    return lfilter(b, np.concatenate([[1.0], a]), x)
 
 
 def _energy(b: np.ndarray, a: np.ndarray) -> float:

@@ -9,7 +9,6 @@ on a noisy channel cannot be distinguished from wild readings; on a channel at r
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import fdtrc, ndtri
 
 from optid.bases.basis import Array
@@ -19,6 +18,9 @@ LONGEST = 3
 
 WINDOW = 15
 """Samples of the running median, the course that wild readings leave; more than half of them must be sound."""
+
+SHORT = 10_000
+"""Samples up to which sorting every window takes less time than the import of scipy.ndimage."""
 
 MOST = 0.12
 """Share of wild readings up to which they are looked for."""
@@ -98,6 +100,8 @@ def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Arra
 
 
 def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
+    from scipy.ndimage import maximum_filter1d
+
     n, lags = len(r), len(signature)
     used = ~np.isnan(r[:, 0])
     padded = np.concatenate([np.where(used[:, None], r, 0.0), np.zeros((lags - 1, r.shape[1]))])
@@ -116,11 +120,25 @@ def _departures(x: Array) -> Array:
     if x.size < WINDOW:
         return np.abs(x - np.median(x)) if x.size else x
     half = WINDOW // 2
-    course = median_filter(x, WINDOW)
+    course = _running_median(x)
     for line in (course, course[::-1]):  # views of its two ends
         slope = (line[2 * half] - line[half]) / half if x.size > 3 * half else 0.0
         line[:half] = line[half] - slope * np.arange(half, 0, -1)
     return np.abs(x - course)
+
+
+def _running_median(x: Array) -> Array:
+    """Return the median of `WINDOW` samples about every sample that has as many before and behind; else the sample."""
+    half = WINDOW // 2
+    course = x.copy()
+    if x.size <= SHORT:
+        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
+        course[half:-half] = np.partition(windows, half, axis=1)[:, half]
+    else:
+        from scipy.ndimage import median_filter
+
+        course[half:-half] = median_filter(x, WINDOW)[half:-half]
+    return course
 
 
 def _beyond(d: Array, parts: Sequence[Array]) -> np.ndarray:

@@ -11,6 +11,7 @@ from optid.errors import LookupFailed, StructureError, nearest
 FORMULATIONS = "optid.formulations"
 CONSTRAINTS = "optid.constraints"
 FAULTS = "optid.fault_formulations"
+_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults"}
 
 
 @cache
@@ -27,10 +28,19 @@ def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]
     """
     if callable(name):
         return getattr(name, "__name__", "formulation"), name
-    known = registered(FORMULATIONS)
+    return name, entry_point(FORMULATIONS, name).load()
+
+
+def entry_point(group: str, name: str) -> EntryPoint:
+    """Return the entry point of a name, not yet loaded.
+
+    Raises:
+        LookupFailed: no such name; the message has the nearest one.
+    """
+    known = registered(group)
     if not isinstance(name, str) or name not in known:
-        raise LookupFailed(f"no formulation is called {name!r}. {nearest(str(name), known)}")
-    return name, known[name].load()
+        raise LookupFailed(f"no {_NOUNS[group]} is called {name!r}. {nearest(str(name), known)}")
+    return known[name]
 
 
 def fault_formulation(name: str) -> Callable[..., Any]:
@@ -39,10 +49,7 @@ def fault_formulation(name: str) -> Callable[..., Any]:
     Raises:
         LookupFailed: no such name; the message has the nearest one.
     """
-    known = registered(FAULTS)
-    if name not in known:
-        raise LookupFailed(f"no programme about faults is called {name!r}. {nearest(name, known)}")
-    return known[name].load()
+    return entry_point(FAULTS, name).load()
 
 
 def named_constraint(text: str) -> Any:
@@ -53,10 +60,7 @@ def named_constraint(text: str) -> Any:
         StructureError: arguments it does not take.
     """
     word, *arguments = text.split(":")
-    known = registered(CONSTRAINTS)
-    if word not in known:
-        raise LookupFailed(f"no constraint is called {word!r}. {nearest(word, known)}")
-    build = known[word].load()
+    build = entry_point(CONSTRAINTS, word).load()
     positional: list[Any] = []
     keywords: dict[str, Any] = {}
     for argument in ":".join(arguments).split(",") if arguments else []:

@@ -12,6 +12,7 @@ from zoo import CASES, case, pose
 
 from optid.backends import BackEnd, Settings, back_ends
 from optid.backends import casadi as casadi_backend
+from optid.backends.catalogue import CONIC
 from optid.backends.conic import tolerances
 from optid.backends.dnlp import smooth
 from optid.conformance import SUCCESS, ConformanceError, check_back_end, run_case, value_error
@@ -20,6 +21,24 @@ from optid.solution import Status
 from optid.solving import solve
 
 INSTALLED = sorted(name for name, back_end in back_ends().items() if back_end.installed)
+
+
+def test_the_catalogue_agrees_with_cvxpy():
+    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
+
+    offered: dict[str, set[str]] = {}
+    for name, interface in SOLVER_MAP_CONIC.items():
+        cones = {c.__name__ for c in interface.SUPPORTED_CONSTRAINTS}
+        offered[name.lower()] = {"LP"} | ({"QP", "SOCP"} if cones & {"SOC", "PSD", "SvecPSD"} else set()) | (
+            {"SDP"} if cones & {"PSD", "SvecPSD"} else set()) | ({"conic"} if "ExpCone" in cones else set())
+    for name in SOLVER_MAP_QP:
+        offered[name.lower()] = offered.get(name.lower(), set()) | {"LP", "QP"}
+    left_out = {"glpk_mi": {"LP"}, "diffcp": offered["diffcp"]}
+    unfit = {"proxqp": {"LP"}, "scip": {"SOCP"}}
+    assert {name: set(classes.split()) | unfit.get(name, set()) for name, (classes, _, _) in CONIC.items()} | left_out \
+        == offered
+    assert {name.upper() for name, end in back_ends().items() if name in CONIC and end.installed} \
+        == set(cp.installed_solvers()) - {"GLPK_MI", "DIFFCP"} - {"IPOPT", "UNO", "COPT", "KNITRO"}
 
 
 @pytest.mark.parametrize("name", INSTALLED)

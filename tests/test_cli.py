@@ -1,3 +1,4 @@
+import inspect
 import json
 import subprocess
 import sys
@@ -14,7 +15,9 @@ from typer.testing import CliRunner
 import optid
 from optid.cli.app import app
 from optid.cli.terminal import spread
+from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
+from optid.registry import FORMULATIONS, registered
 
 
 def run(*words: object):
@@ -266,6 +269,21 @@ def test_registered_names_are_listed(command, group):
     assert result.exit_code == 0
     names = {point.name for point in entry_points(group=group)}
     assert names <= set(result.output.split())
+
+
+@pytest.mark.parametrize("name", sorted(registered(FORMULATIONS)))
+def test_a_formulation_documents_the_variables_it_poses(name):
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 60)
+    data = optid.Data(u, np.convolve(u + u**2, [1.0, 0.5])[:60] + 0.1 * rng.standard_normal(60))
+    offered = {"na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "polynomial:2"}
+    found = describe(registered(FORMULATIONS)[name])
+    function = registered(FORMULATIONS)[name].load()
+    parameters = inspect.signature(function).parameters
+    assert list(found.signature.parameters) == list(parameters)
+    problem = function(data, **{key: value for key, value in offered.items() if key in parameters})
+    view = problem.view if hasattr(problem, "view") else next(problem).view
+    assert set(found.variables) == set(view)
 
 
 def test_formulations_name_their_variables():

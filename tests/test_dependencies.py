@@ -63,6 +63,27 @@ def test_importing_the_package_is_light():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("words, missing", [
+    ("formulations", HEAVY), ("constraints", HEAVY), ("solvers", HEAVY), ("examples", HEAVY), ("--help", HEAVY),
+    ("fit nowhere.csv", HEAVY), ("fit --example thrster", HEAVY), ("fit --example thruster -f hammerstein", HEAVY),
+    ("fit --example thruster -c montone", HEAVY), ("fit --example thruster -s clarabl", HEAVY), ("fti", HEAVY),
+    ("fit --example thruster", ("numba", "matplotlib", "scipy.signal", "scipy.stats", "scipy.ndimage")),
+    ("fit --example thruster --report {folder}/r.html", ("numba", "scipy.signal", "scipy.stats", "scipy.ndimage"))])
+def test_a_command_imports_what_it_uses(words, missing, tmp_path):
+    missing = tuple(name for name in missing if name not in ("typer", "rich"))
+    code = f"""
+import sys
+from optid.cli import app
+sys.argv = ["optid", *{words.format(folder=tmp_path).split()!r}]
+try:
+    app()
+except SystemExit:
+    pass
+print([name for name in {missing!r} if name in sys.modules])"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
 def test_importing_the_package_is_quick():
     code = "import time; t = time.perf_counter(); import numpy; n = time.perf_counter(); import optid; " \
            "print(time.perf_counter() - n)"

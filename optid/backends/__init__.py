@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.errors import LookupFailed, SolverMissing, StructureError, nearest
-from optid.program import Program
 from optid.solution import Status
+
+if TYPE_CHECKING:
+    from optid.program import Program
 
 GROUP = "optid.backends"
 
@@ -80,7 +82,7 @@ class BackEnd:
 
     name: str
     classes: frozenset[str]
-    run: Callable[[Program, Settings], Answer] = field(repr=False)
+    run: Callable[["Program", Settings], Answer] = field(repr=False)
     installed: bool = True
     pip: str = ""
     duals: bool = True
@@ -89,7 +91,7 @@ class BackEnd:
     about: str = ""
     broken: str = ""
 
-    def refuses(self, program: Program) -> str:
+    def refuses(self, program: "Program") -> str:
         """Return why this back end cannot take the programme, or an empty string."""
         if program.rank_one is not None and "rank-one" in self.classes:
             return ""
@@ -127,7 +129,7 @@ def back_ends() -> dict[str, BackEnd]:
 
 
 def _broken(name: str, reason: str) -> BackEnd:
-    def run(program: Program, settings: Settings) -> Answer:
+    def run(program: "Program", settings: Settings) -> Answer:
         return Answer(Status.FAILED, reason)
 
     return BackEnd(name, frozenset(), run, installed=False, about="cannot be loaded", broken=reason)
@@ -159,7 +161,7 @@ AUTO: dict[str, tuple[str, ...]] = {
 """What `choose` chooses from: of a kind of programme the first that is installed."""
 
 
-def choose(program: Program) -> tuple[BackEnd, str]:
+def choose(program: "Program") -> tuple[BackEnd, str]:
     """Choose a back end by class and size of the programme, and say why.
 
     Raises:
@@ -186,7 +188,7 @@ FALLBACKS = ("daqp", "qoco", "highs", "cvxopt", "ipopt")
 """Convex back ends that take over from one chosen automatically, in this order; IPOPT comes with optid."""
 
 
-def fallbacks(program: Program, failed: str) -> Iterator[BackEnd]:
+def fallbacks(program: "Program", failed: str) -> Iterator[BackEnd]:
     """Yield the installed back ends that can solve a convex programme in place of one that gave no usable answer."""
     for name in FALLBACKS if program.kind != "NLP" and failed in AUTO["convex"] else ():
         back_end = back_ends().get(name)

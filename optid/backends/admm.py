@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends import Answer, Settings
 from optid.nuclear_norm.admm import minimise
 from optid.program import Program
 from optid.solution import Status
@@ -27,7 +27,3 @@ def run(program: Program, settings: Settings) -> Answer:
         return Answer(Status.LOCAL, "duality gap closed", values, duals, found.iterations)
     return Answer(Status.LIMIT, f"iteration limit at a relative gap of {found.gap:.1e}", values, duals,
                   found.iterations)
-
-
-back_end = BackEnd("admm", frozenset({"nuclear"}), run,
-                   about="own ADMM for nuclear-norm subspace fits; stops by the duality gap")

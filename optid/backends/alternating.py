@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cvxpy as cp
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends import Answer, Settings
 from optid.program import Program
 from optid.solution import Solution, Status
 from optid.solving import solve
@@ -126,7 +126,3 @@ def _stopped(half: Solution, last: Answer | None, count: int) -> Answer:
     if last is not None:
         return replace(last, status=Status.INACCURATE, word=word)
     return Answer(Status.UNBOUNDED if half.status is Status.UNBOUNDED else Status.FAILED, word, iterations=count)
-
-
-back_end = BackEnd("alternating", frozenset({"rank-one"}), run, warm=True,
-                   about="alternating convex half-steps for rank-one least squares, through any convex back end")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends import Answer, Settings
 from optid.group_sparse import minimise
 from optid.program import Program
 from optid.solution import Status
@@ -27,7 +27,3 @@ def run(program: Program, settings: Settings) -> Answer:
     if found.converged or found.gap <= max(100 * settings.accuracy, 1e-7):  # what the judgement allows
         return Answer(Status.LOCAL, "duality gap closed", values, duals, found.rounds)
     return Answer(Status.LIMIT, f"stopped at a relative gap of {found.gap:.1e}", values, duals, found.rounds)
-
-
-back_end = BackEnd("block_descent", frozenset({"group-sparse"}), run, warm=True,
-                   about="own active-set block descent for group-sparse programmes; stops by the duality gap")

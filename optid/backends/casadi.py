@@ -10,20 +10,17 @@ infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay
 
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends import Answer, Settings
 from optid.backends.dnlp import Smooth, by_name, cache, smooth
 from optid.errors import StructureError
 from optid.program import Program
 from optid.solution import Status
-
-CLASSES = frozenset({"LP", "QP", "NLP"})
 
 LIMIT = 3000  # iterations
 
@@ -344,16 +341,3 @@ def _compiled(name: str, form: Smooth, chosen: dict[str, Any]) -> Any:
     if key not in kept:
         kept[key] = ca.nlpsol("solver", name, kept["casadi"], chosen)
     return kept[key]
-
-
-def family() -> list[BackEnd]:
-    """Return the CasADi solvers that pass the conformance suite."""
-    found = []
-    for name, about in (("ipopt", "interior point with exact Hessians, through CasADi; large sparse programmes"),
-                        ("fatrop", "interior point with exact Hessians, through CasADi; blind to infeasibility")):
-
-        def run(program: Program, settings: Settings, name: str = name) -> Answer:
-            return solve_with(name, program, settings)
-
-        found.append(BackEnd(name, CLASSES, run, find_spec("casadi") is not None, "casadi", warm=True, about=about))
-    return found

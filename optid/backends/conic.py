@@ -5,8 +5,8 @@ from typing import Any
 
 import cvxpy as cp
 
-from optid.backends import Answer, BackEnd, Settings
-from optid.backends.dnlp import conic_capabilities
+from optid.backends import Answer, Settings
+from optid.backends.catalogue import WITHOUT_DUALS
 from optid.program import Program
 from optid.solution import Status
 
@@ -22,26 +22,8 @@ STATUS = {
     cp.SOLVER_ERROR: Status.FAILED,
 }
 
-PIP = {
-    "clarabel": "clarabel", "scs": "scs", "osqp": "osqp", "piqp": "piqp", "proxqp": "proxsuite", "daqp": "daqp",
-    "qoco": "qoco", "highs": "highspy", "cvxopt": "cvxopt", "glpk": "cvxopt", "glpk_mi": "cvxopt", "ecos": "ecos",
-    "sdpa": "sdpa-python", "scip": "pyscipopt", "mosek": "Mosek", "gurobi": "gurobipy", "copt": "coptpy",
-    "cplex": "cplex", "xpress": "xpress", "pdlp": "ortools", "glop": "ortools", "cbc": "cylp", "diffcp": "diffcp",
-    "mpax": "mpax", "qpalm": "qpalm", "cuopt": "cuopt", "knitro": "knitro",
-}
-
-UNFIT = {
-    "proxqp": {"LP"},  # calls feasible linear programmes infeasible, at any setting of its infeasibility tolerances
-    "scip": {"SOCP"},  # branches for minutes on a convex programme, then stops with an error of its LP solver
-}
-"""Classes that CVXPY offers but that do not pass `optid.conformance`."""
-
-WITHOUT_DUALS = {"scip"}  # none for quadratic programmes, wrong ones for linear programmes (its presolve is not undone)
-
 AMBIGUOUS = {"sdpa"}
 """Solvers whose "infeasible" can mean "unbounded": SDPA's pdINF says that the primal or the dual is infeasible."""
-
-LEFT_OUT = {"glpk_mi", "diffcp"}  # other doors to glpk (for integers) and to clarabel and scs (for derivatives)
 
 
 def tolerances(name: str, settings: Settings) -> dict[str, Any]:
@@ -133,19 +115,3 @@ def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bo
     except Exception:  # no answer confirms nothing
         return False
     return STATUS.get(bare.status) is Status.INFEASIBLE
-
-
-def family() -> list[BackEnd]:
-    """Return one back end for every conic or QP solver CVXPY has an interface to, commercial ones included."""
-    found = []
-    for name, (classes, installed) in conic_capabilities().items():
-        if name in LEFT_OUT:
-            continue
-
-        def run(program: Program, settings: Settings, name: str = name) -> Answer:
-            return solve_with(name, program, settings)
-
-        found.append(BackEnd(name, frozenset(classes - UNFIT.get(name, set())), run, installed, PIP.get(name, ""),
-                             duals=name not in WITHOUT_DUALS,
-                             warm=name in {"scs", "osqp", "piqp", "clarabel", "daqp", "proxqp"}, about="through CVXPY"))
-    return found

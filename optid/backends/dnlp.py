@@ -20,32 +20,11 @@ from cvxpy.constraints.zero import Equality, Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
 from cvxpy.reductions.solution import Solution as ReducedSolution
-from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC, SOLVER_MAP_QP
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.errors import StructureError
 
 CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
-
-
-def conic_capabilities() -> dict[str, tuple[set[str], bool]]:
-    """Return {lower-case solver name: (programme classes, installed)} for CVXPY's conic and QP interfaces."""
-    installed = set(cp.installed_solvers())
-    found: dict[str, tuple[set[str], bool]] = {}
-    for name, interface in SOLVER_MAP_CONIC.items():
-        cones = {c.__name__ for c in interface.SUPPORTED_CONSTRAINTS}
-        classes = {"LP"}
-        if "SOC" in cones:
-            classes |= {"QP", "SOCP"}
-        if cones & {"PSD", "SvecPSD"}:
-            classes |= {"QP", "SOCP", "SDP"}
-        if "ExpCone" in cones:
-            classes |= {"conic"}
-        found[name.lower()] = (classes, name in installed)
-    for name in SOLVER_MAP_QP:
-        classes, present = found.get(name.lower(), (set(), name in installed))
-        found[name.lower()] = (classes | {"LP", "QP"}, present)
-    return found
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import nnls
 
-from optid.backends import Answer, BackEnd, Settings, find
+from optid.backends import Answer, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.errors import StructureError
 from optid.gradients import flat_value
@@ -280,9 +280,3 @@ def _signed(point: Point) -> list[Point]:
 
 def _distance(z: np.ndarray, reached: np.ndarray) -> float:
     return float(np.linalg.norm(reached - z) / (1e-300 + np.linalg.norm(reached)))
-
-
-back_end = BackEnd("gauss_newton", frozenset({"rank-one"}), run, warm=True,
-                   thorough={"starts": 32, "directions": 16, "descents": 12},
-                   about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints")
-

@@ -6,12 +6,11 @@ returns no multipliers. Here the status of the *point* decides the claim.
 
 import time
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends import Answer, Settings
 from optid.backends.dnlp import Derivatives, Smooth, by_name, derivatives, smooth
 from optid.program import Program
 from optid.solution import Status
@@ -105,9 +104,3 @@ def _status(ended: str, point: str) -> tuple[str, Status]:
     if ended == "SUCCESS":
         return point, POINT.get(point, Status.FAILED)
     return ended, ENDED.get(ended, Status.FAILED)
-
-
-back_end = BackEnd(
-    "uno", frozenset({"LP", "QP", "NLP"}), run,
-    find_spec("unopy") is not None and find_spec("sparsediffpy") is not None, "unopy sparsediffpy", warm=True,
-    about="SQP through CVXPY's derivative engine; small dense programmes")

@@ -26,6 +26,7 @@ from optid.cli.options import (
 from optid.cli.ordering import order
 from optid.cli.reformulating import reformulate
 from optid.cli.results import command_line, conclude
+from optid.cli.startup import check_names, import_cvxpy
 from optid.cli.studies import study
 from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
 
@@ -183,17 +184,20 @@ def fit(
     Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
     --constraint monotone:increasing --report report.html
     """
+    check_names(formulation, constraint, solver)
     from optid.cli import arguments as words
-    from optid.fitting import fit as fit_model
-    from optid.selection import fit_by_holdout
-    from optid.showing.printing import describe
-    from optid.validation import validate as check
 
     words.check_folders(model, report)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
         record: Any
         record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
+        import_cvxpy()
+        from optid.fitting import fit as fit_model
+        from optid.selection import fit_by_holdout
+        from optid.showing.printing import describe
+        from optid.validation import validate as check
+
         arguments = words.suited(suggestion, formulation) if suggestion else {}
         given = {
             "na": na,

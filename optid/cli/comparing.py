@@ -13,6 +13,7 @@ from rich.text import Text
 
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.options import MODEL, RECORD, SOLVER, Example, Files, Report, Seed, reads_a_record
+from optid.cli.startup import check_names, import_cvxpy
 from optid.cli.studies import NOTHING_SOLVED, Accept, Workers, follow_progress
 from optid.cli.terminal import note, output, say
 from optid.errors import LookupFailed
@@ -83,7 +84,10 @@ def compare(
     Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2
     --basis triangular:8 --solvers all
     """
+    check_names(formulation, constraint)
     from optid.cli import arguments as words
+
+    import_cvxpy()
     from optid.errors import StudyError
     from optid.studies.definition.description import Study
     from optid.studies.execution import running

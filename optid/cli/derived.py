@@ -2,19 +2,18 @@
 
 import inspect
 import json
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from optid.cli.terminal import Command
+from optid.descriptions import Description, describe
 from optid.errors import LookupFailed
+from optid.registry import FORMULATIONS, entry_point, registered
 
 DEFAULT = "hammerstein_arx.exact"
-
-_AS_IN = re.compile(r"[Aa]s in `(\w+)`")
 
 
 class FittingCommand(Command):
@@ -60,11 +59,11 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
         taken: option words of the command.
     """
     try:
-        function = _function(name)
+        found = _described(name)
     except LookupFailed:
         return []
-    about, parameters = described(function), []
-    for key, parameter in _arguments(function).items():
+    about, parameters = found.arguments(), []
+    for key, parameter in found.options.items():
         word = option_of(key)
         if word in taken or key == "constraints":
             continue
@@ -106,52 +105,24 @@ def option_of(argument: str) -> str:
 
 def unknown(name: str, option: str) -> str:
     """Say that a formulation has no such option, what it has, and which formulations have it."""
-    from optid.registry import FORMULATIONS, registered
-
     key = option.removeprefix("--").partition("=")[0].replace("-", "_")
     having = []
     for other, point in sorted(registered(FORMULATIONS).items()):
         try:
-            if key in _arguments(point.load()):
+            if key in describe(point).options:
                 having.append(other)
         except ImportError:  # a broken plug-in takes nothing away
             continue
     try:
-        takes = " ".join(option_of(k) for k in _arguments(_function(name)) if k not in ("data", "constraints"))
+        takes = " ".join(option_of(k) for k in _described(name).options if k != "constraints")
     except LookupFailed as error:
         return f"there is no option {option}, and {error}"
     others = f" Formulations that do: {', '.join(having)}." if having else ""
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
 
 
-def described(function: Callable[..., Any]) -> dict[str, str]:
-    """Return {argument: its first sentence} from a Google docstring; "as in `other`" is looked up in the module."""
-    found: dict[str, str] = {}
-    lines = (inspect.getdoc(function) or "").splitlines()
-    if "Args:" not in lines:
-        return found
-    entries = "\n".join(lines[lines.index("Args:") + 1 :]).split("\n\n")[0]
-    for entry in re.split(r"\n(?=    \S)", "\n" + entries):
-        key, colon, text = entry.strip().partition(":")
-        if colon and key.isidentifier():
-            text = " ".join(text.split())
-            reference = _AS_IN.search(text)
-            other = getattr(inspect.getmodule(function), reference[1], None) if reference else None
-            if other is not None and other is not function:
-                text = described(other).get(key, text)
-            found[key] = re.split(r"(?<=[a-z)])[.;] ", text)[0].replace("`", "").rstrip(".")
-    return found
-
-
-def _function(name: str) -> Callable[..., Any]:
-    from optid.registry import formulation
-
-    return formulation(name)[1]
-
-
-def _arguments(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    parameters = inspect.signature(function).parameters
-    return {key: p for key, p in parameters.items() if p.kind is inspect.Parameter.KEYWORD_ONLY}
+def _described(name: str) -> Description:
+    return describe(entry_point(FORMULATIONS, name))
 
 
 def _json(words: Any) -> str:

@@ -1,16 +1,16 @@
 """Tables of what there is to choose from, generated from the registries and from nothing else."""
 
-import inspect
-import re
 from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint
 from typing import Any
 
-import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
 from optid.cli.terminal import output
+from optid.descriptions import Description, describe, describe_function
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
 
 Show = Callable[[], None]
 
@@ -46,31 +46,13 @@ def solvers() -> Show:
 
 def formulations() -> Show:
     """Return what prints every formulation with its summary, arguments and named variables, then those about faults."""
-    from optid.registry import FORMULATIONS, registered
-
-    rows = []
-    for name, point in sorted(registered(FORMULATIONS).items()):
-        try:
-            function = point.load()
-        except ImportError as error:  # a broken plug-in takes nothing away
-            rows.append((Text(name, "dim"), Text(f"cannot be loaded: {error}", "dim")))
-            continue
-        about = Text.assemble(
-            _summary(function),
-            ("\narguments: ", "dim"),
-            _arguments(function),
-            *((("\nvariables: ", "dim"), " ".join(variables)) if (variables := _variables(function)) else ()),
-            "\n",
-        )
-        rows.append((Text(name, "bold"), about))
     models = _table(
-        "Formulations",
-        ("formulation", "what it poses"),
-        rows,
+        "Formulations", ("formulation", "what it poses"), _entries(FORMULATIONS),
         "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
-        "Arguments in brackets may be left out.",
-    )
-    faults = _fault_programmes()
+        "Arguments in brackets may be left out.")
+    faults = _table(
+        "Programmes about faults", ("programme", "what it poses"), _entries(FAULTS),
+        "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.")
 
     def show() -> None:
         models()
@@ -79,38 +61,37 @@ def formulations() -> Show:
     return show
 
 
-def _fault_programmes() -> Show:
-    from optid.registry import FAULTS, registered
-
+def _entries(group: str) -> list[tuple[Text, Text]]:
+    """Names of a group with summary, arguments and named variables."""
     rows = []
-    for name, point in sorted(registered(FAULTS).items()):
-        try:
-            function = point.load()
-        except ImportError as error:
-            rows.append((Text(name, "dim"), Text(f"cannot be loaded: {error}", "dim")))
+    for name, point in sorted(registered(group).items()):
+        found = _described(point)
+        if isinstance(found, Text):
+            rows.append((Text(name, "dim"), found))
             continue
-        about = Text.assemble(_summary(function), ("\narguments: ", "dim"), _arguments(function), "\n")
-        rows.append((Text(name, "bold"), about))
-    return _table(
-        "Programmes about faults",
-        ("programme", "what it poses"),
-        rows,
-        "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.",
-    )
+        about = Text.assemble(found.summary, ("\narguments: ", "dim"), _arguments(found))
+        if found.variables:
+            about.append("\nvariables: ", "dim").append(" ".join(found.variables))
+        rows.append((Text(name, "bold"), about.append("\n")))
+    return rows
+
+
+def _described(point: EntryPoint) -> Description | Text:
+    try:
+        return describe(point)
+    except ImportError as error:  # a broken plug-in takes nothing away
+        return Text(f"cannot be loaded: {error}", "dim")
 
 
 def constraints() -> Show:
     """Return what prints every named constraint with its arguments and summary."""
-    from optid.registry import CONSTRAINTS, registered
-
     rows = []
     for name, point in sorted(registered(CONSTRAINTS).items()):
-        try:
-            function = point.load()
-        except ImportError as error:
-            rows.append((Text(name, "dim"), Text(""), Text(f"cannot be loaded: {error}", "dim")))
-            continue
-        rows.append((Text(name, "bold"), _arguments(function), _summary(function)))
+        found = _described(point)
+        if isinstance(found, Text):
+            rows.append((Text(name, "dim"), Text(""), found))
+        else:
+            rows.append((Text(name, "bold"), _arguments(found), found.summary))
     return _table(
         "Constraints",
         ("constraint", "arguments", "what it demands"),
@@ -123,7 +104,7 @@ def examples() -> Show:
     """Return what prints the built-in records."""
     from optid.examples import EXAMPLES
 
-    rows = [(Text(name, "bold"), _summary(function)) for name, function in sorted(EXAMPLES.items())]
+    rows = [(Text(name, "bold"), describe_function(function).summary) for name, function in sorted(EXAMPLES.items())]
     return _table("Built-in records", ("example", "what it is"), rows, "Use one with optid fit --example NAME.")
 
 
@@ -146,38 +127,9 @@ def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], fo
     return show
 
 
-def _summary(function: Any) -> str:
-    """First sentence of a docstring, without its markup."""
-    text = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
-    text = re.sub(r"`+", "", text)
-    return text[7].upper() + text[8:] if text.startswith("Return ") else text
-
-
-def _arguments(function: Any) -> Text:
+def _arguments(found: Description) -> Text:
     """Arguments after the record; those with a default in brackets."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except ValueError:
-        return Text("")
-    words = []
-    for p in parameters:
-        if p.name == "data" or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL):
-            continue
-        words.append(Text(p.name) if p.default is p.empty else Text(f"[{p.name}]", "dim"))
+    words = [Text(p.name) if p.default is p.empty else Text(f"[{p.name}]", "dim")
+             for p in found.signature.parameters.values()
+             if p.name != "data" and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
     return Text(" ").join(words)
-
-
-def _variables(function: Any) -> list[str]:
-    """Names that constraints may use, from the programme posed on a small simulated record."""
-    from optid.data import Data
-
-    rng = np.random.default_rng(0)
-    u = rng.uniform(-1, 1, 60)
-    data = Data(u, np.convolve(u + u**2, [1.0, 0.5])[:60] + 0.1 * rng.standard_normal(60))
-    offered = {"na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "polynomial:2"}
-    takes = inspect.signature(function).parameters
-    try:
-        problem = function(data, **{key: value for key, value in offered.items() if key in takes})
-        return sorted(problem.view if hasattr(problem, "view") else next(problem).view)
-    except Exception:  # a formulation that needs other arguments documents its variables itself
-        return []

@@ -5,9 +5,6 @@ from numba import njit
 
 from optid.bases.basis import Array
 
-FORMED = 32
-"""Samples whose derivatives are multiplied at once."""
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def innovate(F: Array, C: Array, gain: Array, r: Array, x0: Array) -> Array:
@@ -93,14 +90,14 @@ def innovation_moments(F: Array, C: Array, gain: Array, r: Array, x0: Array, wei
     turn, turned = np.zeros((n, q)), np.zeros((n, q))
     for i in range(n):
         turn[i, n * l + i] = 1.0
-    sums, products = np.zeros((q + 1, q + 1)), np.empty((q + 1, q + 1))
-    rows, filled = np.zeros((FORMED * l, q + 1)), 0  # [J | e] of some samples
+    sums, rows, filled = np.zeros((q, q + 1)), np.empty((4, q + 1)), 0  # [J'J | J'e], and [J | e] of four rows
     e, taken, seen = np.zeros(l), np.zeros(l), np.zeros((l, q))
     missing = np.zeros(l, dtype=np.bool_)
     for k in range(r.shape[0]):
         for o in range(l):
             predicted = 0.0
-            seen[o] = 0.0
+            for p in range(q):
+                seen[o, p] = 0.0
             for j in range(n):
                 predicted += C[o, j] * x[j]
                 for p in range(q):
@@ -111,7 +108,8 @@ def innovation_moments(F: Array, C: Array, gain: Array, r: Array, x0: Array, wei
         # d x+ = A dx + K de + dK e with de = -C dx where the residual is there
         for i in range(n):
             later[i] = 0.0
-            turned[i] = 0.0
+            for p in range(q):
+                turned[i, p] = 0.0
             for j in range(n):
                 later[i] += F[i, j] * x[j]
                 for p in range(q):
@@ -123,19 +121,23 @@ def innovation_moments(F: Array, C: Array, gain: Array, r: Array, x0: Array, wei
                     for p in range(q):
                         turned[i, p] += gain[i, o] * seen[o, p]
         for o in range(l):
-            row = rows[filled]
-            row[:] = 0.0
+            for p in range(q + 1):
+                rows[filled, p] = 0.0
             for c in range(l):
                 if not missing[c]:
-                    row[q] += weight[o, c] * e[c]
+                    rows[filled, q] += weight[o, c] * e[c]
                     for p in range(q):
-                        row[p] += weight[o, c] * seen[c, p]
+                        rows[filled, p] += weight[o, c] * seen[c, p]
             filled += 1
-        if filled == len(rows) or k == r.shape[0] - 1:
-            rows[filled:] = 0.0
-            np.dot(rows.T, rows, products)
-            sums += products
-            filled = 0
+            if filled == 4 or (k == r.shape[0] - 1 and o == l - 1):
+                for f in range(filled, 4):
+                    for p in range(q + 1):
+                        rows[f, p] = 0.0
+                filled = 0
+                for i in range(q):  # four rows at a time: the sums are read and written a quarter as often
+                    u, v, w, z = rows[0, i], rows[1, i], rows[2, i], rows[3, i]
+                    for p in range(q + 1):
+                        sums[i, p] += u * rows[0, p] + v * rows[1, p] + w * rows[2, p] + z * rows[3, p]
         x, later = later, x
         turn, turned = turned, turn
-    return sums[:q, :q].copy(), sums[:q, q].copy()
+    return sums[:, :q], sums[:, q]

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from optid.bases.basis import Array
+from optid.models.recursions import lfilter
 
 PRESENT, MISSING, DEAD = 0, 1, 2
 
@@ -72,11 +73,7 @@ def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
 
 def impulse_response(c: Array, d: Array, n: int) -> Array:
     """Return the first n samples of C/D, which begins with one."""
-    from scipy.signal import lfilter
-
-    impulse = np.zeros(n)
-    impulse[0] = 1.0
-    return np.asarray(lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), impulse))
+    return lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), np.eye(1, n)[0])
 
 
 def _march(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) -> tuple[Array, Array, Array, Any]:

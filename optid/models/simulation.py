@@ -13,6 +13,7 @@ import numpy as np
 
 from optid.bases.basis import Array
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models.recursions import lfilter
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_arx import HammersteinARX
@@ -140,9 +141,7 @@ def filtered(model: "HammersteinARX", right: Array) -> Array:
     if not model.na:
         return right
     if model.l == 1:
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter([1.0], np.concatenate([[1.0], model.a]), right, axis=0))
+        return lfilter([1.0], np.concatenate([[1.0], model.a]), right)
     with np.errstate(all="ignore"):
         return _recursion()(np.ascontiguousarray(model.a), np.ascontiguousarray(right))
 

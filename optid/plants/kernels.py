@@ -23,15 +23,26 @@ def pendulum(torque: Array, x0: Array, p: Array, dt: float, substeps: int) -> Ar
     """Return the states (N, 3) at the sampling instants, the motor torque (N,) held in between; classical RK4."""
     states = np.empty((torque.size, 3))
     h = dt / substeps
-    x, a, b, c, d = x0.copy(), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    x, at = np.empty(3), np.empty(3)
+    a, b, c, d = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        x[i] = x0[i]
     for k in range(torque.size):
-        states[k] = x
+        for i in range(3):
+            states[k, i] = x[i]
         for _ in range(substeps):
             _pendulum_rates(x, torque[k], p, a)
-            _pendulum_rates(x + 0.5 * h * a, torque[k], p, b)
-            _pendulum_rates(x + 0.5 * h * b, torque[k], p, c)
-            _pendulum_rates(x + h * c, torque[k], p, d)
-            x = x + h / 6 * (a + 2 * b + 2 * c + d)
+            for i in range(3):
+                at[i] = x[i] + 0.5 * h * a[i]
+            _pendulum_rates(at, torque[k], p, b)
+            for i in range(3):
+                at[i] = x[i] + 0.5 * h * b[i]
+            _pendulum_rates(at, torque[k], p, c)
+            for i in range(3):
+                at[i] = x[i] + h * c[i]
+            _pendulum_rates(at, torque[k], p, d)
+            for i in range(3):
+                x[i] = x[i] + h / 6 * (a[i] + 2 * b[i] + 2 * c[i] + d[i])
     return states
 
 
@@ -91,7 +102,8 @@ def with_feedback(a: Array, drive: Array, direct: Array, c: Array, e: Array, v: 
     states = np.empty((drive.shape[0], n))
     x, new = x0.copy(), np.empty(n)
     for k in range(drive.shape[0]):
-        states[k] = x
+        for i in range(n):
+            states[k, i] = x[i]
         y1, y2 = direct[k, 0] + v[k, 0], direct[k, 1] + v[k, 1]
         for i in range(n):
             y1 += c[0, i] * x[i]

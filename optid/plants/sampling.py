@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from optid.bases.basis import Array
 from optid.errors import DataError, StructureError
+from optid.models.recursions import lfilter
 
 WILD = 1e8
 
@@ -42,11 +43,9 @@ def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colou
     white = rng.standard_normal((n, channels))
     if size == 0 or colour == 0:
         return size * white
-    from scipy.signal import lfilter
-
     # The first sample has the stationary deviation; the filter then keeps it.
     white[1:] *= np.sqrt(1 - colour**2)
-    return size * np.asarray(lfilter([1.0], [1.0, -colour], white, axis=0))
+    return size * lfilter([1.0], [1.0, -colour], white)
 
 
 def check_bounded(states: Array, plant: str) -> None:

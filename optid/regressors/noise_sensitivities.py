@@ -24,6 +24,7 @@ from optid.bases.basis import Array
 from optid.models import noise_filter
 from optid.models.noise_filter import DEAD, PRESENT
 from optid.models.nonlinearity import Nonlinearity
+from optid.models.recursions import lfilter
 from optid.regressors.layout import Layout
 from optid.regressors.linearised import CONDITION_LIMIT, Linearised, assembled, compressed
 from optid.regressors.sensitivities import CHUNK, PlantPoint, Unknowns
@@ -164,8 +165,6 @@ def predict(u: Array, y: Array, unknowns: NoiseUnknowns, point: NoisePoint, inde
         point: where; C must be invertible, and A stable where D is not A.
         index: number of the experiment, for its initial state.
     """
-    from scipy.signal import lfilter
-
     layout, plant = unknowns.plant.layout, point.plant
     drive = np.full(len(u), plant.offset)
     for c, lags in enumerate(layout.lags):
@@ -176,7 +175,7 @@ def predict(u: Array, y: Array, unknowns: NoiseUnknowns, point: NoisePoint, inde
     if unknowns.apart:
         count = min(unknowns.memory, len(u))
         drive[:count] += plant.x0[index][:count]
-        x = np.asarray(lfilter([1.0], np.concatenate([[1.0], plant.a]), drive))
+        x = lfilter([1.0], np.concatenate([[1.0], plant.a]), drive)
         found = noise_filter.innovations(y - x, None, point.c, point.d)
     else:
         x = np.zeros(len(u))
@@ -281,7 +280,7 @@ class _Filter:
 
     def advance(self, u: Array, x: Array, *, first: bool) -> "_Filter":
         """Take in the next chunk (T, m) and the plant's output (T,)."""
-        from scipy.signal import lfilter
+        from scipy import signal
 
         n, self.count = self.unknowns.plant.layout.first_row, len(u)
         fresh = np.empty((len(u), self.width))
@@ -293,7 +292,7 @@ class _Filter:
         if self.unknowns.apart:
             fresh[:, self.impulse], fresh[:, self.output] = 0.0, x
             fresh[0, self.impulse] = float(first)
-            fresh, self.zi = lfilter(self.above, self.below, fresh, axis=0, zi=self.zi)
+            fresh, self.zi = signal.lfilter(self.above, self.below, fresh, axis=0, zi=self.zi)
         self.table = np.concatenate([self.table[len(self.table) - n :], fresh])
         return self
 

@@ -23,6 +23,9 @@ FORMED = 2048
 NARROW = 16
 """Products of dense signals at one lag up to which starting the threads of a matrix product does not pay."""
 
+SMALL = 3e7
+"""Products in a sum of dense rows up to which loading compiled loops (half a second) does not pay."""
+
 SAFE = 1e3
 """Energy subtracted from a column over energy left: beyond it more than three digits would be lost."""
 
@@ -251,7 +254,7 @@ class Sums:
         if block.weights is not None:
             used = np.flatnonzero(block.valid)
             self._add_rows(block, used, block.weights[used])
-        elif self.direct or self._direct_is_cheaper(block, count):
+        elif self.direct or self._is_small(count) or self._direct_is_cheaper(block, count):
             self._add_rows(block, np.flatnonzero(block.valid), np.ones(count))
         else:
             self._add_by_difference(block)
@@ -294,6 +297,9 @@ class Sums:
         gram[constant, constant] += self._stretched
         return np.triu(gram) + np.triu(gram, 1).T
 
+    def _is_small(self, rows: int) -> bool:
+        return rows * self.layout.n_complete**2 <= SMALL
+
     def _direct_is_cheaper(self, block: Block, used: int) -> bool:
         widths = [group.weights.shape[1] for group in block.groups]
         row = sum(width * len(group.lags) for width, group in zip(widths, block.groups)) ** 2 / 2
@@ -313,14 +319,14 @@ class Sums:
         self._stretched += block.valid.size
 
     def _add_rows(self, block: Block, rows: NDArray[np.intp], scale: Array) -> None:
-        from optid.regressors import kernels
-
         n = self.layout.n_complete
         entries = 1 + sum(group.weights.shape[1] * len(group.lags) for group in block.groups)
-        sparse = 3 * entries**2 < n**2
+        sparse = 3 * entries**2 < n**2 and not self._is_small(rows.size)
         for start in range(0, rows.size, FORMED):
             part, weights = rows[start : start + FORMED], scale[start : start + FORMED]
             if sparse:
+                from optid.regressors import kernels
+
                 columns, values = sparse_rows(block, part, n)
                 kernels.add_outer(columns, values, weights, self._gram)
                 energy = np.bincount(columns.ravel(), (values**2 * weights[:, None]).ravel(), n)

@@ -30,6 +30,9 @@ CHUNK = 8192
 NARROW = 8
 """Signals up to which a compiled loop is faster than one matrix product per lag."""
 
+SHORT = 5000
+"""Samples up to which it would not make up for its import."""
+
 FORMED = 2048
 """Windows formed at once where that is the cheapest way."""
 
@@ -282,7 +285,7 @@ class _Sums:
         """Add the products of the first `count` samples with those up to rows - 1 samples later."""
         part = signals[:count]
         self._total += np.ones(count) @ part
-        if self.d <= NARROW:
+        if self.d <= NARROW and count > SHORT:
             from optid.subspace.kernels import window_products
 
             found = np.zeros((self.d, self.rows * self.d))

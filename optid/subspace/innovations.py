@@ -215,7 +215,7 @@ def _responses(inner: Array, c: Array, e: Array, target: Array, first: int) -> I
     from optid.subspace.kernels import adjoint_responses
 
     l, n = c.shape  # noqa: E741
-    state = np.zeros((l, l, n))
+    c, state = np.array(c), np.zeros((l, l, n))  # a read-only argument would be compiled for once more
     for start in range(0, len(e), CHUNK):
         signals = np.ascontiguousarray(e[start : start + CHUNK])
         out = np.empty((len(signals), *state.shape))

@@ -49,23 +49,28 @@ def adjoint_responses(inner: Array, outputs: Array, signals: Array, state: Array
     """
     l, d, n = state.shape  # noqa: E741
     width = l * d
-    rows, left = out.reshape(out.shape[0], width * n), state.reshape(width, n)
-    x, before = left.T.copy(), np.empty((n, width))  # states outermost: the inner loops are long
+    x, before = np.empty((n, width)), np.empty((n, width))  # states outermost: the inner loops are long
+    for i in range(n):
+        for o in range(l):
+            for j in range(d):
+                x[i, o * d + j] = state[o, j, i]
     for t in range(signals.shape[0]):
-        row = rows[t]
         for i in range(n):
-            for j in range(width):
-                row[j * n + i] = x[i, j]
-                before[i, j] = x[i, j]
             for o in range(l):
                 for j in range(d):
-                    x[i, o * d + j] = outputs[o, i] * signals[t, j]
+                    place = o * d + j
+                    out[t, o, j, i] = x[i, place]
+                    before[i, place] = x[i, place]
+                    x[i, place] = outputs[o, i] * signals[t, j]
         for h in range(n):
             for i in range(n):
                 weight = inner[h, i]
                 for j in range(width):
                     x[i, j] += weight * before[h, j]
-    left[:] = x.T
+    for i in range(n):
+        for o in range(l):
+            for j in range(d):
+                state[o, j, i] = x[i, o * d + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -131,4 +136,5 @@ def state_run(a: Array, drive: Array, x: Array, out: Array) -> None:
             following[i] = drive[t, i]
             for h in range(n):
                 following[i] += a[i, h] * x[h]
-        x[:] = following
+        for i in range(n):
+            x[i] = following[i]

@@ -269,7 +269,7 @@ class _Regressors:
                 state = np.zeros((form.l, signals.shape[1], form.n))
                 state[:, 0] = form.c  # C_o F^k, the effect of x0
             out = np.empty((len(raw), *state.shape))
-            adjoint_responses(inner, form.c, signals, state, out)
+            adjoint_responses(inner, np.array(form.c), np.ascontiguousarray(signals), state, out)
             for o in range(form.l):
                 present = ~np.isnan(y[:, o])
                 rows = self._rows(o, signals, out[:, o], y[:, o])

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
 from optid.bases.basis import Array
 from optid.data import Data
 from optid.model_order.ranks import rank_test
+from optid.models.recursions import lfilter
 from optid.stretches import interpolated
 from optid.subspace.hankel import HankelStatistics, hankel_statistics
 from optid.subspace.rq import rq
@@ -116,11 +118,9 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
         delay: samples before all responses begin.
         longest: samples after which the responses are cut at the latest.
     """
-    from scipy.signal import lfilter
-
     a = np.asarray(np.real(np.poly(np.concatenate([poles, poles]))), dtype=float) if len(poles) else np.ones(1)
     count = a.size + extra
-    response = np.asarray(lfilter([1.0], a, np.eye(1, max(longest, count + 1))[0]))
+    response = lfilter([1.0], a, np.eye(1, max(longest, count + 1))[0])
     large = np.flatnonzero(np.abs(response) > SETTLED * np.abs(response).max())
     length = min(response.size, int(large[-1]) + 1 + count)
     shifted = np.column_stack([np.concatenate([np.zeros(i), response[: length - i]]) for i in range(count)])
@@ -130,10 +130,13 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
 
 def convolved(values: Array, filters: Array) -> Array:
     """Filter every column of values (T, P) with every response of filters (L, J) where it fits: (T - L + 1, J, P)."""
-    from scipy.signal import oaconvolve
-
-    columns = [oaconvolve(values, response[:, None], mode="valid", axes=0) for response in filters.T]
-    return np.stack(columns, axis=1)
+    size = next_fast_len(len(values), real=True)
+    spectra = np.asarray(rfft(values, size, axis=0))
+    found = np.empty((len(values) - len(filters) + 1, filters.shape[1], values.shape[1]))
+    for j, response in enumerate(filters.T):
+        whole = np.asarray(irfft(spectra * np.asarray(rfft(response, size))[:, None], size, axis=0))
+        found[:, j] = whole[len(filters) - 1 : len(values)]
+    return found
 
 
 def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:

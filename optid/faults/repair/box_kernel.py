@@ -23,10 +23,14 @@ def box_quadratic(H, g, low, high, z, steps, tolerance):
     q = z.size
     for i in range(q):
         z[i] = min(max(z[i], low[i]), high[i])
-    gradient = H @ z + g
+    gradient, curved, trial = np.empty(q), np.empty(q), np.empty(q)
     free = np.empty(q, dtype=np.int64)
-    trial = np.empty(q)
-    scale = max(np.max(np.abs(g)), 1e-300)
+    scale = 1e-300
+    for i in range(q):
+        gradient[i] = g[i]
+        scale = max(scale, abs(g[i]))
+        for j in range(q):
+            gradient[i] += H[i, j] * z[j]
     residual = np.inf
     for step in range(steps):
         count, residual = 0, 0.0
@@ -55,11 +59,12 @@ def box_quadratic(H, g, low, high, z, steps, tolerance):
             for a in range(count):
                 i = free[a]
                 trial[i] = min(max(z[i] + length * direction[a], low[i]), high[i])
-            change = trial - z
-            curved = H @ change
             decrease = 0.0
             for i in range(q):
-                decrease += gradient[i] * change[i] + 0.5 * curved[i] * change[i]
+                curved[i] = 0.0
+                for j in range(q):
+                    curved[i] += H[i, j] * (trial[j] - z[j])
+                decrease += (gradient[i] + 0.5 * curved[i]) * (trial[i] - z[i])
             if decrease <= -1e-4 * length * slope * 1e-3 or decrease <= 0.0 and length < 1e-6:
                 moved = True
                 break
@@ -69,6 +74,8 @@ def box_quadratic(H, g, low, high, z, steps, tolerance):
         for i in range(q):
             z[i] = trial[i]
             gradient[i] += curved[i]
-        if step % 8 == 7:
-            gradient = H @ z + g  # sums of changes lose digits
+        for i in range(q if step % 8 == 7 else 0):  # sums of changes lose digits
+            gradient[i] = g[i]
+            for j in range(q):
+                gradient[i] += H[i, j] * z[j]
     return residual / scale, steps

@@ -170,5 +170,7 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
                     for b in range(n):
                         for i in range(columns):
                             later[a, i] += F[t, a, b] * x[b, i]
-                x[:] = later
+                for a in range(n):
+                    for i in range(columns):
+                        x[a, i] = later[a, i]
     return found

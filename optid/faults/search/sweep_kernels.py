@@ -136,8 +136,9 @@ def grams(tables, group, slots, products, states):
             for a in range(n):
                 for j in range(columns):
                     P[i, j] += F[t, a, i] * pushed[a, j]
-        if whole:
-            states[k] = P
+        for i in range(n if whole else 0):
+            for j in range(columns):
+                states[k, i, j] = P[i, j]
         for i in range(n):
             for j in range(n):
                 moved[i, j] = 0.0
@@ -241,4 +242,6 @@ def course(tables, first, order, onset, signature):
                 for a in range(n):
                     total += tables.F[t, i, a] * x[a, j]
                 later[i, j] = total
-        x[:] = later
+        for i in range(n):
+            for j in range(d):
+                x[i, j] = later[i, j]

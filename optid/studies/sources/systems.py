@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from optid import examples, plants
 from optid.data import Data
 from optid.errors import DataError, LookupFailed, nearest
+from optid.models.recursions import lfilter
 from optid.plants.feedback import EXAMPLE1, TWO_MODES, FeedbackSystem
 from optid.studies.sources.truth import Truth
 
@@ -70,7 +70,7 @@ def simulate(name: str, samples: int | None = None, noise: float | None = None, 
 
 
 def _impulse(b: np.ndarray, a: np.ndarray) -> np.ndarray:
-    return np.asarray(lfilter(b, np.concatenate([[1.0], a]), np.eye(1, LENGTH)[0]))
+    return lfilter(b, np.concatenate([[1.0], a]), np.eye(1, LENGTH)[0])
 
 
 def _example(make: Callable[..., examples.Example], ranges: tuple[tuple[float, float], ...], samples: int, noise: float,
@@ -101,10 +101,10 @@ class _Equation:
         u = rng.standard_normal(samples) if self.gaussian else rng.uniform(*self.range, samples)
         e = rng.standard_normal(samples)
         poles = np.concatenate([[1.0], self.a])
-        clean = np.asarray(lfilter(self.b, poles, self.f(u)))
+        clean = lfilter(self.b, poles, self.f(u))
         power = float(np.var(clean)) if self.power is None else self.power
         sigma = noise * float(np.sqrt(power / np.sum(_impulse(self.c, self.a) ** 2)))
-        data = Data(u, clean + np.asarray(lfilter(sigma * self.c, poles, e)), self.dt)
+        data = Data(u, clean + lfilter(sigma * self.c, poles, e), self.dt)
         return data, Truth((self.f,), (self.range,), _impulse(self.b, self.a)[:, None, None])
 
 

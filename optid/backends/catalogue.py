@@ -1,0 +1,90 @@
+"""The solvers optid comes with an interface to, as data: what each takes, and which package it needs.
+
+A solver's code is imported when it is first asked to solve something.
+"""
+
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from optid.backends import Answer, BackEnd
+
+CONIC: dict[str, tuple[str, str, str]] = {
+    "clarabel": ("LP QP SOCP SDP conic", "clarabel", "clarabel"),
+    "cbc": ("LP", "cylp", "cylp"),
+    "copt": ("LP QP SOCP SDP conic", "coptpy", "coptpy"),
+    "cosmo": ("LP QP SOCP SDP conic", "cosmopy", ""),
+    "cplex": ("LP QP SOCP", "cplex", "cplex"),
+    "cuclarabel": ("LP QP SOCP conic", "juliacall", ""),
+    "cuopt": ("LP QP SOCP", "cuopt", "cuopt"),
+    "cvxopt": ("LP QP SOCP SDP", "cvxopt", "cvxopt"),
+    "daqp": ("LP QP", "daqp", "daqp"),
+    "ecos": ("LP QP SOCP conic", "ecos", "ecos"),
+    "ecos_bb": ("LP QP SOCP conic", "ecos", ""),
+    "glop": ("LP", "ortools", "ortools"),
+    "glpk": ("LP", "cvxopt", "cvxopt"),
+    "gurobi": ("LP QP SOCP", "gurobipy", "gurobipy"),
+    "highs": ("LP QP", "highspy", "highspy"),
+    "knitro": ("LP QP SOCP SDP conic", "knitro", "knitro"),
+    "moreau": ("LP QP SOCP SDP conic", "moreau", ""),
+    "mosek": ("LP QP SOCP SDP", "mosek", "Mosek"),
+    "mpax": ("LP QP", "mpax", "mpax"),
+    "nag": ("LP QP SOCP", "naginterfaces", ""),
+    "osqp": ("LP QP", "osqp", "osqp"),
+    "pdcs": ("LP QP SOCP conic", "juliacall", ""),
+    "pdlp": ("LP", "ortools", "ortools"),
+    "piqp": ("LP QP", "piqp", "piqp"),
+    "proxqp": ("QP", "proxsuite", "proxsuite"),  # calls feasible linear programmes infeasible, whatever its tolerances
+    "qoco": ("LP QP SOCP", "qoco", "qoco"),
+    "qpalm": ("LP QP", "qpalm", "qpalm"),
+    "scip": ("LP QP", "pyscipopt", "pyscipopt"),  # branches for minutes on a cone, then fails in its LP solver
+    "scipy": ("LP", "scipy", ""),
+    "scs": ("LP QP SOCP SDP conic", "scs", "scs"),
+    "sdpa": ("LP QP SOCP SDP", "sdpap", "sdpa-python"),
+    "xpress": ("LP QP SOCP", "xpress", "xpress"),
+}
+"""{word: (classes that pass `optid.conformance`, package to import, what pip calls it)} of the solvers under CVXPY.
+
+Left out are glpk_mi and diffcp, other interfaces to glpk (for integers) and to clarabel and scs (for derivatives).
+"""
+
+WITHOUT_DUALS = {"scip"}  # none for quadratic programmes, wrong ones for linear programmes (its presolve is not undone)
+WARM = {"clarabel", "daqp", "osqp", "piqp", "proxqp", "scs"}
+
+
+def back_ends() -> list[BackEnd]:
+    """Return all of them, installed or not."""
+    return [
+        *(BackEnd(name, frozenset(classes.split()), partial(_run, "conic:solve_with", name), _is_installed(package),
+                  pip, duals=name not in WITHOUT_DUALS, warm=name in WARM, about="through CVXPY")
+          for name, (classes, package, pip) in CONIC.items()),
+        BackEnd("ipopt", frozenset({"LP", "QP", "NLP"}), partial(_run, "casadi:solve_with", "ipopt"),
+                _is_installed("casadi"), "casadi", warm=True,
+                about="interior point with exact Hessians, through CasADi; large sparse programmes"),
+        BackEnd("fatrop", frozenset({"LP", "QP", "NLP"}), partial(_run, "casadi:solve_with", "fatrop"),
+                _is_installed("casadi"), "casadi", warm=True,
+                about="interior point with exact Hessians, through CasADi; blind to infeasibility"),
+        BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "uno:run"),
+                _is_installed("unopy") and _is_installed("sparsediffpy"), "unopy sparsediffpy", warm=True,
+                about="SQP through CVXPY's derivative engine; small dense programmes"),
+        BackEnd("gauss_newton", frozenset({"rank-one"}), partial(_run, "gauss_newton:run"), warm=True,
+                thorough={"starts": 32, "directions": 16, "descents": 12},
+                about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints"),
+        BackEnd("alternating", frozenset({"rank-one"}), partial(_run, "alternating:run"), warm=True,
+                about="alternating convex half-steps for rank-one least squares, through any convex back end"),
+        BackEnd("admm", frozenset({"nuclear"}), partial(_run, "admm:run"),
+                about="own ADMM for nuclear-norm subspace fits; stops by the duality gap"),
+        BackEnd("block_descent", frozenset({"group-sparse"}), partial(_run, "block_descent:run"), warm=True,
+                about="own active-set block descent for group-sparse programmes; stops by the duality gap"),
+    ]
+
+
+def _run(target: str, *arguments: Any) -> Answer:
+    """Call the function "module:name" below `optid.backends`, with a solver's word where one is given first."""
+    module, _, function = target.partition(":")
+    return getattr(import_module(f"optid.backends.{module}"), function)(*arguments)
+
+
+def _is_installed(package: str) -> bool:
+    return find_spec(package) is not None

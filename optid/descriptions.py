@@ -1,0 +1,132 @@
+"""What a registered function says of itself: its signature and docstring, read from its source without importing it."""
+
+import ast
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+_AS_IN = re.compile(r"[Aa]s in `(\w+)`")
+_NAMED = re.compile(r"Named variables: ([^.]*)\.")
+
+
+@dataclass(frozen=True)
+class Description:
+    """Signature and docstring of a function.
+
+    Attributes:
+        signature: defaults as values, expressions and annotations as text.
+        text: the docstring.
+        siblings: docstrings of the functions of the same module, by name.
+    """
+
+    signature: inspect.Signature
+    text: str
+    siblings: Mapping[str, str]
+
+    @property
+    def summary(self) -> str:
+        """First paragraph of the docstring, without its markup."""
+        text = re.sub(r"`+", "", self.text.split("\n\n")[0].replace("\n", " "))
+        return text[7].upper() + text[8:] if text.startswith("Return ") else text
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names that constraints may use, from the sentence "Named variables: ..."."""
+        found = _NAMED.search(" ".join(self.text.split()))
+        return tuple(re.findall(r"``([^`]+)``", found[1])) if found else ()
+
+    @property
+    def options(self) -> dict[str, inspect.Parameter]:
+        """The keyword-only parameters by name."""
+        return {key: p for key, p in self.signature.parameters.items() if p.kind is p.KEYWORD_ONLY}
+
+    def arguments(self) -> dict[str, str]:
+        """Return {argument: its first sentence}; "as in `other`" is looked up in the module."""
+        return _arguments(self.text, self.siblings)
+
+
+def describe(point: EntryPoint) -> Description:
+    """Describe the function of an entry point.
+
+    Raises:
+        ImportError: its module cannot be found.
+    """
+    found = _in_source(point.module, point.attr)
+    if found is not None:
+        return found
+    return describe_function(point.load())
+
+
+def describe_function(function: Callable[..., Any]) -> Description:
+    """Describe a function that is loaded."""
+    module = vars(inspect.getmodule(function) or object())
+    siblings = {name: inspect.getdoc(one) or "" for name, one in module.items() if inspect.isfunction(one)}
+    return Description(inspect.signature(function), inspect.getdoc(function) or "", siblings)
+
+
+def _in_source(module: str, name: str) -> Description | None:
+    """Read a function that its module defines without decorators; None where it does not."""
+    functions = _functions(module)
+    node = functions.get(name)
+    if node is None or node.decorator_list:
+        return None
+    given = node.args
+    parameters = []
+    plain = [*given.posonlyargs, *given.args]
+    missing = [None] * (len(plain) - len(given.defaults))
+    for argument, default in zip(plain, [*missing, *given.defaults]):
+        parameters.append(_parameter(argument, inspect.Parameter.POSITIONAL_OR_KEYWORD, default))
+    if given.vararg:
+        parameters.append(_parameter(given.vararg, inspect.Parameter.VAR_POSITIONAL, None))
+    for argument, default in zip(given.kwonlyargs, given.kw_defaults):
+        parameters.append(_parameter(argument, inspect.Parameter.KEYWORD_ONLY, default))
+    if given.kwarg:
+        parameters.append(_parameter(given.kwarg, inspect.Parameter.VAR_KEYWORD, None))
+    siblings = {other: ast.get_docstring(found) or "" for other, found in functions.items()}
+    return Description(inspect.Signature(parameters), siblings[name], siblings)
+
+
+@cache
+def _functions(module: str) -> dict[str, ast.FunctionDef]:
+    spec = find_spec(module)
+    if spec is None:
+        raise ImportError(f"no module is called {module!r}")
+    if spec.origin is None or not spec.origin.endswith(".py"):
+        return {}
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    return {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def _parameter(argument: ast.arg, kind: Any, default: ast.expr | None) -> inspect.Parameter:
+    annotation = inspect.Parameter.empty if argument.annotation is None else ast.unparse(argument.annotation)
+    value: Any = inspect.Parameter.empty
+    if default is not None:
+        try:
+            value = ast.literal_eval(default)
+        except ValueError:  # an expression, such as np.inf
+            value = ast.unparse(default)
+    return inspect.Parameter(argument.arg, kind, default=value, annotation=annotation)
+
+
+def _arguments(text: str, siblings: Mapping[str, str]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    lines = text.splitlines()
+    if "Args:" not in lines:
+        return found
+    entries = "\n".join(lines[lines.index("Args:") + 1 :]).split("\n\n")[0]
+    for entry in re.split(r"\n(?=    \S)", "\n" + entries):
+        key, colon, said = entry.strip().partition(":")
+        if colon and key.isidentifier():
+            said = " ".join(said.split())
+            reference = _AS_IN.search(said)
+            other = siblings.get(reference[1], "") if reference else ""
+            if other and other != text:
+                said = _arguments(other, siblings).get(key, said)
+            found[key] = re.split(r"(?<=[a-z)])[.;] ", said)[0].replace("`", "").rstrip(".")
+    return found
