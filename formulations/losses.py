@@ -36,6 +36,7 @@ HUBER = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
 KINK = 1e-6  # half-width at which the rounded kink of l1 ends, in robust standard deviations
 PASSES = 200
 SETTLING = 3  # passes in which the robust scale is estimated
+IDLE = 3  # passes without a smaller objective or a better bound: a solver's multipliers vary from pass to pass
 CLOSED = 1e-9  # relative gap at which a convex loss needs no further pass
 
 
@@ -110,7 +111,7 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
             break
         program, problem = pose(used.weights)
     best = gap = np.inf
-    final = width <= spread * threshold
+    idle, final = 0, width <= spread * threshold
     for _ in range(PASSES):
         solution = yield program
         if not solution.has_point:
@@ -121,7 +122,8 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
         found = _evidence(program, solution, sizes, weights, kind, width, convex)
         stalled = final and best - found.objective <= 1e-12 * max(abs(found.objective), 1e-300)
         now = relative_gap(found.objective, found.bound.value, scale * program.unit)
-        if (convex and now <= CLOSED) or (stalled and not now < 0.9 * gap):
+        idle = idle + 1 if stalled and not now < 0.9 * gap else 0
+        if (convex and now <= CLOSED) or idle == (IDLE if convex else 1):
             break
         best, gap = min(best, found.objective) if final else np.inf, now
         final = width <= spread * threshold

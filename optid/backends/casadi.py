@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from optid.backends import Answer, Settings
 from optid.backends.dnlp import Smooth, by_name, cache, smooth
 from optid.errors import StructureError
+from optid.gradients import MOVES
 from optid.program import Program
 from optid.solution import Status
 
@@ -94,11 +95,6 @@ def constant(value: Any, shape: tuple[int, int]) -> Any:
         pattern = ca.Sparsity(*shape, value.indptr.tolist(), value.indices.tolist())
         return ca.DM(pattern, value.data)
     return ca.sparsify(ca.DM(np.reshape(np.asarray(value, dtype=float), shape, order="F")))
-
-
-MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "Concatenate", "Promote", "broadcast_to",
-         "diag_vec", "diag_mat", "upper_tri", "squeeze", "Stack", "nonneg_wrap", "nonpos_wrap", "symmetric_wrap",
-         "psd_wrap", "nsd_wrap", "real"}
 
 
 def _move(expr: Any, columns: list) -> Any:

@@ -168,9 +168,6 @@ class _Constrained:
         x = self._in_gauge(point)
         if x is None:
             return None
-        values = self.at.unpack(x)
-        for name, pin in self.half.pins.items():
-            pin.value = values[name]
         # with b fixed the residual is affine, so that one linearisation is exact
         self.half.set_model(x, {}, second_order=False)
         answer = self.half.run(self.inner, self.settings)

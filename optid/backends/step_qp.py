@@ -2,20 +2,21 @@
 
 Convex constraints enter as they are, the others through their tangents. The model of the objective has the exact
 second-order terms of ``mu bᵀ``, also where the constraints multiply it, and is made definite first across the active
-constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapter 18). A programme is compiled once;
-matrices and right-hand sides are parameters.
+constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapter 18).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings
+from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
-from optid.gradients import jacobians
+from optid.gradients import flat_value, jacobians
 from optid.limits import EQUALITIES, INEQUALITIES
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point
@@ -57,6 +58,10 @@ class Coordinates:
         """Return named values for x."""
         parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
         return {name: np.reshape(part, v.shape, order="F") for name, v, part in zip(self.names, self.variables, parts)}
+
+    def assigned(self) -> np.ndarray:
+        """Return x as the CVXPY variables hold it."""
+        return np.concatenate([flat_value(variable) for variable in self.variables])
 
     def assign(self, x: np.ndarray) -> None:
         """Write x into the CVXPY variables."""
@@ -116,87 +121,83 @@ class Coordinates:
         return found
 
 
-@dataclass(frozen=True)
-class Tangent:
-    """A constraint that is not convex, linearised at every point: ``slope @ x + level <= 0`` or ``= 0``.
+@dataclass(eq=False)
+class _Rows:
+    """A constraint of a step, ``slope @ x + level <= 0`` or ``= 0`` in the units of the programme.
 
     Attributes:
         name: of its group.
         span: its rows in the multipliers of the group.
-        expression: the left-hand side.
-        slope: parameter (r, size).
-        level: parameter (r,).
-        rows: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
+        member: the constraint of the programme.
+        unit: the rows are divided by it.
+        slope: (r, size).
+        level: (r,).
+        lifted: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
     """
 
     name: str
     span: slice
-    expression: cp.Expression
-    slope: cp.Parameter
-    level: cp.Parameter
-    rows: tuple[np.ndarray, np.ndarray] | None
+    member: cp.Constraint
+    unit: float
+    slope: np.ndarray
+    level: np.ndarray
+    lifted: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def equality(self) -> bool:
+        """Whether it is an equality."""
+        return isinstance(self.member, EQUALITIES)
+
+    @property
+    def affine(self) -> bool:
+        """Whether slope and level are those of the constraint everywhere, and not of its tangent."""
+        return self.member.is_dcp()
 
 
 class StepQP:
-    """``minimise ‖U x - t‖²`` over the programme's own variables and constraints, compiled once.
+    """``minimise ‖U x - t‖²`` over the programme's own variables and constraints, with matrices that change.
+
+    With affine constraints and tangents alone it goes straight to Clarabel; with cones, or to another back end, it goes
+    through CVXPY, compiled once.
 
     Args:
         at: the programme and its coordinates.
         sizes: natural size of every variable; the QP is written in these units, and its constraints without units.
-        pinned: hold every b at a parameter and drop the gauge; what is left is convex.
+        pinned: hold every b at its value in the model and drop the gauge; what is left is convex.
     """
 
     def __init__(self, at: Coordinates, sizes: Mapping[str, float], *, pinned: bool) -> None:
-        self.at, self.tangents, self.sizes = at, [], dict(sizes)
-        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
-        self._swap = {id(v): sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
+        self.at, self.sizes, self.pinned = at, dict(sizes), pinned
+        self.rows: list[_Rows] = []
+        self.cones: list[tuple[str, slice, cp.Constraint]] = []
         self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
-        self._units: dict[str, np.ndarray] = {}
+        self._pins = np.zeros(at.size, dtype=bool)
+        position = 0
+        for name, variable in zip(at.names, at.variables):
+            self._pins[position : position + variable.size] = pinned and name in [b for _, b in at.form.blocks]
+            position += variable.size
         self._slopes: dict[int, np.ndarray] = {}
-        self.matrix = cp.Parameter((at.size, at.size), value=np.eye(at.size))
-        self.target = cp.Parameter(at.size, value=np.zeros(at.size))
-        self.pins: dict[str, cp.Parameter] = {}
-        self.unit = 1.0
-        self._x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in stand_ins.values()])
-        r = cp.Variable(at.size)
-        constraints: dict[str, tuple] = {"model": (r == self.matrix @ self._x - self.target,)}
-        for _, name in at.form.blocks if pinned else ():
-            variable = at.program.variables[name]
-            self.pins[name] = cp.Parameter(variable.shape, value=np.zeros(variable.shape))
-            constraints[f"pinned {name}"] = (stand_ins[name] == self.pins[name] / sizes[name],)
-        where = places(at.program, at.form)
+        self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
-            if name == "residual" or (pinned and name == "gauge"):
-                continue
-            spans = _spans(group)
-            self._units[name] = np.ones(spans[-1].stop)
-            constraints[name] = tuple(
-                self._convex(name, member, span) if member.is_dcp()
-                else self._tangent(name, member, span, where.rows(member)) for member, span in zip(group, spans))
-        self.program = Program("step", cp.Minimize(cp.sum_squares(r)), constraints, {**stand_ins, "_r": r}, {}, dict,
-                               at.program.view)
+            if name != "residual" and not (pinned and name == "gauge"):
+                for member, span in zip(group, _spans(group)):
+                    self._add(name, member, span)
 
-    def _convex(self, name: str, member: cp.Constraint, span: slice) -> cp.Constraint:
-        """Write a convex constraint in the units of the QP; an affine one also with rows of size one."""
-        if not isinstance(member, EQUALITIES | INEQUALITIES) or not member.expr.is_affine():
-            return member.tree_copy(self._swap)
-        slope = np.abs(self.slope(member.expr)) @ self._scale
-        level = np.abs(np.ravel(member.expr.value, order="F"))
-        unit = float(np.max(slope + level, initial=0.0)) or 1.0
-        self._units[name][span] = unit
-        expression = member.expr.tree_copy(self._swap) / unit
-        return expression == 0 if isinstance(member, EQUALITIES) else expression <= 0
-
-    def _tangent(self, name: str, member: cp.Constraint, span: slice, rows: tuple[np.ndarray, np.ndarray] | None
-                 ) -> cp.Constraint:
-        slope = cp.Parameter((member.size, self.at.size), value=np.zeros((member.size, self.at.size)))
-        level = cp.Parameter(member.size, value=np.zeros(member.size))
-        self.tangents.append(Tangent(name, span, member.expr, slope, level, rows))
-        expression = slope @ cp.multiply(self._scale, self._x) + level
-        return expression == 0 if isinstance(member, EQUALITIES) else expression <= 0
+    def _add(self, name: str, member: cp.Constraint, span: slice) -> None:
+        if not isinstance(member, EQUALITIES | INEQUALITIES) or member.is_dcp() and not member.expr.is_affine():
+            self.cones.append((name, span, member))
+            return
+        unit, empty = 1.0, np.zeros((member.size, self.at.size))
+        if not member.is_dcp():
+            self.rows.append(_Rows(name, span, member, unit, empty, empty[:, 0], self._where.rows(member)))
+            return
+        slope = self.slope(member.expr)
+        level = flat_value(member.expr) - slope @ self.at.assigned()
+        unit = float(np.max(np.abs(slope) @ self._scale + np.abs(flat_value(member.expr)), initial=0.0)) or 1.0
+        self.rows.append(_Rows(name, span, member, unit, slope, level))
 
     def set_model(self, x: np.ndarray, duals: Values, *, second_order: bool = True, damping: float = 0.0) -> None:
-        """Write the quadratic model of the Lagrangian at x into the parameters.
+        """Take the quadratic model of the Lagrangian at x, and the tangents there.
 
         Args:
             x: where.
@@ -208,9 +209,9 @@ class StepQP:
         z, lift = self.at.point(x).lift(), self.at.slope_of_lift(x)
         residual = problem.root @ z - problem.target
         pull = problem.root.T @ residual
-        for tangent in self.tangents:
-            if tangent.rows is not None and tangent.name in duals:
-                pull = pull + tangent.rows[0].T @ duals[tangent.name][tangent.span] / 2
+        for row in self.rows:
+            if row.lifted is not None and row.name in duals:
+                pull = pull + row.lifted[0].T @ duals[row.name][row.span] / 2
         jacobian = problem.root @ lift
         hessian = jacobian.T @ jacobian
         diagonal = np.diag(hessian)
@@ -222,27 +223,82 @@ class StepQP:
         if factor is None:
             factor = _definite(scaled, self._active(duals, x) / scale, shift)
         upper = factor.T * (scale * self._scale)
-        self.unit = max(float(np.max(np.abs(upper))), 1e-300)
-        self.matrix.value = upper / self.unit
+        self._unit = max(float(np.max(np.abs(upper))), 1e-300)
         descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
-        self.target.value = (upper @ (x / self._scale) - descent) / self.unit
+        self._model = upper / self._unit, (upper @ (x / self._scale) - descent) / self._unit
+        self._held = x[self._pins] / self._scale[self._pins]
         self.at.assign(x)
-        for tangent in self.tangents:
-            if tangent.rows is not None:
-                slope, level = tangent.rows[0] @ lift, tangent.rows[0] @ z - tangent.rows[1]
+        for row in self.rows:
+            if row.lifted is not None:
+                row.slope, value = row.lifted[0] @ lift, row.lifted[0] @ z - row.lifted[1]
+            elif not row.affine:
+                row.slope, value = self.slope(row.member.expr), flat_value(row.member.expr)
             else:
-                slope, level = self.slope(tangent.expression), np.ravel(tangent.expression.value, order="F")
-            tangent.slope.value = slope
-            tangent.level.value = level - slope @ x
+                continue
+            row.level = value - row.slope @ x
 
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
-        answer = back_end.run(self.program, settings)
-        duals = {name: self.unit**2 * answer.duals[name] / units
-                 for name, units in self._units.items() if name in answer.duals}
+        if back_end.name == "clarabel" and not self.cones:
+            return self._directly(settings)
+        program, matrices = self._programme
+        for parameter, value in zip(matrices, self._matrices()):
+            parameter.value = value
+        answer = back_end.run(program, settings)
         values = {name: self.sizes[name] * answer.values[name] for name in self.sizes if name in answer.values}
+        duals = {name: self._unit**2 * answer.duals[name] for name, _, _ in self.cones if name in answer.duals}
+        for row in self.rows:
+            if row.name in answer.duals:
+                duals.setdefault(row.name, self._unit**2 * answer.duals[row.name])[row.span] /= row.unit
         usable = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
         return Answer(answer.status, answer.word, values if usable else {}, duals)
+
+    def _directly(self, settings: Settings) -> Answer:
+        (matrix, target, held), sides = self._matrices()[:3], self._matrices()[3:]
+        pins = np.eye(self.at.size)[self._pins]
+        pairs = list(zip(self.rows, sides[::2], sides[1::2]))
+        equal = [(slope, -level) for row, slope, level in pairs if row.equality]
+        below = [(slope, -level) for row, slope, level in pairs if not row.equality]
+        found = solve_least_squares(matrix, target, [(pins, held), *equal], below, settings)
+        if found.x is None:
+            return Answer(found.status, found.word)
+        duals, position = {}, len(pins)
+        for row in sorted(self.rows, key=lambda row: not row.equality):  # as they were given: a stable order
+            size = row.span.stop - row.span.start
+            total = max(other.span.stop for other in self.rows if other.name == row.name)
+            part = self._unit**2 * found.multipliers[position : position + size] / row.unit
+            duals.setdefault(row.name, np.zeros(total))[row.span] = part
+            position += size
+        return Answer(found.status, found.word, self.at.unpack(found.x * self._scale), duals, found.iterations)
+
+    def _matrices(self) -> list[np.ndarray]:
+        """Model, target and held values, then slope and level of all rows, in the units of the QP."""
+        return [*self._model, self._held, *(part for row in self.rows for part in (
+            row.slope * self._scale / row.unit, row.level / row.unit))]
+
+    @cached_property
+    def _programme(self) -> tuple[Program, list[cp.Parameter]]:
+        """The step in CVXPY, and its parameters in the order of `_matrices`."""
+        at = self.at
+        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
+        swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
+        x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in stand_ins.values()])
+        matrices = [cp.Parameter(value.shape, value=value) for value in self._matrices()]
+        r = cp.Variable(at.size)
+        groups: dict[str, list] = {"model": [r == matrices[0] @ x - matrices[1]]}
+        if self._pins.any():
+            groups["pins"] = [x[np.flatnonzero(self._pins)] == matrices[2]]
+        members: dict[str, list[tuple[int, cp.Constraint]]] = {}
+        for row, slope, level in zip(self.rows, matrices[3::2], matrices[4::2]):
+            expression = slope @ x + level
+            members.setdefault(row.name, []).append(
+                (row.span.start, expression == 0 if row.equality else expression <= 0))
+        for name, span, member in self.cones:
+            members.setdefault(name, []).append((span.start, member.tree_copy(swap)))
+        for name, parts in members.items():
+            groups[name] = [member for _, member in sorted(parts, key=lambda part: part[0])]
+        return Program("step", cp.Minimize(cp.sum_squares(r)), {name: tuple(group) for name, group in groups.items()},
+                       {**stand_ins, "_r": r}, {}, dict, at.program.view), matrices
 
     def _active(self, duals: Values, x: np.ndarray) -> np.ndarray:
         """Gradients (r, size) of the equalities and of the inequalities with a multiplier, at x."""

@@ -53,12 +53,12 @@ class Signals:
         """Whether some functions vanish at every sample."""
         return self.weights.shape[1] < self.size
 
-    def dense(self) -> Array:
-        """Return all values, (T, size)."""
+    def dense(self, at: NDArray[np.intp]) -> Array:
+        """Return all values at some samples, (K, size)."""
         if not self.local:
-            return self.weights
-        values = np.zeros((self.first.size, self.size))
-        np.put_along_axis(values, self.first[:, None] + np.arange(self.weights.shape[1]), self.weights, axis=1)
+            return self.weights[at]
+        values = np.zeros((at.size, self.size))
+        np.put_along_axis(values, self.first[at, None] + np.arange(self.weights.shape[1]), self.weights[at], axis=1)
         return values
 
     def total(self) -> Array:
@@ -192,9 +192,8 @@ def dense_rows(block: Block, rows: NDArray[np.intp], n: int) -> Array:
     """Form some complete rows, (K, n)."""
     formed = np.empty((rows.size, n))
     for group in block.groups:
-        values = group.dense()
         for lag, where in zip(group.lags, group.columns):
-            formed[:, where[0] : where[-1] + 1] = values[rows + (block.reach - lag)]
+            formed[:, where[0] : where[-1] + 1] = group.dense(rows + (block.reach - lag))
     formed[:, n - 1 - block.groups[0].size] = 1.0
     return formed
 

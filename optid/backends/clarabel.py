@@ -1,0 +1,72 @@
+"""Small constrained least-squares problems straight to Clarabel: CVXPY takes longer to translate than it to solve."""
+
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from optid.backends import Settings
+from optid.backends.conic import tolerances
+from optid.solution import Status
+
+Side = tuple[np.ndarray, np.ndarray]
+"""Rows (r, n) and right-hand sides (r,)."""
+
+STATUS = {
+    "Solved": Status.OPTIMAL, "AlmostSolved": Status.INACCURATE, "PrimalInfeasible": Status.INFEASIBLE,
+    "AlmostPrimalInfeasible": Status.INFEASIBLE, "DualInfeasible": Status.UNBOUNDED,
+    "AlmostDualInfeasible": Status.UNBOUNDED, "MaxIterations": Status.LIMIT, "MaxTime": Status.LIMIT,
+}
+USABLE = (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT)
+
+
+class Solved(NamedTuple):
+    """What Clarabel answered.
+
+    Attributes:
+        status: its status in our words.
+        word: its own word.
+        x: (n,), None without a usable point.
+        multipliers: of the equalities, then of the inequalities, for ``L = f + multipliers' (rows x - right)``.
+        iterations: how many it took.
+    """
+
+    status: Status
+    word: str
+    x: np.ndarray | None
+    multipliers: np.ndarray
+    iterations: int
+
+
+def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[Side], below: Sequence[Side],
+                        settings: Settings) -> Solved:
+    """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``.
+
+    The residuals are variables, so that the matrix is not squared.
+
+    Args:
+        matrix: (k, n).
+        target: (k,).
+        equal: equalities.
+        below: inequalities.
+        settings: accuracy, time limit and native options.
+    """
+    clarabel: Any = import_module("clarabel")  # compiled, without types
+    k, n = matrix.shape
+    rows = np.vstack([np.hstack([matrix, -np.eye(k)]),
+                      *(np.hstack([part, np.zeros((len(part), k))]) for part, _ in (*equal, *below))])
+    right = np.concatenate([target, *(side for _, side in (*equal, *below))])
+    inequalities = sum(len(part) for part, _ in below)
+    cones = [clarabel.ZeroConeT(len(rows) - inequalities), clarabel.NonnegativeConeT(inequalities)]
+    options = clarabel.DefaultSettings()
+    options.verbose = settings.verbose
+    for key, value in tolerances("clarabel", settings).items():
+        setattr(options, key, value)
+    weights = sp.diags_array(np.concatenate([np.zeros(n), np.full(k, 2.0)]), format="csc")
+    found = clarabel.DefaultSolver(weights, np.zeros(n + k), sp.csc_array(rows), right,
+                                   cones if inequalities else cones[:1], options).solve()
+    status = STATUS.get(str(found.status), Status.FAILED)
+    x = np.asarray(found.x)[:n] if status in USABLE else None
+    return Solved(status, str(found.status), x, np.asarray(found.z)[k:], int(found.iterations))
