@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 
 from optid.backends import Answer, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
+from optid.certificate.ladder import certify
 from optid.errors import StructureError
 from optid.gradients import flat_value
 from optid.infeasibility import satisfiable
@@ -19,7 +20,7 @@ from optid.limits import EQUALITIES, INEQUALITIES
 from optid.models.gauges import gauge_factor
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point, reduce
-from optid.rank_one.bilinear import minimise, starts
+from optid.rank_one.bilinear import LocalSolution, minimise, starts
 from optid.solution import Status
 
 STEPS = 100
@@ -46,15 +47,21 @@ def run(program: Program, settings: Settings) -> Answer:
 
 
 def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
-    found = minimise(form.problem, count=count, seed=seed)
-    if program.start:
-        again = minimise(form.problem, start_point(form, program.start))
-        found = again if again.value < found.value else found
+    found = _minimum(program, form, count, seed)
     values = to_values(program, form, found.point)
     r = form.problem.root @ found.point.lift() - form.problem.target
     duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
     return Answer(Status.LOCAL if found.converged else Status.LIMIT,
                   "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
+
+
+def _minimum(program: Program, form: RankOneForm, count: int, seed: int) -> LocalSolution:
+    """Descend from the programme's start, and from others where the instant proof fails there."""
+    found = minimise(form.problem, start_point(form, program.start)) if program.start else None
+    if found is not None and certify(form.problem, found.point, effort="instant").bound.proved:
+        return found
+    others = minimise(form.problem, count=count, seed=seed)
+    return found if found is not None and found.value <= others.value else others
 
 
 def start_point(form: RankOneForm, start: Values) -> Point:
@@ -93,7 +100,7 @@ class _Constrained:
         self.half, self.full = StepQP(self.at, sizes, pinned=True), StepQP(self.at, sizes, pinned=False)
 
     def solve(self, count: int, seed: int, directions: int, descents: int) -> Answer:
-        free = minimise(self.problem, count=count, seed=seed).point
+        free = _minimum(self.program, self.form, count, seed).point
         idle = self._idle(free)
         if idle is not None:
             return idle
@@ -108,7 +115,19 @@ class _Constrained:
         for _, x in tried:
             if not any(np.allclose(self._lift(x), self._lift(kept), 1e-3, 1e-6) for kept in distinct):
                 distinct.append(x)
-        return min((self._iterate(x) for x in distinct[:descents]), key=lambda end: end[0])[1]
+        found = []
+        for x in distinct[:descents]:
+            value, answer = self._iterate(x)
+            found.append((value, answer))
+            if self._is_proved(answer):
+                break
+        return min(found, key=lambda end: end[0])[1]
+
+    def _is_proved(self, answer: Answer) -> bool:
+        """Whether a point is the global optimum for certain, so that no other descent can better it."""
+        if self.program.certify is None or answer.status is not Status.LOCAL:
+            return False
+        return self.program.certify(self.program, answer.values, answer.duals)[0].proved
 
     def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
