@@ -161,6 +161,13 @@ def test_an_optimum_on_one_lag_is_found_where_mu_vanishes_all_around(seed):
     assert fit.solution.objective <= search(fit.program, 36) * (1 + 1e-6)
 
 
+def test_one_lag_is_tried_although_a_forbidden_direction_is_near():
+    from scripts import benchmark
+
+    excess, status = benchmark("local_optima").excess_of_signed(141)
+    assert excess < 1e-6 and status == "optimal"
+
+
 @pytest.mark.parametrize("solver", ["gauss_newton", "ipopt", "alternating"])
 @pytest.mark.parametrize("seed", range(3))
 def test_contradictions_are_infeasible_whoever_solves(solver, seed):

@@ -133,11 +133,10 @@ class _Constrained:
         """Points with different directions of b, each with every pattern of signs."""
         core = reduce(self.problem)
         points = [start_point(self.form, self.program.start)] if self.program.start else []
-        points += [free, *(core.point(*pair) for pair in starts(core, count=DIRECTIONS, seed=seed))]
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
-            points += [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
-                       for i, b in enumerate(free.bs) for axis in np.eye(b.size)]
-            points += [core.point(*pair) for pair in starts(core, count=most, seed=seed)[DIRECTIONS:]]
+            points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
+                      for i, b in enumerate(free.bs) for axis in np.eye(b.size)] + points
+        points += [free, *(core.point(*pair) for pair in starts(core, count=max(most, DIRECTIONS), seed=seed))]
         distinct: list[Point] = []
         for point in points:
             directions = [b / max(float(np.linalg.norm(b)), 1e-300) for b in point.bs]
