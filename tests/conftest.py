@@ -1,6 +1,7 @@
 """Shared test set-up: deterministic property tests, the folder with real data, a Dask cluster."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 import matplotlib
@@ -20,13 +21,23 @@ nuclear_subspace output_error prices rank_one readme shift shooting solving stat
 uncertainty""".split()
 
 
+SLOW = """clusters monitor_arl monitor_cli study_cli study_cluster study_examples study_running study_third_party
+study_workers""".split()
+
+
 def pytest_collection_modifyitems(items):
-    """Give the tests of these modules the marks by which the oldest versions and other processors select them."""
+    """Mark tests by module and fixture; of a test that is `sampled(n)` all but the first n parameters are slow."""
+    seen = Counter()
     for item in items:
         module = item.path.stem.removeprefix("test_")
-        for mark, modules in {"core": CORE, "numerical": NUMERICAL}.items():
+        for mark, modules in {"core": CORE, "numerical": NUMERICAL, "slow": SLOW}.items():
             if module in modules:
                 item.add_marker(mark)
+        function = f"{item.path}::{item.originalname}"
+        seen[function] += 1
+        sample = item.get_closest_marker("sampled")
+        if {"browser", "two_processes"} & set(item.fixturenames) or sample and seen[function] > sample.args[0]:
+            item.add_marker("slow")
 
 
 @pytest.fixture(scope="session")

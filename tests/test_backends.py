@@ -41,6 +41,7 @@ def test_the_catalogue_agrees_with_cvxpy():
         == set(cp.installed_solvers()) - {"GLPK_MI", "DIFFCP"} - {"IPOPT", "UNO", "COPT", "KNITRO"}
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("name", INSTALLED)
 def test_back_end_is_conformant(name):
     rows = check_back_end(back_ends()[name])

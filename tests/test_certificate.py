@@ -96,6 +96,7 @@ def test_two_lags_are_always_proved_and_agree_with_exact_search(seed):
     assert bound.value <= exact * (1 + 1e-9)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize("seed", range(6))
 def test_bounds_never_exceed_the_best_known_value(seed, channels):

@@ -146,6 +146,7 @@ def test_the_command_line_and_python_give_the_same_model(csv, tmp_path):
     assert fit.model.equation().split(" = ")[0] in result.output and "model written to" in result.output
 
 
+@pytest.mark.slow
 def test_split_validates_on_the_rest_and_the_report_has_it(csv, tmp_path):
     result = run("fit", csv, *ORDERS, "--split", 0.75, "--report", tmp_path / "r.html")
     assert result.exit_code == 0, result.output
@@ -200,6 +201,7 @@ def test_a_solver_is_chosen_by_one_word():
 # -- options of the formulation ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_formulation_brings_its_options_along(csv, tmp_path):
     words = ["--inputs", "u1", "u2", "--outputs", "y1", "--formulation", "hammerstein_ss.sid", "--nx", "1",
              "--block-rows", "6", "--basis", "polynomial:3", "--feedthrough", "true", "true",

@@ -39,12 +39,14 @@ def test_the_engine_never_imports_the_catalogue(name, path):
     assert "formulations" not in imported(path)
 
 
+@pytest.mark.slow
 def test_cvxpy_is_known_to_programmes_certificates_and_back_ends_only():
     users = {str(name) for name, path in modules().items() if "cvxpy" in imported(path)}
     beyond = {name for name in users if not name.startswith("backends/")} - CVXPY
     assert not beyond, f"{sorted(beyond)} import CVXPY; state why in this list, or go through a programme"
 
 
+@pytest.mark.slow
 def test_casadi_is_known_to_its_back_end_and_the_export_only():
     users = {str(name) for name, path in modules().items() if "casadi" in imported(path)}
     assert {name for name in users if not name.startswith("backends/")} <= {"models/export"}
@@ -63,6 +65,7 @@ def test_importing_the_package_is_light():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("words, missing", [
     ("formulations", HEAVY), ("constraints", HEAVY), ("solvers", HEAVY), ("examples", HEAVY), ("--help", HEAVY),
     ("fit nowhere.csv", HEAVY), ("fit --example thrster", HEAVY), ("fit --example thruster -f hammerstein", HEAVY),

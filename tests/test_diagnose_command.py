@@ -32,6 +32,7 @@ def run(*words):
     return CliRunner().invoke(app, ["diagnose", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_a_record_becomes_a_diagnosis_a_page_and_a_picture(folder, tmp_path):
     out, page, picture = tmp_path / "d.json", tmp_path / "d.html", tmp_path / "d.png"
     result = run(folder / "model.json", folder / "faulty.csv", "--kinds", "bias", "--out", out, "--report", page,
@@ -62,6 +63,7 @@ def test_a_healthy_record_is_told_as_such_and_exits_well(folder, tmp_path):
     assert "Diagnosis: healthy" in page.read_text()
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_noise_and_the_uncertainty_come_from_files(folder, tmp_path):
     u = levels(400, 5)
     loud = tmp_path / "loud.csv"

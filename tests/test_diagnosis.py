@@ -101,6 +101,7 @@ def test_a_healthy_record_is_healthy_with_a_p_value(found, limits):
     assert "healthy" in healthy.explain() and healthy.certificate.kind == "none" and not healthy.unique
 
 
+@pytest.mark.slow
 def test_what_fits_no_candidate_is_unknown_with_direction_and_frequency(found, limits):
     u, y = record()
     tone = 0.6 * np.sin(2 * np.pi * 0.15 * np.arange(COUNT)) * (np.arange(COUNT) > 40)
@@ -152,6 +153,7 @@ def test_with_one_output_arbitrary_courses_are_refused_and_known_ones_allowed_wi
 # -- frozen sensors, noise, outliers ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_sensor_that_repeats_its_reading_is_a_finding_and_the_rest_is_judged(found):
     u, y = record(Fault.frozen("sensor:y1", 70))
     answer = diagnose(small(), (u, y), found)
@@ -172,6 +174,7 @@ def test_a_constant_channel_is_a_finding_too(found):
     assert "at or before" in str(answer)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_stands_still_in_its_noise_and_noise_that_grows_are_named():
     faults = dictionary(small(), kinds=["bias", "frozen", "noise"])
     u, y = record(Fault.frozen("sensor:y1", 70))
@@ -186,6 +189,7 @@ def test_a_sensor_that_stands_still_in_its_noise_and_noise_that_grows_are_named(
     assert diagnose(small(), record(seed=5), faults).verdict == "healthy"
 
 
+@pytest.mark.slow
 def test_a_record_that_is_too_long_for_a_kind_says_so():
     faults = dictionary(small(), kinds=["bias", "frozen"], state_jump=False)
     u = inputs(1600)
@@ -236,6 +240,7 @@ def test_a_second_fault_is_not_bounded_as_if_it_were_outliers(found, limits):
         assert second.size[0] == pytest.approx(first.size[0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_scheduled_change_of_the_plant_is_a_candidate():
     other = small().A.copy()
     other[0, 0] = 0.6
@@ -327,6 +332,7 @@ def test_missing_readings_and_several_experiments(found):
 # -- the healthy model and its noise ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_healthy_record_with_other_noise_is_refused(found, limits):
     long = inputs(600, 7)
     sound = Data(long, inject(small(), long, seed=8))
@@ -347,6 +353,7 @@ def test_a_healthy_record_with_other_noise_is_refused(found, limits):
         diagnose(small(), faulty, found, rescale=True)
 
 
+@pytest.mark.slow
 def test_swapped_outputs_and_units_that_jump_are_named(found):
     long = inputs(300, 7)
     y = inject(small(), long, seed=8)

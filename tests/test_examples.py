@@ -134,6 +134,7 @@ EXPECTED: dict[str, dict[str, Range]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(SCRIPTS))
 def test_script_runs_and_gives_its_figures(name, tmp_path, monkeypatch, capsys):
     path = SCRIPTS[name]

@@ -159,6 +159,7 @@ def alarms(found, limits, seeds, colour):
     return total
 
 
+@pytest.mark.slow
 def test_a_monitor_keeps_its_rate_with_thresholds_of_a_healthy_record(found):
     simulated = Monitor(found.model, found, arl0=3000, window=WINDOW)
     limits = empirical_calibration(simulated, record(12_000, 31, 1.5))

@@ -15,6 +15,7 @@ from optid.faults.search.box_kernels import boxed
 from optid.faults.search.losses import bounds_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_all_faces_find_the_optimum_of_the_box(d):
     rng = np.random.default_rng(d)

@@ -65,6 +65,7 @@ def compare(result, limits):
     return found
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("gaps", [0.0, 0.2])
 @pytest.mark.parametrize("shape", [(3, 2, 2), (2, 1, 1)])
 def test_all_pairs_are_dense_least_squares(shape, gaps):
@@ -76,6 +77,7 @@ def test_all_pairs_are_dense_least_squares(shape, gaps):
     compare(scan(found, whiten(model, data, x0="zero"), data.experiments[0].u), penalties(found))
 
 
+@pytest.mark.slow
 def test_all_pairs_with_scheduled_changes():
     model = random_model(4, 3, 2, 2)
     changed = {"a": Fault.schedule(A=0.9 * model.A), "b": Fault.schedule(B=lambda k: model.B * (1 - k / 32))}

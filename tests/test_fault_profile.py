@@ -31,6 +31,7 @@ def search(found, faults, seed=1, missing=0.0):
     return scan(found, whiten(found.model, Data(u, y), x0="zero"), u)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 @pytest.mark.parametrize("fault, label, prior, course", [
     (Fault.step("sensor:y1", 20, 1.5), "sensor:y1", "tv", 1.5 * (np.arange(N) >= 20)),

@@ -41,6 +41,7 @@ def test_noise_of_innovations_is_a_covariance_though_singular():
         NoiseCovariances(np.eye(2), np.eye(2), np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 1.0]]))
 
 
+@pytest.mark.slow
 def test_the_onset_of_grown_noise_has_an_interval_that_holds_it():
     model, held = small(), 0
     found = dictionary(model, kinds=["bias", "noise"], state_jump=False)
@@ -75,6 +76,7 @@ def test_inputs_that_are_swapped_or_in_another_unit_are_named(spoil, named):
         check_channels(model, Data(spoil(u), data.y, model.dt, list(model.inputs), list(model.outputs)))
 
 
+@pytest.mark.slow
 def test_two_faults_of_one_actuator_at_different_times_are_refitted():
     model, u = small(), levels(400, 6)
     y = inject(model, u, [Fault.loss("actuator:u1", 200, 0.6), Fault.step("actuator:u1", 240, 0.8)], seed=6)

@@ -68,6 +68,7 @@ def compare(found, white, u):
                 *found.additions(candidate, len(white.r), 20, u), white.present)))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("gaps", [0.0, 0.15])
 @pytest.mark.parametrize("shape", [(3, 2, 2), (1, 1, 1), (5, 1, 3), (2, 3, 1)])
 def test_every_candidate_at_every_onset_is_dense_least_squares(shape, gaps):
@@ -304,6 +305,7 @@ def test_thresholds_of_a_typical_input_hold_on_the_average():
     assert abs(np.mean(rates) - 0.05) < 0.006
 
 
+@pytest.mark.slow
 def test_thresholds_of_a_window_with_gaps_and_an_uncertain_model():
     model = small()
     found, data = dictionary(model), record(model, 60, 3, 0.3)

@@ -262,6 +262,7 @@ def found_index(s, label):
     return s.labels.index(label)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_all_onsets_give_what_all_pairs_give(found, limits, missing):
     s = two(found, missing=missing)
@@ -330,6 +331,7 @@ def test_exchanges_never_lose_and_end_where_no_single_one_gains(found, limits):
                         assert dense_gain(s, limits, trial) <= better.gain + 1e-6 or len(set(trial)) < len(trial)
 
 
+@pytest.mark.slow
 def test_a_mixed_integer_programme_agrees_on_a_tiny_grid(found, limits):
     """The same optimum by branch and bound with binaries, on a grid small enough for it."""
     if "SCIP" not in cp.installed_solvers():

@@ -141,6 +141,7 @@ def test_directions_that_change_no_prediction_are_left_out(real_data):
     assert found.root.shape[1] == found.root.shape[0] - 16 - 2
 
 
+@pytest.mark.slow
 def test_model_errors_count_as_noise(real_data):
     """Innovations of models drawn from their distribution: too large without it, of unit size with it."""
     model, _ = standard(real_data)
@@ -161,6 +162,7 @@ def test_model_errors_count_as_noise(real_data):
     assert abs(np.mean(aware) / freedom - 1) < 4 * np.sqrt(2 / freedom / 60)
 
 
+@pytest.mark.slow
 def test_the_largest_factor_is_an_upper_bound():
     rng, s2 = np.random.default_rng(0), np.geomspace(0.05, 4, 20)
     for true in (1.5, 4.0):

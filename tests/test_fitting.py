@@ -80,6 +80,7 @@ def test_a_solver_that_dies_is_an_outcome():
     assert fit.solution.status is Status.FAILED
 
 
+@pytest.mark.slow
 def test_the_time_limit_is_kept():
     started = time.perf_counter()
     fit = optid.fit(record(), solver=mine(slow), time_limit=1.0, raises=False, **STRUCTURE)

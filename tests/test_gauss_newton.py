@@ -31,6 +31,7 @@ def program_of(data, rules, **structure):
                                                    constraints=rules)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 @pytest.mark.parametrize("name", RULES)
@@ -144,6 +145,7 @@ def test_it_refuses_what_is_not_rank_one():
         optid.fit(record(), "arx", na=1, nb=1, solver="gauss_newton")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 14, 18, 35])
 def test_nearly_collinear_inputs_are_no_obstacle(seed):
     """Large mu that nearly cancel: descents in both factors stopped at their limit up to 1 % above the optimum."""
@@ -153,6 +155,7 @@ def test_nearly_collinear_inputs_are_no_obstacle(seed):
     assert excess < 1e-9 and status in ("locally optimal", "optimal")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 26, 29, 33])
 def test_an_optimum_on_one_lag_is_found_where_mu_vanishes_all_around(seed):
     rules = [shape.monotone(), shape.sign("b", ["positive", "negative"][seed // 2 % 2])]
@@ -176,6 +179,7 @@ def test_contradictions_are_infeasible_whoever_solves(solver, seed):
     assert fit.solution.status is Status.INFEASIBLE
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 @pytest.mark.parametrize("rule", [shape.slope(-0.5, 3.0), shape.gain(1.5), shape.through(0.5, 1.0),
                                   shape.value_range(-3.0, 3.0)], ids=lambda rule: rule.name)

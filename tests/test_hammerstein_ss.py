@@ -40,6 +40,7 @@ def record(model, count=120, seed=1, noise=0.05, missing=0.0, experiments=1):
 # -- the three simulators ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("model", MODELS)
 def test_free_run_equals_the_equations(model):
     u = inputs(model)
@@ -47,6 +48,7 @@ def test_free_run_equals_the_equations(model):
     assert model.simulate(u) == pytest.approx(by_hand(model, u, np.zeros(model.nx)), abs=1e-11)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_measured_feedback_and_prediction_equal_the_equations(model, missing):
@@ -57,6 +59,7 @@ def test_measured_feedback_and_prediction_equal_the_equations(model, missing):
     assert model.predict(data, x0=state(model)) == pytest.approx(expected, abs=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [linear(), with_feedback(), with_feedback(USER)])
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_several_steps_ahead_equal_a_free_run_from_the_predicted_state(model, horizon, monkeypatch):
@@ -111,6 +114,7 @@ def test_tables_equal_the_nonlinearity(basis):
 # -- initial states ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("model", [linear(), with_feedback(), with_feedback(USER)])
 @pytest.mark.parametrize("simulator", ["predict", "measured_feedback", "free"])
 def test_fitted_state_minimises(model, simulator):
@@ -451,6 +455,7 @@ def test_kalman_gain_is_the_fixed_point_of_the_filter():
     assert kalman_gain(np.zeros((0, 0)), np.zeros((2, 0)), np.zeros((0, 0)), R).innovation == pytest.approx(R)
 
 
+@pytest.mark.slow
 def test_kalman_gain_predicts_best():
     rng = np.random.default_rng(1)
     model = linear(radius=0.95, offset_x=None)

@@ -55,6 +55,7 @@ def test_no_random_model_beats_the_bound(n, seed, gaps):
             assert np.all(bounds.values[:, n] <= error + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
 def test_no_fitted_model_beats_the_bound(n):
     """Every parameter, offsets and initial state included, fitted by least squares from many starts."""

@@ -101,6 +101,7 @@ def test_sensors_with_coloured_noise():
             assert set(hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N).candidates) == dead
 
 
+@pytest.mark.slow
 def test_a_healthy_record_gives_no_alarm():
     for coupled in (False, True):
         for seed in range(10):
@@ -262,6 +263,7 @@ def test_statistic_against_a_dense_regression():
     assert found.threshold == pytest.approx(chi2.isf(0.01, 2 * t.shape[1]) / j, rel=0.3)  # nearly white residuals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", [0.0, 0.8])
 def test_dead_channels_are_missed_as_often_as_the_level_says(colour):
     runs, level, wrong = 100, 0.1, {"sensor:y1": 0, "actuator:u1": 0}
@@ -315,6 +317,7 @@ def test_tails_of_the_forecast_against_the_windows_themselves():
     assert least_order(second, z, phi, pi, raised, 4, scale) == 2
 
 
+@pytest.mark.slow
 def test_healthy_streams_of_a_plant_with_a_weak_mode_give_no_alarm():
     plant, count = standard_plant(), 0
     for seed in range(8):

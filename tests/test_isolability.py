@@ -85,6 +85,7 @@ def test_two_rivals_at_a_known_onset_follow_the_formula():
     assert abs(study.forecast("actuator:u1", d / study.unit[0]).isolated - expected) < 0.015
 
 
+@pytest.mark.slow
 def test_thresholds_keep_the_rate_of_the_family(found):
     space = signature_space(found, 50)
     thresholds = space.thresholds(0.02, 20_000, 1)
@@ -117,6 +118,7 @@ def test_the_standard_plant_needs_the_deflections_measured_before(standard_study
     assert study.bounded.tolist() == [False] * 5 + [True]
 
 
+@pytest.mark.slow
 def test_the_forecast_meets_records_of_the_plant(standard_study):
     """Small version of the benchmark: faults injected into the noisy plant, the Kalman filter, the search."""
     model, load, faults, study = standard_study
@@ -134,6 +136,7 @@ def test_the_forecast_meets_records_of_the_plant(standard_study):
         assert abs(np.mean(excess.max(axis=1) > 0) - study.forecast(label, size).detected) < 0.06
 
 
+@pytest.mark.slow
 def test_a_longer_window_helps_a_lasting_fault_and_not_a_transient_one(found):
     short, long = found.isolability(40, calibration=5000), found.isolability(120, calibration=5000)
     assert long.detectable[0] < 0.8 * short.detectable[0]
@@ -209,6 +212,7 @@ def test_losses_and_stuck_actuators_are_searched_along_the_input_of_the_window()
     assert signature_space(lossy, 40).skipped == tuple(x for x in lossy.labels if "loss" in x or "stuck" in x)
 
 
+@pytest.mark.slow
 def test_the_forecast_of_a_loss_meets_records_with_that_input():
     model, u, rng = small(), levels(160, 5), np.random.default_rng(0)
     lossy = dictionary(model, kinds=["bias", "loss"])
@@ -240,6 +244,7 @@ def run(*words):
     return CliRunner().invoke(app, ["isolability", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     model = small()
     model.save(tmp_path / "model.json")

@@ -22,6 +22,7 @@ SETS = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("gain, seed", [(1.0, 0), (-1.0, 1), (1.0, 2)])
 @pytest.mark.parametrize("name", SETS)
 def test_bounds_hold_and_proofs_are_true(name, gain, seed):

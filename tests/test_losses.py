@@ -131,6 +131,7 @@ CONTAMINATED = [("hammerstein_arx.exact", 1.0, False), ("hammerstein_arx.exact",
                 ("hammerstein_arx.overparametrised", 1e6, True), ("arx", 1.0, True)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
 @pytest.mark.parametrize("formulation, unit, both_signs", CONTAMINATED)
 @pytest.mark.parametrize("loss", ["huber", "l1"])

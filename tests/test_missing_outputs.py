@@ -38,6 +38,7 @@ def test_every_identification_formulation_has_a_case():
     assert len(CELLS) == len(gaps.CELLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CELLS)
 def test_a_fifth_of_the_outputs_missing(name):
     cell = CELLS[name]
@@ -48,6 +49,7 @@ def test_a_fifth_of_the_outputs_missing(name):
         assert score(cell, gaps.punctured(whole, share, 0)) > complete - close
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", [name for name, cell in CELLS.items() if cell.samples > 3000 and not (
     "exact" in name and cell.outputs == 2)])
 def test_a_few_inputs_missing_besides(name):
@@ -59,6 +61,7 @@ def test_a_few_inputs_missing_besides(name):
     assert score(cell, Data(u, data.y)) > score(cell, whole) - 2.0
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("experiments", [1, 3])
 @pytest.mark.parametrize("formulation", ["hammerstein_ss.sid", "hammerstein_ss.asivid", "ss.exact"])
 def test_two_fifths_missing_in_experiments(formulation, experiments):

@@ -28,6 +28,7 @@ def record(model, count=200, seed=1, noise=0.0):
 # -- nonlinearity ----------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("basis", BASES)
 def test_nonlinearity_equals_its_expansion(basis):
     f = nonlinearity(basis)
@@ -215,6 +216,7 @@ def test_static_gain_is_the_slope_of_the_steady_state(model):
 # -- gauge, offset, units ----------------------------------------------------------
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", MODELS)
 @given(scale=st.floats(-50, 50).filter(lambda x: abs(x) > 0.02), gauge=st.sampled_from(["norm", "gain", "b0", "none"]))
 def test_predictions_do_not_depend_on_the_gauge(model, scale, gauge):
@@ -276,6 +278,7 @@ def test_offset_of_f_is_restored_where_it_can_be():
     assert replace(two, offset=np.array([0.5, 0.0])).c0 is None
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("basis", BASES)
 @given(
     scales=st.tuples(st.floats(0.01, 100), st.floats(0.01, 100)),

@@ -77,6 +77,7 @@ def agrees(monitor, best, accuracy=1e-9):
         assert monitor.onsets[label] == onset, label
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("count", [3, 25, 90])
 def test_statistics_are_those_of_dense_least_squares(count, feedback):
@@ -101,6 +102,7 @@ def test_statistics_with_missing_readings_are_those_of_dense_least_squares():
     agrees(monitor, dense(found, 40, white.r, u, white.present))
 
 
+@pytest.mark.slow
 def test_one_missing_reading_inside_a_window_that_was_complete_before():
     model = plant()
     found, u = everything(model), levels(130, 5)
@@ -381,6 +383,7 @@ def systems(draw):
     return model, lost, draw(st.integers(12, 60)), rng
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(systems())
 def test_random_plants_against_dense_least_squares(system):

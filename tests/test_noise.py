@@ -70,6 +70,7 @@ def test_gain_innovations_and_spectrum_are_recovered(lengths, missing, most, see
         assert np.linalg.norm(got - true) < most * np.linalg.norm(true)
 
 
+@pytest.mark.slow
 def test_errors_shrink_like_the_root_of_the_record():
     model, errors = truth(4), []
     for N in (1000, 16000):
@@ -88,6 +89,7 @@ def test_covariances_are_positive_semidefinite_and_give_the_gain_back():
     assert again.K == pytest.approx(found.K, abs=1e-7) and again.innovation == pytest.approx(noise.innovation)
 
 
+@pytest.mark.slow
 def test_no_other_gain_predicts_better():
     model = truth(6)
     data = record(model, (1500,), missing=0.05)
@@ -235,6 +237,7 @@ def test_the_slope_of_the_likelihood_by_finite_differences(missing):
     assert _slope(A, C, gain, errors(gain.T.ravel())) == pytest.approx(-slope, rel=1e-4, abs=1e-2)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("lengths", [(40000,), (9000, 700, 12000)])
 @pytest.mark.parametrize("missing", [0.0, 0.1])
 @pytest.mark.parametrize("kind", ["stationary", "grows", "coloured"])

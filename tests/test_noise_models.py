@@ -134,6 +134,7 @@ def test_linear_models():
         assert fit.model.c == pytest.approx(C, abs=0.06) and "Linear" in fit.model.title
 
 
+@pytest.mark.slow
 def test_two_inputs_and_one_common_noise():
     functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
     plant = HammersteinARX(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.1)
@@ -145,6 +146,7 @@ def test_two_inputs_and_one_common_noise():
         assert fit.model.theta(c) == pytest.approx(plant.theta(c), abs=0.04)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ORDERS)
 def test_constraints_hold_and_the_optimum_is_that_of_a_penalty_free_search(kind):
     data = record(system(kind, mu=np.array([-0.2, -0.5, 0.5, 0.4])), (300,), seed=2)
@@ -266,6 +268,7 @@ def test_missing_inputs():
     assert fit.figures["rows"] == 4000 - 2 - 7
 
 
+@pytest.mark.slow
 def test_efficiency():
     """The mean of the squared errors is that of the Cramer-Rao bound (60 short records)."""
     truth = system("armax", b=np.array([1.0]), mu=np.array([-1.0, -0.5, 0.5, 1.0]), c=np.array([-0.5]))

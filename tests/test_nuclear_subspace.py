@@ -107,6 +107,7 @@ def test_a_hammerstein_system_with_nonlinear_feedback_in_predictor_form():
     assert np.mean(linear.simulation_fit) < 80
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("form", ["predictor", "projection", "instruments"])
 @pytest.mark.parametrize("missing", [False, True])
 def test_every_back_end_ends_at_the_same_objective(form, missing):

@@ -100,6 +100,7 @@ def test_t_has_its_expectation():
     assert ratio == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", benchmark.CASES)
 def test_the_order_of_the_examples(case):
     for n, least in ((300, 17), (1000, 19)):

@@ -233,6 +233,7 @@ def test_offset_can_be_held_at_zero():
     assert same.solution.objective == pytest.approx(fit.solution.objective, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_standard_errors_agree_with_the_scatter():
     true = siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.4, 0.9])),))
     scores = []
@@ -271,6 +272,7 @@ def test_every_point_of_a_descent_is_stable():
     hammerstein_oe.search(Watched(data, unknowns, "norm"), 8, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.95, 0.8, 0.6])
 def test_stability_of_higher_orders_holds_for_the_model(radius):
     true = siso(basis=BASIS, a=np.real(np.poly([0.9, 0.75 + 0.37j, 0.75 - 0.37j]))[1:])
@@ -298,6 +300,7 @@ def test_constraints_that_hold_anyway_cost_nothing():
     assert not other.prices[0].binding
 
 
+@pytest.mark.slow
 def test_the_opposite_gain_is_reached_by_turning_a_sign():
     linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
     data = record(HammersteinARX([-0.8], ([1.0],), (linear,), (0,), 0.0), noise=0.5)

@@ -189,6 +189,7 @@ def turns(r):
 '''
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind, key, word", [
     ("answers", "one_step", None), ("raises", "error", "KeyError"), ("leaves", "error", "SystemExit"),
     ("dies", "stopped", "the process ended: signal 6"), ("sleeps", "stopped", "no answer in 2 s"),

@@ -23,6 +23,7 @@ def line(ax, label):
     return next(one for one in ax.get_lines() if one.get_label() == label)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("make", [lambda: example_fit("thruster"), mimo_fit, linear_fit])
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_is_drawn_without_a_warning_and_leaves_no_trace(make, name, tmp_path):
@@ -33,6 +34,7 @@ def test_every_figure_is_drawn_without_a_warning_and_leaves_no_trace(make, name,
     assert dict(matplotlib.rcParams) == before
 
 
+@pytest.mark.slow
 def test_pyplot_is_never_imported():
     code = (
         "import sys, optid; from sample_fits import linear_fit; optid.plots.overview(linear_fit());"

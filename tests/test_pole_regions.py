@@ -41,6 +41,7 @@ RULES = {"stable": stable(0.8), "disc": disc(0.4, 0.5), "strip": strip(-0.1, 0.7
          "damped": pole_regions.damped(0.3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_a_certificate_exists_exactly_for_eigenvalues_inside(name):
     rng = np.random.default_rng(1)
@@ -62,6 +63,7 @@ def test_a_certificate_exists_exactly_for_eigenvalues_inside(name):
     assert min(seen.values()) > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.05, 0.3, 0.7, 0.95])
 def test_the_polygon_fills_the_convex_part_of_a_damping_region(ratio):
     rate = ratio / np.sqrt(1 - ratio**2)

@@ -97,6 +97,7 @@ def test_equalities_are_active():
     assert (fit.prices[0].active, fit.prices[0].rows, fit.prices[0].slack) == (2, 2, 0.0)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised"])
 @pytest.mark.parametrize("word", sorted(benchmark("prices").cases(1.0, 1.0)))
 def test_every_word_has_the_price_that_moving_its_bound_gains(word, form):

@@ -39,6 +39,7 @@ def model(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_the_main_example_prints_the_figures_of_the_readme(tmp_path):
     shown = output("fit", "--example", "thruster", "--report", tmp_path / "thruster.html")
     assert figures(shown) == figures(printed("Hammerstein ARX model"))

@@ -41,6 +41,7 @@ def test_three_tanks_raise_no_alarm_when_healthy(watch):
         assert [e for e in tanks.watched(found, table, thresholds) if e.kind == "alarm"] == []
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", tanks.FAULTS)
 def test_three_tanks_alarm_after_the_onset_and_name_the_part_in_a_small_set(watch, name):
     found, thresholds, uncertainty, stored = watch

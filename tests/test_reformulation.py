@@ -481,6 +481,7 @@ def test_targets_against_bounded_least_squares(healthy, seed):
         assert (target.distance - moved.distance) / 1e-4 == pytest.approx(price, rel=0.05, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_unreachable_targets_are_never_clipped_silently(healthy):
     dead = without(healthy, 0)
     target = allocate(dead).attainable([2.0, 2.0])

@@ -102,6 +102,7 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
     assert pages["thruster"].count("<figure>") == pages["thruster"].count("<svg ") == 5
 
 
+@pytest.mark.slow
 def test_names_are_text_never_markup():
     data = two_by_two()
     hostile = optid.Data(
@@ -150,6 +151,7 @@ def test_a_fit_without_a_model_is_refused():
         report.render(fit)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 @pytest.mark.parametrize("name", ["thruster", "mimo"])
 def test_a_browser_renders_the_page_without_a_complaint(pages, name, tmp_path):
@@ -162,6 +164,7 @@ def test_a_browser_renders_the_page_without_a_complaint(pages, name, tmp_path):
     assert result.stdout.count("<path") == pages[name].count("<path")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_light_and_dark_differ_and_a_phone_needs_no_sideways_scrolling(pages, tmp_path):
     import matplotlib.image

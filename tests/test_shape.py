@@ -65,6 +65,7 @@ OBEYED = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 @pytest.mark.parametrize("name", OBEYED)
 def test_the_exact_model_obeys_and_is_the_global_optimum(name, gain):
@@ -87,6 +88,7 @@ def known_direction(data):
 RELAXED = [name for name in OBEYED if name not in ("known b",)]
 
 
+@pytest.mark.sampled(11)
 @pytest.mark.parametrize("name", RELAXED)
 def test_the_relaxed_theta_obeys_and_bounds_the_exact_optimum(name):
     rule, _ = OBEYED[name]
@@ -142,6 +144,7 @@ def test_parity_on_a_symmetric_interval_holds_everywhere_for_every_basis(basis, 
     assert np.ptp(f) > 1e-3  # not everything is forbidden
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("basis", [BSpline(6), Polynomial(4)], ids=str)
 @pytest.mark.parametrize("rule, order", [(shape.monotone(), 1), (shape.convex(), 2)], ids=["monotone", "convex"])
 def test_cones_of_smooth_bases_hold_between_their_points(basis, rule, order):
@@ -182,6 +185,7 @@ def named_record():
     return optid.Data(u=data.u, y=data.y, inputs=["valve", "pump"])
 
 
+@pytest.mark.slow
 def test_channels_are_constrained_by_name():
     bases = [Triangular(5).fitted(-1, 1), Polynomial(3).fitted(-1, 1)]
     fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=bases, constraints=[
@@ -195,6 +199,7 @@ def test_channels_are_constrained_by_name():
     assert all(rising(np.round(one(GRID), 6)) for one in every.model.nonlinearities)
 
 
+@pytest.mark.slow
 def test_two_channels_share_their_dynamics():
     fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=Triangular(5).fitted(-1, 1),
                     constraints=[shape.shared("b", "valve", "pump")])

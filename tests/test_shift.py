@@ -57,6 +57,7 @@ def solved(up, down, rules, solver="auto"):
 REGIONS = [stable(1.0), stable(0.8), damped(0.3), strip(-0.2, 0.8), sector(1.2), disc(0.3, 0.6)]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("rule", REGIONS, ids=lambda rule: rule.name)
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_the_poles_lie_where_they_were_wanted(rule, n):
@@ -86,6 +87,7 @@ def test_the_residual_is_measured_and_the_certificate_proves_the_poles():
     assert np.all(np.diff(falls) <= 1e-7)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("radius", [1.0, 0.8])
 def test_close_to_the_best_stable_matrix_of_a_search(radius):
     """With two states, |eigenvalues| < r is the triangle of trace and determinant: searched from many starts."""
@@ -118,6 +120,7 @@ def test_nothing_is_posed_where_least_squares_obeys():
     assert outcome is None and not shift.applied and shift.suboptimality == 0 and shift.status is Status.OPTIMAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["scs", "cvxopt"])
 def test_any_semidefinite_back_end_gives_the_same_matrix(solver):
     rng = np.random.default_rng(5)
@@ -163,6 +166,7 @@ def test_of_a_large_order_only_the_poles_that_disobey_are_moved(n, outside):
     assert 0 < shift.suboptimality < np.linalg.norm(up @ radial - down) - shift.bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [stable(0.8), sector(1.2), disc(0.3, 0.6)], ids=lambda rule: rule.name)
 def test_a_deflated_step_is_nearly_as_good_as_the_whole(rule, monkeypatch):
     ratios = []

@@ -72,6 +72,7 @@ def near_the_circle(rng, na, distance):
     return np.array([*pairs, *np.conj(pairs), *([1 - distance] if na % 2 else [])])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("na", [1, 2, 3, 4, 6])
 @pytest.mark.parametrize("distance", [0.3, 1e-2, 1e-3, 1e-5])
 def test_a_stable_iterate_lies_in_its_own_region_and_all_of_the_region_is_stable(na, distance):

@@ -51,6 +51,7 @@ def weighted_square(criterion, x):
     return total
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("innovations", [False, True])
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 @pytest.mark.parametrize("basis", [None, Polynomial(3), UserFunctions((np.sin, np.tanh), interval=(-3.0, 3.0))])
@@ -162,6 +163,7 @@ def hammerstein(samples=1500, seed=0, fed=True):
     return model, u, rng
 
 
+@pytest.mark.slow
 def test_hammerstein_with_feedback_without_noise():
     model, u, _ = hammerstein(samples=800)
     y = model.simulate(u, x0=[0.5, -0.5])
@@ -246,6 +248,7 @@ def test_refusals():
             optid.fit(data, exact, nx=2, basis="linear", feedback_basis="polynomial:1")
 
 
+@pytest.mark.slow
 def test_detrended_and_scaled_data_give_the_model_in_raw_units():
     model, u, rng = hammerstein(samples=600)
     y = model.simulate(u) + 0.05 * rng.normal(size=(len(u), 2))

@@ -45,6 +45,7 @@ def test_whole_records_stay_as_they_are():
     assert with_whole_inputs(data, 3) is data
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("name", "orders"), [
     ("oe.exact", ORDERS),
     ("hammerstein_oe.exact", {**ORDERS, "basis": "polynomial:2"}),

@@ -110,12 +110,14 @@ def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
 # -- level and power -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_products_keep_their_level_in_coloured_noise():
     found = [structure_test(hammerstein(800, seed)) for seed in range(60)]
     assert kstest([one.products["y"] for one in found], "uniform").pvalue > 1e-3
     assert all(one.passed for one in found)
 
 
+@pytest.mark.slow
 def test_random_systems_are_told_apart():
     wrong = {wiener: [benchmark.system(seed, wiener, 1500)[1] for seed in range(20)
                       if structure_test(benchmark.system(seed, wiener, 1500)[0]).passed == wiener]

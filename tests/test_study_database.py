@@ -54,6 +54,7 @@ def test_hashes_of_data_files_by_study_and_label(path):
     assert expected and data_hashes(path) == expected
 
 
+@pytest.mark.slow
 def test_ten_thousand_rows_are_written_and_read(path):
     append(path, rows(10_000))
     assert read_rows(path)["key"].size == 10_000
@@ -224,6 +225,7 @@ def test_files_of_another_kind_are_told_with_what_to_do(tmp_path, name, content,
     assert path.read_bytes() == content
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.1, 0.3])
 def test_a_database_that_was_cut_short_is_told_with_what_to_do(path, share):
     append(path, rows(2000))

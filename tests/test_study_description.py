@@ -308,6 +308,7 @@ def _lists(entries, **size):
     return st.lists(entries, unique=True, **size)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(name=_NAMES, labels=st.lists(_NAMES, min_size=2, max_size=2, unique=True), warm=st.booleans(),
        accuracy=_lists(_SHARES, min_size=1), noise=_lists(st.floats(0, 1e3)),
@@ -590,6 +591,7 @@ IN_CLASS = [("dead_zone_in_span", "hammerstein_arx.exact"), ("ding_chen", "hamme
             ("linear", "oe.exact"), ("two_modes", "hammerstein_ss.sid")]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name, formulation", IN_CLASS)
 def test_a_model_of_the_class_has_no_error_without_noise(name, formulation):
     from optid.cli.arguments import suited

@@ -587,6 +587,7 @@ def bad_inputs():
     }
 
 
+@pytest.mark.sampled(2)
 @in_browser
 @pytest.mark.parametrize("name", bad_inputs())
 def test_bad_input_gives_a_true_and_quiet_page(browser, tmp_path, name):

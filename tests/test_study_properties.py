@@ -49,6 +49,7 @@ def test_complete_is_idempotent_and_finite(row):
     assert all(math.isfinite(value) for value in row.values() if isinstance(value, float))
 
 
+@pytest.mark.slow
 @FEW
 @given(BATCHES)
 def test_rows_survive_the_database(batch):
@@ -96,6 +97,7 @@ def test_places_differ_where_labels_do(labels):
     assert len({place(*label) for label in labels}) == len({json.dumps(label) for label in labels})
 
 
+@pytest.mark.slow
 @FEW
 @given(st.permutations(range(8)), st.sets(st.integers(0, 7)))
 def test_the_order_of_batches_does_not_matter(order, renewed):

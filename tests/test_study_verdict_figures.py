@@ -176,6 +176,7 @@ def test_the_probability_of_friedman_is_the_one_of_all_permutations():
     assert statistic == pytest.approx(scipy.stats.friedmanchisquare(*scores.T).statistic)
 
 
+@pytest.mark.slow
 def test_the_test_over_data_sets_keeps_its_level():
     rng = np.random.default_rng(1)
     found = [rank_over_data_sets(rng.normal(size=(7, 4)), tuple("abcd")).probability for _ in range(1000)]

@@ -150,6 +150,7 @@ def test_reference_errors_of_example_1():
     assert linear[0] > 15 and linear[1] > 20
 
 
+@pytest.mark.slow
 def test_coloured_noise_needs_instruments_without_outputs():
     """Theory 2.6: past outputs bias the poles under AR(0.9) noise; simulated feedback does not."""
     data = example1(12000, 0.0, 0.5, colour=0.9)
@@ -158,6 +159,7 @@ def test_coloured_noise_needs_instruments_without_outputs():
     assert gap(without_injection(found).A, A) < 0.05 < gap(without_injection(biased).A, A)
 
 
+@pytest.mark.slow
 def test_condition_stays_bounded_only_with_simulated_feedback():
     """Condition of R11 as the record grows."""
     figures = {}

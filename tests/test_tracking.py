@@ -62,6 +62,7 @@ def textbook(x, r, beta, start, p0=1.0, orthonormal=False):
 # -- trackers --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["past", "opast"])
 def test_recursion_is_that_of_the_textbook(method):
     c = covariance()

@@ -315,6 +315,7 @@ def test_static_gain_fixed_in_the_exact_programme():
 # -- bootstrap -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_bootstrap_agrees_with_the_linearisation(plain):
     refits = optid.bootstrap(plain, 100)
     assert refits.failed == 0 and len(refits.models) == 100
@@ -339,6 +340,7 @@ def test_bootstrap_keeps_holes_constraints_and_several_outputs():
     np.testing.assert_allclose(optid.bootstrap(linear, 60).basic.b[0].error, linear.uncertainty.b[0].error, rtol=0.4)
 
 
+@pytest.mark.slow
 def test_bootstrap_serves_robust_losses():
     fit = optid.fit(simulated(150), "arx", na=2, nb=2, loss="huber")
     with pytest.raises(StructureError, match="huber.*bootstrap"):

@@ -100,6 +100,7 @@ def same(case, accuracy, constrained, units):
         assert other.solution.objective / r**unit == pytest.approx(base.solution.objective, rel=accuracy)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("constrained", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_units_do_not_matter(name, constrained):
@@ -124,6 +125,7 @@ def test_random_records_in_random_units(seed, size, spread, name, constrained):
     assert other.solution.gap == pytest.approx(base.solution.gap, abs=1e-9)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("constrained", [False, True])
 @pytest.mark.parametrize("name", ["arx", "exact", "overparametrised", "oe", "armax", "bj", "sid", "ss"])
 def test_a_level_of_the_output_does_not_matter(name, constrained):
