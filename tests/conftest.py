@@ -21,8 +21,8 @@ nuclear_subspace output_error prices rank_one readme shift shooting solving stat
 uncertainty""".split()
 
 
-SLOW = """clusters monitor_arl monitor_cli study_cli study_cluster study_examples study_running study_third_party
-study_workers""".split()
+SLOW = """clusters fault_empirical hard_over monitor monitor_arl monitor_cli study_cli study_cluster study_examples
+study_running study_third_party study_workers""".split()
 
 
 def pytest_collection_modifyitems(items):

@@ -111,6 +111,7 @@ def test_bounds_never_exceed_the_best_known_value(seed, channels):
     assert recompute(problem, bound.multipliers) == pytest.approx(bound.value, rel=1e-7)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("effort", ["instant", "ascent", "sdp"])
 def test_a_worse_stationary_point_is_never_proved(effort):
     """Stationary points above the optimum must be refused on every rung, and the SDP must point to a better one."""

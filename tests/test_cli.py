@@ -273,6 +273,7 @@ def test_registered_names_are_listed(command, group):
     assert names <= set(result.output.split())
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", sorted(registered(FORMULATIONS)))
 def test_a_formulation_documents_the_variables_it_poses(name):
     rng = np.random.default_rng(0)
@@ -426,6 +427,7 @@ def test_an_error_goes_to_the_error_stream(tmp_path):
     assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_fit_without_a_report_needs_no_figures(csv, tmp_path):
     code = (
         "import sys; from typer.testing import CliRunner; from optid.cli.app import app;"

@@ -160,6 +160,7 @@ def test_the_page_is_complete_and_makes_no_request(tmp_path):
     assert f"{hostile.fits['5 steps'][0, 1]:.2f} %" in source
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_a_browser_renders_the_comparison_without_a_complaint(tmp_path):
     path = report.write_comparison(compare_models([siso(), worse(siso())], record(siso())), tmp_path / "page.html")

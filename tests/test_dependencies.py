@@ -52,6 +52,7 @@ def test_casadi_is_known_to_its_back_end_and_the_export_only():
     assert {name for name in users if not name.startswith("backends/")} <= {"models/export"}
 
 
+@pytest.mark.slow
 def test_private_names_of_cvxpy_live_in_one_back_end():
     for name, path in modules().items():
         inner = [node.module for node in ast.walk(ast.parse(path.read_text()))

@@ -49,6 +49,7 @@ def test_a_record_becomes_a_diagnosis_a_page_and_a_picture(folder, tmp_path):
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_two_faults_and_the_other_options(folder):
     two = run(folder / "model.json", folder / "crossing.csv", "-k", "bias", "--max-faults", "2", "--coverage", "0.9",
               "--false-alarm", "0.02", "--seed", "3", "--no-state-jump", "--load", "pump=0.3,-0.2,0.5", "--robust")

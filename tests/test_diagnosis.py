@@ -48,6 +48,7 @@ def record(*faults, seed=1, model=None, u=None, **how):
 # -- verdicts ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("fault", "label", "size"),
     [
@@ -115,6 +116,7 @@ def test_what_fits_no_candidate_is_unknown_with_direction_and_frequency(found, l
     assert forced.verdict == "faulty" and forced.candidates
 
 
+@pytest.mark.slow
 def test_an_actuator_that_does_not_move_is_untestable():
     u = inputs().copy()
     u[:, 0] = 0.4
@@ -165,6 +167,7 @@ def test_a_sensor_that_repeats_its_reading_is_a_finding_and_the_rest_is_judged(f
     assert both.best.labels == ("sensor:y2", "sensor:y1 frozen")
 
 
+@pytest.mark.slow
 def test_a_constant_channel_is_a_finding_too(found):
     u, y = record()
     y = y.copy()
@@ -316,6 +319,7 @@ def test_at_the_edge_of_the_record_only_the_interval_of_the_size_is_reported(fou
     assert not late.onset_censored and np.isnan(late.size[0]) and "between" in str(late)
 
 
+@pytest.mark.slow
 def test_missing_readings_and_several_experiments(found):
     fault = Fault.step("sensor:y2", 60, 0.8)
     u, y = record(fault)

@@ -217,6 +217,7 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
     assert found.promise.outputs[0] == pytest.approx(whole.promise.outputs[0], rel=0.1)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("call, error, words", [
     (lambda: design(optid.Data(np.ones(4000), PENDULUM.y)), DataError, "cannot be told apart"),
     (lambda: design(PENDULUM, "prbs"), StructureError, "'prbs' is refused: two levels"),

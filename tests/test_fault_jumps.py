@@ -36,6 +36,7 @@ def brute(found, white, onsets):
     return float(np.sum((r - G @ np.linalg.lstsq(G, r, rcond=1e-10)[0]) ** 2))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("missing", [0.0, 0.15])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_equal_to_brute_force_over_all_segmentations(found, seed, missing):

@@ -135,6 +135,7 @@ def test_no_false_proof_and_no_false_exclusion(found):
         assert result.impossible and label in result.consistent
 
 
+@pytest.mark.slow
 def test_candidates_against_all_onsets_by_plain_programmes(found):
     data = record(found, 5, Fault.step("sensor:y2", 9, 2.0))
     process, output = sigmas(found.model, 2.0)

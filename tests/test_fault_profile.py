@@ -100,6 +100,7 @@ def test_the_refit_under_a_sign_is_non_negative_least_squares(found):
     np.testing.assert_allclose([held.changes[k] for k in kept], nnls(columns, problem.r)[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_healthy_window_has_no_course(found):
     result = profile(search(found, []), "sensor:y1")
     assert len(result.changes) <= 2 and np.abs(result.course).max() < 0.8

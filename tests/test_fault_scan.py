@@ -110,6 +110,7 @@ def scheduled(N=60):
     return model, A, B
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gaps", [0.0, 0.15])
 def test_a_scheduled_change_is_the_difference_of_two_predictors(gaps):
     """By hand: one predictor with the healthy matrices, one that follows A(k) and B(k) from the onset on."""

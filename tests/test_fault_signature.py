@@ -58,6 +58,7 @@ def two(found, seed=1, **how):
 # -- atoms ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_atoms_explain_what_the_scan_says(found, limits, missing):
     s = two(found, missing=missing)

@@ -179,6 +179,7 @@ def test_missing_input_is_named():
         model.predict(Data(u, data.y, dt=0.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [1, 3])
 def test_predictions_between_missing_inputs_are_those_of_the_stretches(horizon):
     model = linear()

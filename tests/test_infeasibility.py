@@ -34,6 +34,7 @@ def program_of(rules, form="hammerstein_arx.exact"):
     return formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", SETS)
 def test_the_subset_is_named_and_irreducible(name):
     rules, expected = SETS[name]

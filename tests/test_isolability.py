@@ -161,6 +161,7 @@ def test_one_output_cannot_tell_all_apart_at_any_size():
     assert np.all(study.isolable > study.detectable)
 
 
+@pytest.mark.slow
 def test_it_prints_within_80_columns_and_draws(standard_study, found, tmp_path):
     _, _, _, study = standard_study
     wide = found.isolability(40, calibration=5000, draws=200)

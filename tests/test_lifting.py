@@ -36,6 +36,7 @@ def test_bounds_hold_and_proofs_are_true(name, gain, seed):
         assert "not proved" in fit.solution.bound.reason
 
 
+@pytest.mark.slow
 def test_a_point_that_is_not_optimal_is_never_proved():
     """The certificate is asked about points away from the optimum, some of them stationary for another branch."""
     data = record(count=60, noise=1.0)

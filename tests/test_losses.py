@@ -46,6 +46,7 @@ def test_linear_arx_equals_the_raw_sample_problem(loss, number):
     assert fit.solution.proof
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss, number", CASES[:2])
 def test_nuclear_equals_the_raw_sample_problem(loss, number):
     fit = optid.fit(soiled(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=3.0, loss=loss)
@@ -56,6 +57,7 @@ def test_nuclear_equals_the_raw_sample_problem(loss, number):
     assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-8)
 
 
+@pytest.mark.slow
 def test_l1_with_a_penalty_and_a_constraint_is_bounded_honestly(monkeypatch):
     monkeypatch.setattr(losses, "PASSES", 50)  # stopped early, the bound must hold all the same
     fit = optid.fit(soiled(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=1.0, loss="l1",

@@ -56,6 +56,7 @@ def bare(model):
     return HammersteinSS(model.A, model.B, model.C)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("lengths", "missing", "most"), [((20000,), 0.0, 0.1), ((9000, 4000, 7000), 0.1, 0.12)])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_gain_innovations_and_spectrum_are_recovered(lengths, missing, most, seed):
@@ -106,6 +107,7 @@ def test_no_other_gain_predicts_better():
     assert all(loss(found.K.ravel() + 0.02 * rng.normal(size=6)) > best for _ in range(20))
 
 
+@pytest.mark.slow
 def test_the_normal_equations_are_those_of_a_formed_jacobian():
     model = truth(7)
     data = record(model, (400, 150), missing=0.1)

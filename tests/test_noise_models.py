@@ -209,6 +209,7 @@ def test_changed_units_give_the_same_model(kind):
     assert scaled.model.predict(data) == pytest.approx(fit.model.predict(data), abs=1e-5, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_gaps_cost_no_more_than_their_samples():
     """The estimate on a record with gaps stays near the one without, and its variance within that of the rows left."""
     truth, whole, gapped = system("armax"), [], []
@@ -327,6 +328,7 @@ def test_structure_that_will_not_do(changes, error, words):
             quiet(data, pose, **(orders | changes))
 
 
+@pytest.mark.slow
 def test_orders_of_the_noise_beyond_the_record():
     data = record(system("armax"), (40,))
     with pytest.raises(RankError, match="prediction errors for"):

@@ -140,6 +140,7 @@ def test_experiments_and_missing_samples():
     assert found.nx == 2 and found.lags is not None and np.isfinite(found.states.fit).all()
 
 
+@pytest.mark.slow
 def test_nonlinear_inputs_and_feedback():
     u = np.random.default_rng(0).uniform(-2, 2, (6000, 2))
     data = EXAMPLE1.record(u, 1, process=0.02, measurement=0.05)
@@ -348,6 +349,7 @@ def test_bad_records():
     assert block_rows_for(records(data), linear(data), None) == 10
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     data = TWO_MODES.record(np.random.default_rng(0).normal(size=(600, 2)), 1, measurement=0.1)
     rows = [",".join(f"{x:.9g}" for x in row) for row in np.hstack([data.u, data.y])]

@@ -316,6 +316,7 @@ def test_more_starts_never_give_a_worse_optimum():
     assert values[1] <= values[0] * (1 + 1e-9) and values[2] <= values[1] * (1 + 1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
     staged = []
@@ -331,6 +332,7 @@ def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
     assert staged == [3 if noise == 0.1 else 6] * 6
 
 
+@pytest.mark.slow
 def test_long_records_are_searched_in_part():
     true = siso(basis=BASIS)
     data = record(true, count=60_000, noise=0.2)
@@ -413,6 +415,7 @@ def test_published_output_error_fits(real_data, name, count, lag, low, high):
     assert fit.model.is_stable and fit.solution.status is Status.LOCAL
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("OPTID_DATA" not in os.environ, reason="OPTID_DATA names no folder with the record")
 def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
     record = optid.read(f"{os.environ['OPTID_DATA']}/lab_hydraulic_actuator.csv", inputs="u_valve",

@@ -24,6 +24,7 @@ def fit_with(form, build, bound):
     return optid.fit(record(count=100), form, na=2, nb=2, basis=BASIS, constraints=[build(bound)])
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised"])
 @pytest.mark.parametrize("name", BOUNDS)
 def test_the_multiplier_is_the_derivative_of_the_objective(name, form):
@@ -72,6 +73,7 @@ def test_cones_have_a_slack_too(build, slack):
     assert fit.prices[0].slack == pytest.approx(slack(fit.model.a), abs=1e-6)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("build", [
     lambda v: {"cone": cp.SOC(cp.Constant(1.1), v["a"])},
     lambda v: {"psd": cp.bmat([[1.0, v["a"][0]], [v["a"][0], 1.0]]) >> 0},

@@ -45,6 +45,7 @@ def test_the_main_example_prints_the_figures_of_the_readme(tmp_path):
     assert figures(shown) == figures(printed("Hammerstein ARX model"))
 
 
+@pytest.mark.slow
 def test_the_sizes_of_isolable_faults_are_those_of_the_readme(model):
     assert figures(output("isolability", model)) == figures(printed("window 100 samples"))
 

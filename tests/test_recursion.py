@@ -78,6 +78,7 @@ def started(case, **more):
 # -- the recursion is Algorithm 3.2
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("forgetting", [1.0, 0.98])
 def test_equals_algorithm_3_2_written_out(case, forgetting):

@@ -201,6 +201,7 @@ def test_rules_hold_and_binding_ones_are_named(healthy, faults):
     assert run(actuator(refitting(healthy, data, ONSET, damaged=[1]), constraints=[monotone("increasing")])).model
 
 
+@pytest.mark.slow
 def test_refit_beats_the_healthy_model_and_the_wrong_part(healthy, faults):
     fits = {"right": [], "wrong": [], "healthy": []}
     for seed in range(4):
@@ -512,6 +513,7 @@ def test_corners_bound_what_can_be_held():
             assert found.attainable(corner).distance < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("m", [2, 3])
 def test_the_compiled_controller_solves_the_programme(m):
     found = allocate(plant(m), weights=[1.0, 0.5])

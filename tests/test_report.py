@@ -133,6 +133,7 @@ def test_figures_follow_the_colours_of_the_page(pages):
     assert "--blue: light-dark(" in pages["thruster"]
 
 
+@pytest.mark.slow
 def test_write_returns_the_path(tmp_path):
     path = report.write(linear_fit(), tmp_path / "page.html", command="optid fit 'my data.csv'")
     assert "optid fit &#39;my data.csv&#39;" in path.read_text(encoding="utf-8")

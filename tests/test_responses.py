@@ -106,6 +106,7 @@ def test_an_input_without_effect_on_one_output_and_on_all():
     assert np.max(np.abs(solution.values["Theta[u1]"][:, N])) > 1e-2
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("margin", [0.0, 0.5])
 def test_positive_realness_is_that_of_the_frequency_response(seed, margin):

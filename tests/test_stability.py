@@ -43,6 +43,7 @@ def test_the_polytope_is_the_condition_on_the_roots(coefficients, radius):
         assert holds(a, members, coefficients) == (size < radius)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("na", [3, 4, 5])
 @pytest.mark.parametrize("radius", [1.0, 0.8])
 def test_the_inner_region_holds_stable_polynomials_only(na, radius):

@@ -99,6 +99,7 @@ def test_the_solver_has_the_time_that_loading_left_and_the_second_solve_the_same
     assert limits[0] == limits[1] <= 49.7
 
 
+@pytest.mark.slow
 def test_a_second_solve_for_which_too_little_time_is_left_is_left_out(solver):
     calls = []
 
@@ -141,6 +142,7 @@ def test_memory_that_only_the_second_solve_takes_leaves_the_row_of_the_first(mon
     assert "no warm solve: held" in row["reason"]
 
 
+@pytest.mark.slow
 def test_a_procedure_has_its_steps_and_their_times():
     row = run_cell(one("auto", "subspace.nuclear", options={"nx": 2}, warm=True))
     assert row["outcome"] == "done" and row["n_programs"] > 1 and row["warm_s"] is None

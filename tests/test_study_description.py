@@ -257,6 +257,7 @@ def test_options_that_kill_a_solver_are_told(monkeypatch):
     assert "equilibrate_enable makes clarabel fail" in told and "SIGKILL" in told
 
 
+@pytest.mark.slow
 def test_a_formulation_that_fits_some_of_the_data_is_left_to_the_run():
     text = SMALL.replace("[[data]]", '[[data]]\nsystem = "two_modes"\n\n[[data]]', 1)
     one_output = text + '[[formulation]]\nformulation = "oe.exact"\nna = 2\nnb = 2\n'

@@ -134,6 +134,7 @@ def test_sivid_recovers_with_future_inputs():
 # -- noise ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reference_errors_of_example_1():
     """Theory 2.10 for process 0.05, measurement 0.1: 3.2 / 6.2 %; linear 26 / 32 %; without feedback 10.6 / 17 %."""
     estimation, validation = example1(7000, 0.05, 0.1).split(6000)

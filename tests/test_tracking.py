@@ -264,6 +264,7 @@ def test_derivatives_by_differences(n, r, seed):
         assert hessian[:, column] == pytest.approx(bend, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_descent_from_everywhere_ends_at_the_minimum():
     c = covariance()
     for seed in range(10):

@@ -328,6 +328,7 @@ def test_bootstrap_agrees_with_the_linearisation(plain):
     assert optid.bootstrap(plain, 40, seed=3).models[7].a[0] == optid.bootstrap(plain, 40, seed=3).models[7].a[0]
 
 
+@pytest.mark.slow
 def test_bootstrap_keeps_holes_constraints_and_several_outputs():
     data = two_outputs()
     u, y = data.u.copy(), data.y.copy()
