@@ -70,6 +70,11 @@ def named_constraint(text: str) -> Any:
         else:
             positional.append(_number(argument))
     try:
+        signature = inspect.signature(build)
+        for key, value in signature.bind(*positional, **keywords).arguments.items():
+            kind = str(signature.parameters[key].annotation)
+            if isinstance(value, str) and ("float" in kind or "int" in kind) and "str" not in kind:
+                raise StructureError(f"constraint {text!r}: {key} must be a number, not {value!r}")
         return build(*positional, **keywords)
     except TypeError as error:
         raise StructureError(f"constraint {text!r}: {error}; it is used as {word}{inspect.signature(build)}") from None

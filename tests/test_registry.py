@@ -73,3 +73,10 @@ def test_a_callable_is_its_own_formulation():
     with pytest.raises(StructureError, match="no argument 'oder'. Did you mean 'order'"):
         check_arguments("mine", mine, {"oder": 2})
     check_arguments("open", lambda data, **anything: None, {"whatever": 1})
+
+
+@pytest.mark.parametrize("text, argument", [("slope:low=a", "low"), ("gain:abc", "value"), ("dead_zone:-0.1,b", "high"),
+                                            ("sector:q", "angle")])
+def test_a_word_in_place_of_a_number_is_named(text, argument):
+    with pytest.raises(StructureError, match=f"{argument} must be a number, not"):
+        named_constraint(text)
