@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 from optid.backends import Answer, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.certificate.ladder import certify
+from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
 from optid.gradients import flat_value
 from optid.infeasibility import satisfiable
@@ -124,10 +125,10 @@ class _Constrained:
         return min(found, key=lambda end: end[0])[1]
 
     def _is_proved(self, answer: Answer) -> bool:
-        """Whether a point is the global optimum for certain, so that no other descent can better it."""
+        """Whether a point is the global optimum by one of the quick proofs, so that no other descent can better it."""
         if self.program.certify is None or answer.status is not Status.LOCAL:
             return False
-        return self.program.certify(self.program, answer.values, answer.duals)[0].proved
+        return certify_rank_one(self.program, answer.values, answer.duals, max_size=0)[0].proved
 
     def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
