@@ -95,14 +95,21 @@ def _derive(expression: Any, known: dict[int, _Node | None]) -> _Node | None:
     return _Node(value.toarray() if sp.issparse(value) else np.asarray(value, dtype=float), slopes)
 
 
-def _moved(expression: Any) -> list[Map]:
-    """Follow an atom that only moves entries, by evaluating it on the numbers 1, 2, ... of the entries."""
-    numbers, edges = [], [0]
+def sources(expression: Any) -> np.ndarray:
+    """Return where an atom of `MOVES` takes every entry from, counted through all its arguments; -1 where it is zero.
+
+    The atom is evaluated on the numbers 1, 2, ... of the entries.
+    """
+    numbers, first = [], 1
     for arg in expression.args:
-        first, edges = edges[-1] + 1, [*edges, edges[-1] + arg.size]
         numbers.append(np.reshape(np.arange(first, first + arg.size, dtype=float), arg.shape, order="F"))
+        first += arg.size
     moved = expression.numeric(numbers)
-    source = np.ravel(moved.toarray() if sp.issparse(moved) else moved, order="F").astype(int) - 1
+    return np.ravel(moved.toarray() if sp.issparse(moved) else np.asarray(moved), order="F").astype(int) - 1
+
+
+def _moved(expression: Any) -> list[Map]:
+    source, edges = sources(expression), np.cumsum([0, *(arg.size for arg in expression.args)])
     return [partial(_gather, np.where((source >= low) & (source < high), source - low, -1))
             for low, high in zip(edges, edges[1:])]
 

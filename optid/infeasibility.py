@@ -81,9 +81,11 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
 
 
 def _linearised(member: Any) -> Any:
-    expression = member.expr
+    expression, slopes = member.expr, jacobians(member.expr)
+    if slopes is None:  # nothing is known of it, so it cannot be blamed
+        return cp.Constant(0.0) <= 0
     linear: Any = flat_value(expression)
-    for variable, slope in (jacobians(expression) or {}).items():
+    for variable, slope in slopes.items():
         flat = variable if variable.ndim == 1 else cp.vec(variable, order="F")
         linear = linear + slope @ (flat - flat_value(variable))
     equal = isinstance(member, EQUALITIES)

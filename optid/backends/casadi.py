@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from optid.backends import Answer, Settings
 from optid.backends.dnlp import Smooth, by_name, cache, smooth
 from optid.errors import StructureError
-from optid.gradients import MOVES
+from optid.gradients import MOVES, sources
 from optid.program import Program
 from optid.solution import Status
 
@@ -98,21 +98,15 @@ def constant(value: Any, shape: tuple[int, int]) -> Any:
 
 
 def _move(expr: Any, columns: list) -> Any:
-    """Apply an atom that only moves entries, by evaluating it on the numbers 1, 2, ... of the entries."""
+    """Apply an atom that only moves entries."""
     import casadi as ca
 
-    numbers, count = [], 0
-    for arg in expr.args:
-        numbers.append(np.reshape(np.arange(count + 1, count + arg.size + 1, dtype=float), arg.shape, order="F"))
-        count += arg.size
-    moved = expr.numeric(numbers)
-    moved = np.ravel(moved.toarray() if sp.issparse(moved) else np.asarray(moved), order="F").astype(int)
-    source = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
-    if moved.all():
-        return source if np.array_equal(moved, np.arange(1, count + 1)) else source[(moved - 1).tolist(), 0]
-    kept = np.flatnonzero(moved)
+    moved, column = sources(expr), columns[0] if len(columns) == 1 else ca.vertcat(*columns)
+    if np.all(moved >= 0):
+        return column if np.array_equal(moved, np.arange(column.numel())) else column[moved.tolist(), 0]
+    kept = np.flatnonzero(moved >= 0)
     place = ca.Sparsity(moved.size, 1, [0, kept.size], kept.tolist())
-    return ca.MX(place, ca.densify(source)[(moved[kept] - 1).tolist(), 0])
+    return ca.MX(place, ca.densify(column)[moved[kept].tolist(), 0])
 
 
 def _matrix(column: Any, shape: tuple[int, ...], *, row: bool = False) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from optid.backends import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
-from optid.gradients import flat_value, jacobians
+from optid.gradients import affine_parts, flat_value, jacobians
 from optid.limits import EQUALITIES, INEQUALITIES
 from optid.program import Program, RankOneForm, Values
 from optid.rank_one import Point
@@ -58,10 +58,6 @@ class Coordinates:
         """Return named values for x."""
         parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
         return {name: np.reshape(part, v.shape, order="F") for name, v, part in zip(self.names, self.variables, parts)}
-
-    def assigned(self) -> np.ndarray:
-        """Return x as the CVXPY variables hold it."""
-        return np.concatenate([flat_value(variable) for variable in self.variables])
 
     def assign(self, x: np.ndarray) -> None:
         """Write x into the CVXPY variables."""
@@ -157,8 +153,8 @@ class _Rows:
 class StepQP:
     """``minimise ‖U x - t‖²`` over the programme's own variables and constraints, with matrices that change.
 
-    With affine constraints and tangents alone it goes straight to Clarabel; with cones, or to another back end, it goes
-    through CVXPY, compiled once.
+    With affine constraints and tangents alone it goes straight to Clarabel; with cones or variables of a constraint's
+    own, or to another back end, it goes through CVXPY, compiled once.
 
     Args:
         at: the programme and its coordinates.
@@ -167,7 +163,7 @@ class StepQP:
     """
 
     def __init__(self, at: Coordinates, sizes: Mapping[str, float], *, pinned: bool) -> None:
-        self.at, self.sizes, self.pinned = at, dict(sizes), pinned
+        self.at, self.sizes = at, dict(sizes)
         self.rows: list[_Rows] = []
         self.cones: list[tuple[str, slice, cp.Constraint]] = []
         self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
@@ -184,16 +180,16 @@ class StepQP:
                     self._add(name, member, span)
 
     def _add(self, name: str, member: cp.Constraint, span: slice) -> None:
-        if not isinstance(member, EQUALITIES | INEQUALITIES) or member.is_dcp() and not member.expr.is_affine():
+        if isinstance(member, EQUALITIES | INEQUALITIES) and not member.is_dcp():
+            empty = np.zeros((member.size, self.at.size))
+            self.rows.append(_Rows(name, span, member, 1.0, empty, empty[:, 0], self._where.rows(member)))
+            return
+        parts = affine_parts(member.expr) if isinstance(member, EQUALITIES | INEQUALITIES) else None
+        if parts is None or {v.id for v in parts[0]} - {v.id for v in self.at.variables}:
             self.cones.append((name, span, member))
             return
-        unit, empty = 1.0, np.zeros((member.size, self.at.size))
-        if not member.is_dcp():
-            self.rows.append(_Rows(name, span, member, unit, empty, empty[:, 0], self._where.rows(member)))
-            return
-        slope = self.slope(member.expr)
-        level = flat_value(member.expr) - slope @ self.at.assigned()
-        unit = float(np.max(np.abs(slope) @ self._scale + np.abs(flat_value(member.expr)), initial=0.0)) or 1.0
+        slope, level = self._laid_out(parts[0], member.size), parts[1]
+        unit = float(np.max(np.abs(slope) @ self._scale + np.abs(level), initial=0.0)) or 1.0
         self.rows.append(_Rows(name, span, member, unit, slope, level))
 
     def set_model(self, x: np.ndarray, duals: Values, *, second_order: bool = True, damping: float = 0.0) -> None:
@@ -254,7 +250,7 @@ class StepQP:
         return Answer(answer.status, answer.word, values if usable else {}, duals)
 
     def _directly(self, settings: Settings) -> Answer:
-        (matrix, target, held), sides = self._matrices()[:3], self._matrices()[3:]
+        matrix, target, held, *sides = self._matrices()
         pins = np.eye(self.at.size)[self._pins]
         pairs = list(zip(self.rows, sides[::2], sides[1::2]))
         equal = [(slope, -level) for row, slope, level in pairs if row.equality]
@@ -322,9 +318,11 @@ class StepQP:
         return self._jacobian(expression)
 
     def _jacobian(self, expression: cp.Expression) -> np.ndarray:
-        slopes = jacobians(expression) or {}
-        return np.hstack([slopes[v].toarray() if v in slopes else np.zeros((expression.size, v.size))
-                          for v in self.at.variables])
+        return self._laid_out(jacobians(expression) or {}, expression.size)
+
+    def _laid_out(self, slopes: Mapping[cp.Variable, Any], rows: int) -> np.ndarray:
+        """Put Jacobians by variable side by side."""
+        return np.hstack([slopes[v].toarray() if v in slopes else np.zeros((rows, v.size)) for v in self.at.variables])
 
 
 def _spans(group: tuple[cp.Constraint, ...]) -> list[slice]:
