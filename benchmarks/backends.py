@@ -11,9 +11,9 @@ an "optimal", and every disagreement with how it was caught.
 import argparse
 
 from optid.backends import back_ends
-from optid.conformance import SUCCESS, VALUE, Row, accepted_cases, run_case, value_error
-from optid.solution import Status
-from optid.zoo import SOLVED, cases
+from optid.conformance.checks import SUCCESS, VALUE, Row, accepted_cases, run_case, value_error
+from optid.conformance.zoo import SOLVED, cases
+from optid.program.solution import Status
 
 CLAIMS = {"optimal", "Solve_Succeeded", "success", "FEASIBLE_KKT_POINT", "stationary", "optimal_inaccurate"}
 LIMIT = 60.0  # seconds per run

@@ -20,9 +20,9 @@ from scipy.signal import lfilter
 from scipy.special import ndtr
 
 from optid.certificate import certify, solve_certified
-from optid.rank_one import RankOne, reduce
-from optid.rank_one.bilinear import best_of
-from optid.rank_one.cones import minimise_in_cones
+from optid.certificate.cones import minimise_in_cones
+from optid.structures.bilinear import best_of
+from optid.structures.rank_one import RankOne, reduce
 
 TOLERANCE = 1e-8
 

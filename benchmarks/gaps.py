@@ -20,8 +20,8 @@ from scipy.signal import lfilter
 import optid
 from optid.bases import Polynomial, Triangular
 from optid.errors import OptidError
+from optid.identify.validation import fit_percent
 from optid.models import HammersteinSS, Nonlinearity
-from optid.validation import fit_percent
 
 AR, B = np.array([1.0, -1.5, 0.7]), np.array([0.0, 0.8, 0.6])
 ORDERS = {"na": 2, "nb": 2, "nk": 1}

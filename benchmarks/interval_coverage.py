@@ -18,8 +18,8 @@ import numpy as np
 from montecarlo import NODES, STRUCTURE, TRUTHS, A, B, mapped, record
 
 import optid
-from formulations import shape
-from optid.uncertainty import uncertainty
+from formulations.constraints import shape
+from optid.identify.uncertainty import uncertainty
 
 GRID = np.linspace(-1.0, 1.0, 41)
 CASES = ("strictly monotone", "dead zone", "saturation")

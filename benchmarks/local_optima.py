@@ -15,8 +15,8 @@ import numpy as np
 from montecarlo import mapped
 
 import optid
-from formulations import shape
-from optid.rank_one.bilinear import best_of
+from formulations.constraints import shape
+from optid.structures.bilinear import best_of
 
 
 def collinear(seed: int, count: int = 300) -> optid.Data:

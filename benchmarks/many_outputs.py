@@ -22,9 +22,9 @@ import numpy as np
 
 import formulations.shift
 import optid
-from formulations.stability import stable
+from formulations.constraints.stability import stable
 from optid.errors import DataWarning
-from optid.solving import run
+from optid.solving.solve import run
 
 STATES, INPUTS = 7, 3
 FITS = {"seven states": ("hammerstein_ss.sid", "hammerstein_ss.asivid", "ss.exact", "order"),

@@ -17,9 +17,9 @@ from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataWarning
-from optid.regressors import collect
-from optid.regressors.layout import Layout
-from optid.uncertainty import uncertainty
+from optid.identify.uncertainty import uncertainty
+from optid.models.layout import Layout
+from optid.statistics import collect
 
 VALUES = TRUTHS["dead zone"]
 GRID = np.linspace(-1.0, 1.0, 41)

@@ -30,7 +30,7 @@ import optid
 from formulations.nuclear_subspace import held_out_fit, nuclear_programme, order_scores, structure
 from formulations.subspace_procedure import Plan, prepared
 from optid.backends import Settings, find
-from optid.solving import solve
+from optid.solving.solve import solve
 
 
 def record(folder: str) -> optid.Data:

@@ -15,9 +15,9 @@ import numpy as np
 from montecarlo import share
 
 from optid.bases import Linear, fitted_bases
-from optid.model_order import RankTest, order_test
+from optid.identify.order import RankTest, order_test
 from optid.plants import NOISE_CASES, TWO_MODES
-from optid.subspace.expansion import expand
+from optid.statistics.expansion import expand
 
 CASES = {name: (*noise, 0.0) for name, noise in NOISE_CASES.items()}
 CASES["strong, coloured"] = (*NOISE_CASES["strong"], 0.9)

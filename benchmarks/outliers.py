@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataWarning
-from optid.outliers import find_outliers
+from optid.identify.outliers import find_outliers
 
 SIGNALS = {
     "white": lambda rng: rng.normal(size=500),

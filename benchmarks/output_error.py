@@ -26,7 +26,7 @@ import numpy as np
 
 import optid
 from optid.errors import DataWarning, OptidError
-from optid.validation import fit_percent
+from optid.identify.validation import fit_percent
 
 WINDOW = 50
 

@@ -16,8 +16,8 @@ import cvxpy as cp
 import numpy as np
 
 import optid
-from formulations import shape
-from formulations.shape import _flat, _mirror
+from formulations.constraints import shape
+from formulations.constraints.shape import _flat, _mirror
 
 EXACT, RELAXED = "hammerstein_arx.exact", "hammerstein_arx.overparametrised"
 

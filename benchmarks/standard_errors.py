@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 import optid
 from optid import examples
-from optid.uncertainty import uncertainty
+from optid.identify.uncertainty import uncertainty
 
 POINTS = np.linspace(-1.5, 1.5, 11)
 NAMES = ["a1", "a2", *(f"f({u:g})" for u in POINTS)]

@@ -19,7 +19,7 @@ from montecarlo import share
 from scipy.signal import butter, lfilter
 
 import optid
-from optid.validation.structure import structure_test
+from optid.identify.validation.structure import structure_test
 
 FUNCTIONS = {
     "saturation": lambda x: np.tanh(1.5 * x),

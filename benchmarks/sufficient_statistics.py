@@ -76,7 +76,7 @@ def measure(route: str, samples: int) -> dict[str, float]:
     import numpy as np
 
     import optid
-    from optid.regressors import Layout, collect
+    from optid.statistics import Layout, collect
 
     data = record(samples)
     basis = optid.Triangular(CELLS).fitted(-1, 1)

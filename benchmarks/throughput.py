@@ -104,7 +104,7 @@ def measure(path: Path, work: str, threads: int, cells: int, lags: int) -> dict[
     if threads == 1:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import optid
-    from optid.regressors import Layout, collect
+    from optid.statistics import Layout, collect
 
     names = ["u", "y"] if path.suffix == ".npy" else None
     stream = optid.open_stream(path, inputs=["u"], outputs=["y"], columns=names)

@@ -5,7 +5,7 @@ variables a, b, mu, Theta, offset. The price of a constraint is the points of fi
 """
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.errors import InfeasibleError
 from optid.examples import example
 

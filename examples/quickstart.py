@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.examples import example
 
 

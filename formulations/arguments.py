@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 
 ROWS_PER_UNKNOWN = 1.1

@@ -12,11 +12,11 @@ import numpy as np
 from formulations.equation_error import EquationError, compress, residual_programme
 from formulations.losses import degree, with_loss
 from optid.bases import Linear
-from optid.data import Data
+from optid.data.record import Data
+from optid.data.streams import Stream
 from optid.models import HammersteinARX
-from optid.program import Program, RankOneForm, Values
-from optid.solving import Procedure
-from optid.streams import Stream
+from optid.program.program import Program, RankOneForm, Values
+from optid.solving.solve import Procedure
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,

@@ -15,17 +15,17 @@ from scipy.linalg import solve_triangular
 from formulations.arguments import per_channel, whole_number
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
+from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
-from optid.program import Program
-from optid.rank_one import RankOne
-from optid.regressors import Layout, Statistics, collect
-from optid.streams import Stream
-from optid.units import energy_unit, in_units, inner_bases, own_units
-from optid.view import View
+from optid.program.program import Program
+from optid.program.units import energy_unit, in_units, inner_bases, own_units
+from optid.program.view import View
+from optid.statistics import Layout, Statistics, collect
+from optid.structures.rank_one import RankOne
 
 
 class Compressed(Protocol):
@@ -45,7 +45,7 @@ class EquationError:
         statistics: what one pass over the record left.
         problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
         meta: dt, names and units for the model.
-        units: from those of the problem (`optid.units`) to those of the record.
+        units: from those of the problem (`optid.program.units`) to those of the record.
         bases: one per input, in the units of the record.
         unit: what one unit of the objective is in units of the record.
         unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
@@ -191,7 +191,7 @@ def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
              weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2) -> EquationError:
-    """Read the record once and return the compressed problem, posed in the record's own units (`optid.units`).
+    """Read the record once and return the compressed problem, posed in the record's own units (`optid.program.units`).
 
     Args:
         data: the record.

@@ -23,11 +23,11 @@ from formulations.noise_models import PredictionErrors, extended_least_squares, 
 from formulations.output_error_records import in_own_units
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
-from optid.data import Data
-from optid.regressors import Layout
-from optid.regressors.noise_sensitivities import NoiseUnknowns
-from optid.regressors.sensitivities import Unknowns
-from optid.solving import Procedure
+from optid.data.record import Data
+from optid.solving.solve import Procedure
+from optid.statistics import Layout
+from optid.statistics.noise_sensitivities import NoiseUnknowns
+from optid.statistics.sensitivities import Unknowns
 
 
 def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nk: int | Sequence[int] = 0,
@@ -69,7 +69,7 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int,
         nc: order of C.
         basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
         offset: estimate the constant of the equation; False holds it at zero, for centred data.
         starts: number of starts that are compared.

@@ -25,17 +25,17 @@ from formulations.gauges import check_gauge, scale_fixed
 from formulations.losses import degree, with_loss
 from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
-from optid.data import Data
+from optid.data.record import Data
+from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.judging import measure_violation
 from optid.models import HammersteinARX
 from optid.models.gauges import gauge_factor
-from optid.program import Program, RankOneForm, Values
-from optid.rank_one import Core, reduce
-from optid.rank_one.bilinear import starts
-from optid.rank_one.whitening import leading_pair
-from optid.solving import Procedure
-from optid.streams import Stream
+from optid.program.judging import measure_violation
+from optid.program.program import Program, RankOneForm, Values
+from optid.solving.solve import Procedure
+from optid.structures.bilinear import starts
+from optid.structures.rank_one import Core, reduce
+from optid.structures.whitening import leading_pair
 
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -51,7 +51,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         nb: number of coefficients of B, one per input or one for all.
         basis: basis of the nonlinearity, one per input or one for all.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (reweighted passes; no proof).
         ridge: weight of ``‖mu‖² ‖b‖²``.
         curvature: weight of ``‖b‖²`` times the integral of ``f''²``.

@@ -22,26 +22,20 @@ import numpy as np
 from formulations.arguments import one_output, whole_number
 from formulations.gauges import check_gauge
 from formulations.hammerstein_oe import search
-from formulations.noise_models import (
-    PredictionErrors,
-    arma,
-    extended_least_squares,
-    other_zeros,
-    procedure,
-)
+from formulations.noise_models import PredictionErrors, arma, extended_least_squares, other_zeros, procedure
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import RADIUS, with_poles
 from optid.bases import Linear
 from optid.bases.basis import Basis
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import OptidError
 from optid.models.roots import contained
-from optid.regressors import Layout
-from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns
-from optid.regressors.sensitivities import Unknowns, simulate
-from optid.solving import Procedure
+from optid.solving.solve import Procedure
+from optid.statistics import Layout
+from optid.statistics.noise_sensitivities import NoisePoint, NoiseUnknowns
+from optid.statistics.sensitivities import Unknowns, simulate
 
 Array = np.ndarray
 
@@ -53,7 +47,7 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int, nk
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``.
 
     Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles of the plant.
         nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
@@ -82,14 +76,14 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], nc: int, nd: int,
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``mu``, ``offset``, ``x0``.
 
     Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles of the plant.
         nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
         nd: order of D.
         basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
         offset: estimate the constant of the equation; False holds it at zero, for centred data.
         starts: number of starts that are compared.

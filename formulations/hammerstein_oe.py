@@ -1,7 +1,7 @@
 """Output error: ``y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + e``, the sum of squared simulation errors minimised.
 
 `exact` is the Hammerstein model, `linear` (registered as ``oe.exact``) the linear one. Both are procedures: starts
-(`formulations.output_error_starts`), Gauss-Newton descents on streamed sensitivities (`optid.regressors.sensitivities`)
+(`formulations.output_error_starts`), Gauss-Newton descents on streamed sensitivities (`optid.statistics.sensitivities`)
 and, at the optimum or under constraints, convex programmes in the tangent of the iterate
 (`formulations.prediction_error`, `formulations.output_error_programme`). Named variables: ``a``, ``b``, ``mu`` (not in
 the linear model), ``offset``, ``x0`` ((n,), or (n, experiments)) and the affine expression
@@ -20,26 +20,18 @@ from formulations.gauges import check_gauge
 from formulations.output_error import OutputError
 from formulations.output_error_programme import Posing
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
-from formulations.output_error_starts import (
-    RADIUS,
-    blank,
-    equation_error,
-    iterated,
-    perturbed,
-    subspace,
-    with_poles,
-)
+from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, perturbed, subspace, with_poles
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
 from optid.bases.basis import Basis
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import RankError
 from optid.models.roots import contained
-from optid.regressors import Layout
-from optid.regressors.sensitivities import Unknowns
-from optid.solving import Procedure
-from optid.units import energy_unit
+from optid.program.units import energy_unit
+from optid.solving.solve import Procedure
+from optid.statistics import Layout
+from optid.statistics.sensitivities import Unknowns
 
 Array = np.ndarray
 
@@ -57,7 +49,7 @@ def linear(data: Data, *, na: int, nb: int | Sequence[int], nk: int | Sequence[i
     Named variables: ``Theta``, ``a``, ``b``, ``offset``, ``x0``.
 
     Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
@@ -85,12 +77,12 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
         basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
         offset: estimate the constant of the equation; False holds it at zero, for centred data.
         starts: number of starts that are compared at most; three suffice where they agree on a model that explains

@@ -21,10 +21,10 @@ import numpy as np
 from formulations.arguments import one_of
 from formulations.subspace_plan import in_record_units, planned
 from formulations.subspace_procedure import NOISES, identified
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import StructureError
-from optid.experiment.expansion import Bases, FeedbackBases
-from optid.solving import Procedure
+from optid.identify.design.expansion import Bases, FeedbackBases
+from optid.solving.solve import Procedure
 
 
 def sid(
@@ -38,16 +38,16 @@ def sid(
 
     Args:
         data: the record.
-        nx: order; "auto" for the smallest order after which the singular values are noise (`optid.model_order`), "gap"
-            for the largest gap between them (SLICOT's rule).
+        nx: order; "auto" for the smallest order after which the singular values are noise (`optid.identify.order`),
+            "gap" for the largest gap between them (SLICOT's rule).
         block_rows: block rows of the future, and as many of the past; more than the order. None chooses; where missing
-            outputs then leave few complete windows, they are estimated (`optid.subspace.imputation`), for the choice of
-            A and C only.
+            outputs then leave few complete windows, they are estimated (`optid.identify.subspace.imputation`), for the
+            choice of A and C only.
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
             alone (consistent under coloured measurement noise).
-        weighting: of the singular value decomposition, "moesp", "cva" or "plain" (`optid.subspace.realisation`), or
-            "best" for the one whose (A, C) leaves the smallest error on the record.
+        weighting: of the singular values, "moesp", "cva" or "plain" (`optid.identify.subspace.realisation`),
+            or "best" for the one whose (A, C) leaves the smallest error on the record.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         observer: for the step in B, D and x0: "none" minimises the simulation error, "kalman" a prediction error,

@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 
 from formulations.equation_error import EquationError
-from optid.data import Data
-from optid.doctor import BY_RESIDUALS, EXAMINED, list_samples
+from optid.data.record import Data
+from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
-from optid.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
-from optid.program import Program
-from optid.regressors import Layout, Statistics, residuals
-from optid.solution import Bound, Solution, Status, relative_gap
-from optid.solving import Evidence, Procedure
-from optid.streams import Stream
-from optid.units import in_units
+from optid.identify.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
+from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, list_samples
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status, relative_gap
+from optid.program.units import in_units
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics import Layout, Statistics, residuals
 
 Pose = Callable[[list[np.ndarray] | None], tuple[Program, EquationError]]
 

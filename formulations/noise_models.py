@@ -1,6 +1,6 @@
 """What the prediction-error formulations with a noise filter share: the criterion, its programmes and its starts.
 
-The errors and their sensitivities are those of `optid.regressors.noise_sensitivities`; descents and programmes are
+The errors and their sensitivities are those of `optid.statistics.noise_sensitivities`; descents and programmes are
 those of `formulations.prediction_error`. The programmes have the named variables of the output-error ones and ``c``
 (and ``d`` for Box-Jenkins); C stays invertible at every iterate.
 """
@@ -18,17 +18,17 @@ from formulations.output_error import STABLE, OutputError
 from formulations.output_error_programme import Posing
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataWarning, OptidError, RankError
 from optid.models import HammersteinARX, HammersteinTF, roots
-from optid.program import Values
-from optid.rank_one.bilinear import minimise
-from optid.regressors import Layout
-from optid.regressors.linearised import Linearised
-from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns, linearise, predict
-from optid.regressors.sensitivities import PlantPoint
-from optid.solving import Procedure
-from optid.units import energy_unit
+from optid.program.program import Values
+from optid.program.units import energy_unit
+from optid.solving.solve import Procedure
+from optid.statistics import Layout
+from optid.statistics.linearised import Linearised
+from optid.statistics.noise_sensitivities import NoisePoint, NoiseUnknowns, linearise, predict
+from optid.statistics.sensitivities import PlantPoint
+from optid.structures.bilinear import minimise
 
 Array = np.ndarray
 

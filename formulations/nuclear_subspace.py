@@ -26,20 +26,19 @@ import numpy as np
 from formulations.arguments import one_of
 from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import completed, preliminary, prepared
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.experiment.expansion import Bases, FeedbackBases
-from optid.nuclear_norm import NuclearProblem, Predictor
-from optid.nuclear_norm.problem import window_starts
-from optid.program import NuclearForm, Program, Values
-from optid.solution import Bound, Solution, Status, relative_gap
-from optid.solving import Evidence, Procedure
-from optid.subspace.expansion import Expansion
-from optid.subspace.realisation import realise
-from optid.units import energy_unit
-from optid.validation import fit_percent
-from optid.view import View
+from optid.identify.design.expansion import Bases, FeedbackBases
+from optid.identify.subspace.realisation import realise
+from optid.identify.validation import fit_percent
+from optid.program.program import NuclearForm, Program, Values
+from optid.program.solution import Bound, Solution, Status, relative_gap
+from optid.program.units import energy_unit
+from optid.program.view import View
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.expansion import Expansion
+from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
 
 FORMS = ("predictor", "projection", "instruments")
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))

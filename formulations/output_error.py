@@ -5,14 +5,14 @@ from functools import cached_property
 
 import numpy as np
 
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.models import HammersteinARX, roots
 from optid.models.gauges import gauge_factor
 from optid.models.hammerstein_tf import HammersteinTF
-from optid.program import Values
-from optid.regressors.linearised import Linearised
-from optid.regressors.sensitivities import Unknowns, expanded, linearise
+from optid.program.program import Values
+from optid.statistics.linearised import Linearised
+from optid.statistics.sensitivities import Unknowns, expanded, linearise
 
 Array = np.ndarray
 
@@ -28,7 +28,7 @@ class OutputError:
         data: the record.
         unknowns: their order.
         gauge: how the scale between mu and b is fixed; "none" for a linear model.
-        units: from those of the record above (`optid.units`) to those of the model.
+        units: from those of the record above (`optid.program.units`) to those of the model.
     """
 
     data: Data

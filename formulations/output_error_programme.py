@@ -13,16 +13,16 @@ from formulations.gauges import scale_fixed
 from formulations.output_error import OutputError
 from formulations.output_error_starts import with_poles
 from formulations.prediction_error import Descent, Posed
-from optid.judging import measure_violation
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.models.roots import contained
-from optid.program import Program, RankOneForm, Values
-from optid.regressors import Layout
-from optid.regressors.linearised import Linearised
-from optid.units import energy_unit, outer_bases
-from optid.view import View
+from optid.program.judging import measure_violation
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.units import energy_unit, outer_bases
+from optid.program.view import View
+from optid.statistics import Layout
+from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 

@@ -9,13 +9,13 @@ from formulations.arguments import ROWS_PER_UNKNOWN, enough_rows, outputs_presen
 from formulations.equation_error import compress
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
+from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError
-from optid.regressors import Layout
-from optid.regressors.sensitivities import CHUNK, Unknowns
-from optid.stretches import with_whole_inputs
-from optid.units import in_units, inner_bases, own_units
+from optid.program.units import in_units, inner_bases, own_units
+from optid.statistics import Layout
+from optid.statistics.sensitivities import CHUNK, Unknowns
 
 
 def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Sequence[Basis | str],
@@ -38,7 +38,7 @@ def plant_record(data: Data, na: int, nb: Any, nk: Any, basis: Basis | str | Seq
 
 def in_own_units(record: Data, bases: Sequence[Basis], offset: bool = True
                  ) -> tuple[Data, tuple[Basis, ...], Transform]:
-    """Return the record and its bases in the record's own units (`optid.units`), and the way back."""
+    """Return the record and its bases in the record's own units (`optid.program.units`), and the way back."""
     units = own_units(record, [isinstance(basis, Linear) for basis in bases], bool(offset))
     return in_units(record, units), inner_bases(bases, units), units
 

@@ -11,14 +11,14 @@ import numpy as np
 from formulations.equation_error import compress
 from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
+from optid.identify.subspace.methods import default_block_rows, project
+from optid.identify.subspace.realisation import realise
 from optid.models.roots import contained, roots_of
-from optid.rank_one.bilinear import minimise
-from optid.regressors.sensitivities import PlantPoint, Unknowns, instruments
-from optid.subspace.expansion import expand
-from optid.subspace.methods import default_block_rows, project
-from optid.subspace.realisation import realise
+from optid.statistics.expansion import expand
+from optid.statistics.sensitivities import PlantPoint, Unknowns, instruments
+from optid.structures.bilinear import minimise
 
 Array = np.ndarray
 

@@ -16,11 +16,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from optid.errors import StructureError
-from optid.judging import measure_violation
-from optid.program import Program
-from optid.regressors.linearised import Linearised
-from optid.solution import Bound, Solution, Status
-from optid.solving import Evidence
+from optid.program.judging import measure_violation
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status
+from optid.solving.solve import Evidence
+from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 

@@ -1,6 +1,6 @@
 """The programme for B, D, E, offset and x0 of a state-space model whose (A, C) are known.
 
-Two forms of one least-squares problem (`optid.subspace.observer`):
+Two forms of one least-squares problem (`optid.identify.subspace.observer`):
 
 * factored: every channel is rank one, ``Theta_i = mu_i [B_i; D_i]ᵀ``; solved and certified by the machinery of
   rank-one blocks. Named variables: ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed
@@ -24,14 +24,14 @@ import numpy as np
 from formulations.equation_error import flat, residual_programme
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
-from optid.channels import Transform
-from optid.program import Program, RankOneForm, Values
-from optid.rank_one import reduce
-from optid.rank_one.bilinear import starts
-from optid.rank_one.whitening import leading_pair
-from optid.subspace.observer import ObserverProblem
-from optid.units import energy_unit, outer_bases
-from optid.view import View
+from optid.data.channels import Transform
+from optid.identify.subspace.observer import ObserverProblem
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.units import energy_unit, outer_bases
+from optid.program.view import View
+from optid.structures.bilinear import starts
+from optid.structures.rank_one import reduce
+from optid.structures.whitening import leading_pair
 
 RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""

@@ -19,11 +19,11 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.psd import PSD
 
-from formulations.rule import Rule
+from formulations.constraints.rule import Rule
 from optid.errors import StructureError
-from optid.program import Program, Values
-from optid.solution import Solution, Status
-from optid.view import View
+from optid.program.program import Program, Values
+from optid.program.solution import Solution, Status
+from optid.program.view import View
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
 ROUNDS = 6  # pairs of programmes in A and in P at most

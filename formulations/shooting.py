@@ -32,16 +32,16 @@ from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, with_poles
 from optid.bases.basis import Basis
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.roots import contained
-from optid.program import Program, Values
-from optid.regressors.sensitivities import Unknowns, simulate
-from optid.solution import Bound
-from optid.units import energy_unit, outer_bases
-from optid.view import View
+from optid.program.program import Program, Values
+from optid.program.solution import Bound
+from optid.program.units import energy_unit, outer_bases
+from optid.program.view import View
+from optid.statistics.sensitivities import Unknowns, simulate
 
 Array = np.ndarray
 
@@ -62,13 +62,13 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
 
     Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles.
         nb: number of coefficients of B, one per input or one for all.
         basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth
-            constraint in the named variables.
+        constraints: builders such as ``shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth constraint in
+            the named variables.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
         offset: estimate the constant of the equation; False holds it at zero, for centred data.
 

@@ -4,9 +4,9 @@ import numpy as np
 
 from optid.certificate.hankel import hankel_bounds
 from optid.errors import OptidError
-from optid.solution import Bound
-from optid.subspace.expansion import Expansion
-from optid.subspace.observer import ObserverProblem
+from optid.identify.subspace.observer import ObserverProblem
+from optid.program.solution import Bound
+from optid.statistics.expansion import Expansion
 
 WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
 

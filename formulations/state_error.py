@@ -13,13 +13,13 @@ import numpy as np
 
 from formulations.state_models import state_model
 from optid.bases import Linear
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.models.state_forms import balancing
-from optid.regressors.linearised import Linearised
-from optid.regressors.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
+from optid.statistics.linearised import Linearised
+from optid.statistics.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
 
 Array = np.ndarray
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from formulations.equation_error import model_meta
-from optid.data import Data
+from optid.data.record import Data
 from optid.models import HammersteinSS, Nonlinearity
-from optid.subspace.expansion import Expansion
+from optid.statistics.expansion import Expansion
 
 Array = np.ndarray
 

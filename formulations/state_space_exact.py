@@ -31,16 +31,16 @@ from formulations.state_error import STABLE, StateError, entered
 from formulations.state_space_programme import Posing
 from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import identified
-from optid.data import Data
+from optid.data.record import Data
+from optid.data.stretches import with_whole_inputs
 from optid.errors import DataWarning, RankError, StructureError
-from optid.experiment.expansion import Bases
+from optid.identify.design.expansion import Bases
+from optid.identify.noise import with_noise
 from optid.models import HammersteinSS, NoiseCovariances
-from optid.noise import with_noise
-from optid.regressors.state_sensitivities import StateUnknowns
-from optid.solution import Status
-from optid.solving import Evidence, Procedure
-from optid.stretches import with_whole_inputs
-from optid.units import energy_unit, inverse
+from optid.program.solution import Status
+from optid.program.units import energy_unit, inverse
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.state_sensitivities import StateUnknowns
 
 Array = np.ndarray
 
@@ -65,7 +65,7 @@ def linear(
     Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``.
 
     Args:
-        data: the record. Samples may be missing: it is cut where inputs are, see `optid.stretches`.
+        data: the record. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
         criterion: "simulation" (output error, K = 0) or "prediction" (innovation form, K estimated).
         block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
@@ -117,7 +117,7 @@ def exact(
         stability: as in `linear`; what counts are the poles with the feedback taken as a given signal.
         initial: as in `linear`.
         iterations: as in `linear`.
-        constraints: as in `linear`, also those of `formulations.shape`.
+        constraints: as in `linear`, also those of `formulations.constraints.shape`.
 
     Raises:
         StructureError, DataError, RankError: as `linear`; RankError also for a feedback basis that is linear in y.

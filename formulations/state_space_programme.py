@@ -14,13 +14,13 @@ import numpy as np
 from formulations.equation_error import flat, tangent_product
 from formulations.prediction_error import Posed
 from formulations.state_error import StateError
-from optid.channels import Transform
-from optid.judging import measure_violation
+from optid.data.channels import Transform
 from optid.models import HammersteinSS
-from optid.program import Program, Values
-from optid.regressors.linearised import Linearised
-from optid.units import outer_bases
-from optid.view import View
+from optid.program.judging import measure_violation
+from optid.program.program import Program, Values
+from optid.program.units import outer_bases
+from optid.program.view import View
+from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 

@@ -7,14 +7,14 @@ import numpy as np
 
 from formulations.arguments import one_of
 from optid.bases import Linear, UserFunctions, fitted_bases
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.experiment.expansion import feedback_bases
-from optid.solving import Procedure
-from optid.subspace.expansion import Expansion, expand
-from optid.subspace.realisation import WEIGHTINGS
-from optid.units import in_units, inner_bases, own_units
+from optid.identify.design.expansion import feedback_bases
+from optid.identify.subspace.realisation import WEIGHTINGS
+from optid.program.units import in_units, inner_bases, own_units
+from optid.solving.solve import Procedure
+from optid.statistics.expansion import Expansion, expand
 
 OBSERVERS = ("auto", "none", "kalman")
 SPLITS = ("exact", "lumped")
@@ -95,7 +95,7 @@ class Plan:
 
 def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis: Any, feedback_basis: Any,
             instruments: str, *, offset: bool = True, **settings: Any) -> Plan:
-    """Plan a method on a record taken to its own units (`optid.units`); `in_record_units` brings the model back.
+    """Plan a method on a record taken to its own units (`optid.program.units`), see `in_record_units`.
 
     Args:
         name: of the formulation.

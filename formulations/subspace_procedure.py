@@ -7,22 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from formulations.constraints.stability import stable
 from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
 from formulations.simulation_bound import simulation_bound
-from formulations.stability import stable
 from formulations.state_models import state_model
 from formulations.subspace_plan import BEST, Plan
 from optid.errors import DataWarning, RankError, StructureError
-from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.roots import spectral_radius
-from optid.solution import Solution, Status
-from optid.solving import Evidence, Procedure
-from optid.subspace.channels import check_channels
-from optid.subspace.expansion import Expansion
-from optid.subspace.imputation import count_windows, impute
-from optid.subspace.innovations import model_innovations
-from optid.subspace.methods import (
+from optid.identify.subspace.imputation import count_windows, impute
+from optid.identify.subspace.innovations import model_innovations
+from optid.identify.subspace.methods import (
     Projection,
     check_order,
     default_block_rows,
@@ -32,8 +26,14 @@ from optid.subspace.methods import (
     tested_order,
     weakest_feedback,
 )
-from optid.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
-from optid.subspace.realisation import WEIGHTINGS, largest_gap, scaled_pair
+from optid.identify.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
+from optid.identify.subspace.realisation import WEIGHTINGS, largest_gap, scaled_pair
+from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.roots import spectral_radius
+from optid.program.solution import Solution, Status
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.channels import check_channels
+from optid.statistics.expansion import Expansion
 
 NOISES = ("white", "coloured")
 

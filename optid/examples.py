@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid import plants, signals
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import LookupFailed, nearest
 from optid.models.recursions import lfilter
 

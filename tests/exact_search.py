@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optid.rank_one import RankOne
+from optid.structures.rank_one import RankOne
 
 
 def direction_value(problem: RankOne, b: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import optid
 from optid.errors import DataWarning
 from optid.examples import example
-from optid.fitting import Fit
+from optid.identify.fitting import Fit
 
 
 @cache

@@ -15,10 +15,10 @@ from optid.backends import casadi as casadi_backend
 from optid.backends.catalogue import CONIC
 from optid.backends.conic import tolerances
 from optid.backends.dnlp import smooth
-from optid.conformance import SUCCESS, ConformanceError, check_back_end, run_case, value_error
+from optid.conformance.checks import SUCCESS, ConformanceError, check_back_end, run_case, value_error
 from optid.errors import StructureError
-from optid.solution import Status
-from optid.solving import solve
+from optid.program.solution import Status
+from optid.solving.solve import solve
 
 INSTALLED = sorted(name for name, back_end in back_ends().items() if back_end.installed)
 
@@ -61,7 +61,7 @@ def test_every_class_has_a_solver_that_solves_all_of_it():
 
 def test_known_multipliers_satisfy_the_optimality_conditions():
     # the zoo is checked without any solver: points and multipliers known in closed form must be stationary
-    from optid.judging import judge
+    from optid.program.judging import judge
 
     checked = 0
     for entry in CASES.values():

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optid.certificate import certify, solve_certified
+from optid.certificate.cones import minimise_in_cones
 from optid.certificate.minors import basis_from, cholesky, free_mask, project_minors, tangent_minors
 from optid.certificate.shape_duals import sign_free_cut
 from optid.errors import StructureError
-from optid.rank_one import Point, RankOne, reduce
-from optid.rank_one.bilinear import best_of, minimise
-from optid.rank_one.cones import minimise_in_cones
+from optid.structures.bilinear import best_of, minimise
+from optid.structures.rank_one import Point, RankOne, reduce
 
 SHAPES = st.tuples(st.integers(2, 4), st.integers(2, 5))
 

@@ -128,7 +128,7 @@ def test_the_command_line_and_python_give_the_same_model(csv, tmp_path):
         tmp_path / "m.json",
     )
     assert result.exit_code == 0, result.output
-    from formulations import shape
+    from formulations.constraints import shape
 
     fit = optid.fit(
         optid.read(csv, dt=0.5),

@@ -13,10 +13,10 @@ import pytest
 from test_reduction import STRUCTURE, assert_same_fit, frame_of, record_folders, two_experiments
 
 import optid
-from optid import clusters
-from optid.clusters import check_workers, connected, difference
+from optid.data import clusters
+from optid.data.clusters import check_workers, connected, difference
 from optid.errors import ClusterError, DataError, RankError
-from optid.regressors import Layout, collect
+from optid.statistics import Layout, collect
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 import optid
 from optid import report
 from optid.cli.app import app
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.identify.validation import compare_models, fit_by_horizon, fit_percent, validate
+from optid.identify.validation.correlations import between_outputs
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.validation import compare_models, fit_by_horizon, fit_percent, validate
-from optid.validation.correlations import between_outputs
 
 
 @pytest.fixture(autouse=True)

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from problems import BASIS, record
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.backends import Answer, BackEnd, back_ends
 from optid.certificate.convex import certify_convex
 from optid.errors import DataWarning
+from optid.program.solution import Status
 from optid.registry import formulation
-from optid.solution import Status
-from optid.solving import solve
+from optid.solving.solve import solve
 
 CONVEX = {
     "arx": ("arx", {"na": 2, "nb": 3}, [shape.gain(0.7)]),
@@ -110,7 +110,7 @@ def test_every_solver_is_called_optimal_only_near_the_optimum(name, level):
 
 def test_a_smooth_programme_without_least_squares_is_bounded_by_a_tangent():
     x = cp.Variable(3, name="x")
-    from optid.zoo import pose
+    from optid.conformance.zoo import pose
 
     program = pose("plain", cp.sum_squares(x - np.array([1.0, 2.0, 3.0])), {"cap": cp.sum(x) <= 3}, [x])
     found = solve(program, "clarabel", accuracy=1e-10)

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import decimate
 
-from optid.channels import MOST_LEVELS, count_levels
-from optid.data import Data, Transform
+from optid.data.channels import MOST_LEVELS, count_levels
+from optid.data.record import Data, Transform
 from optid.errors import DataError, DataWarning
 
 

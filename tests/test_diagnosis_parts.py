@@ -14,17 +14,7 @@ from test_fault_injection import small
 
 from optid import Data
 from optid.errors import ModelFileError, StructureError
-from optid.faults import (
-    Answer,
-    Certificate,
-    Diagnosis,
-    Estimate,
-    dictionary,
-    load_diagnosis,
-    scan,
-    thresholds,
-    whiten,
-)
+from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds, whiten
 from optid.faults.consistency.leftover import alarm_probability, left_over
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.intervals import mixture_intervals, onset_range

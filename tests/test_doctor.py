@@ -5,8 +5,8 @@ import pytest
 from problems import BASIS, record
 
 import optid
-from optid.doctor import examine, examine_rows
 from optid.errors import DataError, DataWarning
+from optid.identify.record_checks import examine, examine_rows
 
 RNG = np.random.default_rng(0)
 U, Y = RNG.uniform(-1, 1, 400), RNG.normal(size=400)

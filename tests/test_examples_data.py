@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import LookupFailed
 from optid.examples import EXAMPLES, dead_zone, example, thruster
 

@@ -9,9 +9,9 @@ import optid
 from optid import plants
 from optid.cli.app import app
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
-from optid.experiment import design, frequency_response
-from optid.experiment.expansion import expanded_condition, expansion_of, feedback_bases
-from optid.experiment.rules import check_feedback
+from optid.identify.design import design, frequency_response
+from optid.identify.design.expansion import expanded_condition, expansion_of, feedback_bases
+from optid.identify.design.rules import check_feedback
 
 QUARTIC = "polynomial:4"
 B, A = [0.0, 0.3, 0.1], [1.0, -1.2, 0.5]

@@ -6,10 +6,10 @@ from problems import BASIS
 
 import optid
 from optid import plants, signals
-from optid.doctor import examine, examine_instruments
 from optid.errors import DataError, DataWarning
-from optid.experiment.lines import longest_run, many_lines, remaining_shares
-from optid.experiment.rules import check_condition, check_instruments, check_levels, check_lines
+from optid.identify.design.lines import longest_run, many_lines, remaining_shares
+from optid.identify.design.rules import check_condition, check_instruments, check_levels, check_lines
+from optid.identify.record_checks import examine, examine_instruments
 
 RNG = np.random.default_rng(0)
 QUARTIC = optid.Polynomial(4).fitted(-1, 1)

@@ -13,7 +13,7 @@ from optid.backends import Answer, BackEnd, find
 from optid.errors import DataError, StructureError
 from optid.faults import Fault, dictionary, inject, membership
 from optid.faults.consistency.bounded_noise import bounded_window, parity_proof
-from optid.solution import Status
+from optid.program.solution import Status
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 20

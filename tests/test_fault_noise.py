@@ -16,7 +16,7 @@ from optid.faults import Fault, dictionary, inject, noise_covariance, noise_sear
 from optid.faults.consistency.noise_changes import noise_places
 from optid.faults.consistency.noise_matching import covariance_problem
 from optid.faults.consistency.waveforms import start_matrix, waveform_matrix
-from optid.solution import Status
+from optid.program.solution import Status
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 40

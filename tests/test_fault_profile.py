@@ -6,14 +6,14 @@ from fault_plants import levels
 from scipy.optimize import nnls
 from test_fault_injection import small
 
-from formulations.fault_profile import profile_programme, smooth_programme
+from formulations.faults.profile import profile_programme, smooth_programme
 from optid import Data
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, SolverFailed, StructureError
 from optid.faults import Fault, dictionary, inject, profile, scan, whiten
 from optid.faults.consistency.profiles import course_problem
-from optid.solution import Status
-from optid.solving import solve
+from optid.program.solution import Status
+from optid.solving.solve import solve
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 60

@@ -9,7 +9,7 @@ from test_fault_injection import small
 from typer.testing import CliRunner
 
 from optid.cli.app import app
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults import Fault, check_channels, diagnose, dictionary, inject, reformulate
 from optid.models import NoiseCovariances

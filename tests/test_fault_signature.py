@@ -25,9 +25,9 @@ from optid.faults import (
     whiten,
 )
 from optid.faults.search.atoms import atoms_of, signatures
+from optid.program.solution import Status
 from optid.registry import fault_formulation
-from optid.solution import Status
-from optid.solving import solve
+from optid.solving.solve import solve
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 40

@@ -11,7 +11,7 @@ import optid
 from formulations import hammerstein_arx
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, SolverFailed, StructureError
-from optid.solution import Status
+from optid.program.solution import Status
 
 STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
 

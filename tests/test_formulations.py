@@ -7,7 +7,7 @@ from problems import BASIS, dense, plant, raw_problem, record, regression
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.errors import RankError, StructureError
 from optid.models import HammersteinARX

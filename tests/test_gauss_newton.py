@@ -7,13 +7,13 @@ from problems import BASIS, record, search
 from systems import nonlinearity
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.backends import Settings
 from optid.backends.step_qp import Coordinates
 from optid.bases import Triangular
 from optid.models import HammersteinARX
+from optid.program.solution import Status
 from optid.registry import formulation
-from optid.solution import Status
 
 RULES = {
     "monotone": [shape.monotone()],

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from optid.backends.group_descent import minimise
 from optid.errors import StructureError
-from optid.group_sparse import GroupProblem, minimise
+from optid.structures.group_sparse import GroupProblem
 
 
 def problem(seed, groups=25, m=30, similar=0.9):

@@ -10,8 +10,8 @@ from systems import nonlinearity
 
 import optid
 from optid.bases import Linear, Polynomial
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
 from optid.models.feedback_tables import tabulated

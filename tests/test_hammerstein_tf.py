@@ -9,8 +9,8 @@ from systems import inputs, mimo, nonlinearity, siso
 
 import optid
 from optid.bases import Linear, Polynomial, Triangular
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
 

@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 
 from optid.bases import Polynomial
 from optid.errors import RankError, StructureError
-from optid.subspace.hankel import dependent_signal, hankel_statistics
-from optid.subspace.rq import rq
+from optid.statistics.hankel import dependent_signal, hankel_statistics
+from optid.statistics.rq import rq
 
 
 def formed(records, rows, centre=0.0):

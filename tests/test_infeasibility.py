@@ -7,9 +7,9 @@ import pytest
 from problems import BASIS, record
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
+from optid.certificate.infeasibility import conflicting_subset, explain, satisfiable
 from optid.errors import InfeasibleError, UnboundedError
-from optid.infeasibility import conflicting_subset, explain, satisfiable
 
 SETS = {
     "slope and gain": ([shape.slope(low=2, high=3), shape.gain(1.0, at=0.1), shape.coefficients("a", high=3)],
@@ -67,13 +67,13 @@ def test_what_can_be_satisfied_is_not_blamed():
 def test_failures_are_values_on_request():
     rules, _ = SETS["slope and gain"]
     fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=rules, raises=False)
-    assert fit.solution.status is optid.solution.Status.INFEASIBLE
+    assert fit.solution.status is optid.program.solution.Status.INFEASIBLE
     assert fit.model is None and not fit.solution.has_point
 
 
 def test_an_unbounded_programme_says_so():
-    from optid.program import Program
-    from optid.view import View
+    from optid.program.program import Program
+    from optid.program.view import View
 
     def falling(data):
         x = cp.Variable(1, name="x")

@@ -11,8 +11,8 @@ from systems import BASES, inputs, mimo, siso
 import optid
 from optid.bases import UserFunctions
 from optid.errors import ModelFileError, StructureError
-from optid.io import from_content, load
 from optid.models import Nonlinearity
+from optid.models.files import from_content, load
 
 
 @pytest.mark.parametrize("model", [siso(basis, nk=1) for basis in BASES] + [mimo(), siso(a=[])])

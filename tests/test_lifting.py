@@ -6,7 +6,7 @@ import pytest
 from problems import BASIS, record, search
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.certificate.lifting import lift_exact, places
 from optid.registry import formulation
 

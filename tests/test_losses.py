@@ -74,7 +74,7 @@ def test_the_exact_form_says_that_it_has_no_proof(loss, monkeypatch):
     monkeypatch.setattr(losses, "PASSES", 40)
     fit = optid.fit(soiled(), na=2, nb=2, basis=BASIS, loss=loss)
     assert not fit.solution.proof and "no proof" in fit.solution.bound.reason
-    assert fit.solution.status is optid.solution.Status.LOCAL
+    assert fit.solution.status is optid.program.solution.Status.LOCAL
 
 
 def test_the_exact_robust_objective_is_a_local_minimum_of_its_loss():

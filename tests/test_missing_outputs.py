@@ -8,11 +8,11 @@ import pytest
 import scripts
 
 import optid
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataWarning, RankError
+from optid.identify.subspace.imputation import ROUNDS, count_windows, impute
+from optid.identify.validation import fit_percent
 from optid.registry import registered
-from optid.subspace.imputation import ROUNDS, count_windows, impute
-from optid.validation import fit_percent
 
 gaps = scripts.benchmark("gaps")
 

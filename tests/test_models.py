@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 from optid.bases import Linear, Triangular, UserFunctions
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.simulation import simulate_record

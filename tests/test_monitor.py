@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optid.bases import Linear, Polynomial, UserFunctions
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, ModelFileError, StructureError
 from optid.faults import Fault, Monitor, dictionary, inject, scan, whiten
 from optid.models import Nonlinearity

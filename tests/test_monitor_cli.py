@@ -12,8 +12,8 @@ import pytest
 from processes import wait_for
 from test_monitor import plant, stream
 
+from optid.data.reading.rows import RowReader
 from optid.errors import DataError
-from optid.reading.rows import RowReader
 
 NAMES = ["u1", "u2", "y1", "y2"]
 QUICK = ["--arl0", "300", "--window", "30", "--kinds", "bias", "loss"]

@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import approx_fprime
 from scipy.signal import csd
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.noise import _most_likely, _part, colour, estimate_noise, noise_spectrum, residuals, with_noise
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     _equations,
@@ -20,7 +21,6 @@ from optid.models.innovation_gain import (
 from optid.models.innovation_kernels import innovate
 from optid.models.kalman import kalman_gain
 from optid.models.noise_covariances import NoiseCovariances
-from optid.noise import _most_likely, _part, colour, estimate_noise, noise_spectrum, residuals, with_noise
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])

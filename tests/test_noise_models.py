@@ -8,17 +8,17 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import optid
-from formulations import shape, stability
+from formulations.constraints import shape, stability
 from formulations.hammerstein_armax import exact as armax
 from formulations.hammerstein_armax import linear as linear_armax
 from formulations.hammerstein_bj import exact as bj
 from formulations.hammerstein_bj import linear as linear_bj
 from formulations.noise_models import arma
 from optid.bases import Linear, Polynomial, Triangular
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
-from optid.solution import Status
+from optid.program.solution import Status
 
 BASIS = Triangular(4).fitted(-1.0, 1.0)
 MU = np.array([-0.9, -0.35, 0.5, 0.75])

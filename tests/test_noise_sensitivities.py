@@ -6,11 +6,11 @@ from scipy.signal import lfilter
 from systems import inputs, nonlinearity
 
 from optid.bases import Linear, Polynomial, Triangular
-from optid.data import Data
+from optid.data.record import Data
 from optid.models import HammersteinARX, HammersteinTF
-from optid.regressors import sensitivities
-from optid.regressors.noise_sensitivities import NoisePoint, NoiseUnknowns, blocks, linearise, predict
-from optid.regressors.sensitivities import PlantPoint, Unknowns
+from optid.statistics import sensitivities
+from optid.statistics.noise_sensitivities import NoisePoint, NoiseUnknowns, blocks, linearise, predict
+from optid.statistics.sensitivities import PlantPoint, Unknowns
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 

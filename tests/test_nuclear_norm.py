@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optid.nuclear_norm import NuclearProblem, Predictor, minimise
-from optid.nuclear_norm.problem import nuclear_norm, window_starts
+from optid.backends.nuclear_admm import minimise
+from optid.structures.nuclear_norm import NuclearProblem, Predictor, nuclear_norm, window_starts
 
 FORMS = ("plain", "predictor", "projection", "weighted")
 

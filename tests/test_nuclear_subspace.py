@@ -13,8 +13,8 @@ from formulations.subspace_plan import Plan
 from formulations.subspace_procedure import prepared
 from optid.backends import Answer, Settings, choose, find
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
-from optid.solution import Status
-from optid.solving import solve
+from optid.program.solution import Status
+from optid.solving.solve import solve
 
 A = np.array([[0.8, 0.4], [-0.4, 0.8]])
 B, C = np.array([[1.0, 0.2], [0.5, -0.7]]), np.array([[1.0, 0.3], [-0.2, 0.8]])

@@ -5,10 +5,10 @@ import pytest
 
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import RankError
-from optid.subspace.expansion import expand
-from optid.subspace.innovations import innovation_form, prediction_errors
-from optid.subspace.methods import default_block_rows, simulate_clipped
-from optid.subspace.observer import ObserverForm, observer_gain, observer_problem
+from optid.identify.subspace.innovations import innovation_form, prediction_errors
+from optid.identify.subspace.methods import default_block_rows, simulate_clipped
+from optid.identify.subspace.observer import ObserverForm, observer_gain, observer_problem
+from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])
 C = np.array([[1.0, 0.4], [0.2, -1.0]])
@@ -100,7 +100,7 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
     step = observer_problem(records, form)
-    monkeypatch.setattr("optid.subspace.observer.MANY", np.inf)
+    monkeypatch.setattr("optid.identify.subspace.observer.MANY", np.inf)
     stacked = observer_problem(records, form)
     scale = np.sqrt(np.outer(np.diag(stacked.problem.H), np.diag(stacked.problem.H)))
     np.testing.assert_allclose(step.problem.H / scale, stacked.problem.H / scale, atol=1e-11)

@@ -13,16 +13,16 @@ from typer.testing import CliRunner
 import optid
 from optid.bases import Linear, Polynomial, Triangular, fitted_bases
 from optid.cli.app import app
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.model_order import order_test, rank_test, scan_lags
-from optid.model_order.several_outputs import weighted_problem
-from optid.model_order.signals import block_rows_for, with_simulated_outputs
-from optid.model_order.states import state_criteria
+from optid.identify.order import order_test, rank_test, scan_lags
+from optid.identify.order.several_outputs import weighted_problem
+from optid.identify.order.signals import block_rows_for, with_simulated_outputs
+from optid.identify.order.states import state_criteria
 from optid.plants import EXAMPLE1, TWO_MODES
-from optid.regressors import collect
-from optid.subspace.expansion import expand
-from optid.subspace.hankel import hankel_statistics, windows_of
+from optid.statistics import collect
+from optid.statistics.expansion import expand
+from optid.statistics.hankel import hankel_statistics, windows_of
 
 benchmark = scripts.benchmark("order")
 

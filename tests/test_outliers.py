@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 import optid
 from optid import examples
 from optid.errors import DataWarning
-from optid.outliers import find_additive_outliers, find_outliers
+from optid.identify.outliers import find_additive_outliers, find_outliers
 
 
 def switching(rng, n, chance):

@@ -9,15 +9,16 @@ from scipy.optimize import least_squares
 from systems import by_hand, nonlinearity, siso
 
 import optid
-from formulations import hammerstein_oe, shape
+from formulations import hammerstein_oe
+from formulations.constraints import shape
 from formulations.output_error import OutputError
 from formulations.output_error_records import plant_layout
 from formulations.prediction_error import descend
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
 from optid.models import HammersteinARX, Nonlinearity, roots
-from optid.regressors.sensitivities import PlantPoint, Unknowns, simulate
-from optid.solution import Status
+from optid.program.solution import Status
+from optid.statistics.sensitivities import PlantPoint, Unknowns, simulate
 
 BASIS = Triangular(4).fitted(-0.7, 1.3)
 

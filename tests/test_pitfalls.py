@@ -11,11 +11,11 @@ from zoo import case, pose
 from optid.backends import Answer, BackEnd, Settings, back_ends
 from optid.backends import casadi as casadi_backend
 from optid.backends.dnlp import smooth
+from optid.conformance.zoo import planted_fit
 from optid.errors import LookupFailed, StructureError
-from optid.program import Program
-from optid.solution import Status
-from optid.solving import solve
-from optid.zoo import planted_fit
+from optid.program.program import Program
+from optid.program.solution import Status
+from optid.solving.solve import solve
 
 
 def through_cvxpy(program: Program, settings: Settings) -> Answer:

@@ -14,7 +14,7 @@ from sample_fits import example_fit, linear_fit, mimo_fit, two_by_two
 import optid
 from optid import plots
 from optid.errors import DataError, DataWarning
-from optid.showing import panels
+from optid.show import panels
 
 FIGURES = ["overview", "fit_over_time", "nonlinearity", "residual_tests", "poles_and_response", "certificate"]
 

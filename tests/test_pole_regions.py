@@ -6,12 +6,12 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from formulations import pole_regions
-from formulations.pole_regions import damping_sides, disc, disc_side, sector, strip, wedge_side
-from formulations.stability import stable
+from formulations.constraints import pole_regions
+from formulations.constraints.pole_regions import damping_sides, disc, disc_side, sector, strip, wedge_side
+from formulations.constraints.stability import stable
 from optid.errors import StructureError
+from optid.program.view import View
 from optid.registry import named_constraint
-from optid.view import View
 
 
 def admits(rule, matrix):

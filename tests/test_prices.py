@@ -7,7 +7,7 @@ from problems import BASIS, record
 from scripts import benchmark
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 
 # bound -> constraint, with the sign of dF/d(bound)
 BOUNDS = {
@@ -83,7 +83,7 @@ def test_cones_on_the_exact_form_are_solved_without_a_proof(build):
     name = fit.prices[0].name
     assert fit.prices[0].binding and not fit.solution.proof
     assert f"constraint {name!r}" in fit.solution.bound.reason
-    assert fit.solution.status is optid.solution.Status.LOCAL
+    assert fit.solution.status is optid.program.solution.Status.LOCAL
     convex = optid.fit(record(), "hammerstein_arx.overparametrised", na=2, nb=2, basis=BASIS, constraints=[build])
     assert convex.solution.objective <= fit.solution.objective * (1 + 1e-9)
 

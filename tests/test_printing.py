@@ -6,7 +6,7 @@ import pytest
 from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, output_error_fit, two_by_two
 
 import optid
-from optid.showing.printing import describe
+from optid.show.printing import describe
 
 
 def rows(text: str, title: str) -> dict[str, list[str]]:

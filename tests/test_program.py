@@ -6,10 +6,10 @@ import pytest
 from zoo import CASES, case, pose
 
 from optid.errors import StructureError
-from optid.program import named
-from optid.solution import Status
-from optid.solving import solve
-from optid.view import View
+from optid.program.program import named
+from optid.program.solution import Status
+from optid.program.view import View
+from optid.solving.solve import solve
 
 
 def bilinear():

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from optid.certificate.cones import minimise_in_cones
 from optid.errors import RankError, StructureError
-from optid.rank_one import Point, RankOne, reduce
-from optid.rank_one.bilinear import alternate, best_of, descend, minimise, starts
-from optid.rank_one.cones import minimise_in_cones
-from optid.rank_one.whitening import kronecker_factors
+from optid.structures.bilinear import alternate, best_of, descend, minimise, starts
+from optid.structures.rank_one import Point, RankOne, reduce
+from optid.structures.whitening import kronecker_factors
 
 
 def plain_split(problem: RankOne) -> Point:

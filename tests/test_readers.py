@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 from scipy.io import savemat
 
-from optid.data import Data
+from optid.data.readers import open_stream, read
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning
-from optid.readers import open_stream, read
 
 U, Y = np.array([[0.5, -1.0], [1.5, 2.0], [2.5, 0.0]]), np.array([[10.0], [np.nan], [30.0]])
 CSV = "u1,u2,y\n0.5,-1,10\n1.5,2,\n2.5,0,30\n"

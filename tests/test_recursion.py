@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric, UserFunctions
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, ModelFileError, RankError, StructureError
 from optid.examples import example
-from optid.recursion import RecursiveARX
-from optid.regressors import collect
+from optid.identify.recursive import RecursiveARX
+from optid.statistics import collect
 
 INSIDE = (-1.0, 1.0)
 
@@ -231,7 +231,7 @@ def test_a_noise_free_system_is_recovered(split, case):
 @pytest.mark.parametrize("split", ["whitened", "plain"])
 @pytest.mark.parametrize("case", ["triangular", "trigonometric", "two inputs, two outputs"])
 def test_the_model_is_that_of_algorithm_3_1_on_the_whole_record(split, case):
-    from optid.fitting import fit
+    from optid.identify.fitting import fit
 
     recursion, (u, y) = started(case)
     layout = recursion.layout
@@ -249,7 +249,7 @@ def test_the_model_is_that_of_algorithm_3_1_on_the_whole_record(split, case):
 
 def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
     """Where the Gram matrix is exactly a Kronecker product, the whitened SVD is the least-squares optimum."""
-    from optid.recursion.splitting import leading_pair
+    from optid.identify.recursive.splitting import leading_pair
 
     rng = np.random.default_rng(0)
     theta, left, right = (rng.standard_normal(shape) for shape in ((5, 3), (5, 5), (3, 3)))

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from test_regressors import assert_gram, cases, formed
 
 import optid
-from optid.data import Data
+from optid.data.reading import parts as parts_module
+from optid.data.record import Data
+from optid.data.reduction import FAN_IN, _streamed
 from optid.errors import DataError, RankError
-from optid.reading import parts as parts_module
-from optid.reduction import FAN_IN, _streamed
-from optid.regressors import accumulate, collect, factorise
-from optid.regressors.joining import total_of_parts
-from optid.regressors.sums import Sums
+from optid.statistics import accumulate, collect, factorise
+from optid.statistics.joining import total_of_parts
+from optid.statistics.sums import Sums
 
 da = pytest.importorskip("dask.array")
 dd = pytest.importorskip("dask.dataframe")

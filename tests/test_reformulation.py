@@ -9,8 +9,8 @@ import pytest
 from fault_plants import levels, noisy, standard
 from scipy.optimize import lsq_linear
 
-from formulations.refit import actuator, parameters
-from formulations.shape import monotone
+from formulations.constraints.shape import monotone
+from formulations.faults.refit import actuator, parameters
 from optid import Data
 from optid.bases import Polynomial, Triangular
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, StructureError
@@ -36,7 +36,7 @@ from optid.faults import (
 from optid.faults.repair.refitting import refitting
 from optid.models import Nonlinearity
 from optid.registry import fault_formulation
-from optid.solving import run, solve
+from optid.solving.solve import run, solve
 
 ONSET, COUNT = 80, 140
 

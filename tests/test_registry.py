@@ -4,7 +4,7 @@ import pytest
 from problems import BASIS, record
 
 import optid
-from formulations import pole_regions, responses, shape
+from formulations.constraints import pole_regions, responses, shape
 from optid.errors import LookupFailed, StructureError
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, check_arguments, formulation, named_constraint, registered
 

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.regressors import Layout, accumulate, collect, factorise, residuals
-from optid.regressors.sums import Sums, make_block, stretches
+from optid.statistics import Layout, accumulate, collect, factorise, residuals
+from optid.statistics.sums import Sums, make_block, stretches
 
 BASES = (Triangular(1), Triangular(5), Triangular(3, outside="extrapolate"), Trigonometric(3), Polynomial(3),
          BSpline(4), PiecewiseConstant(3), Linear())
@@ -170,7 +170,7 @@ def test_short_record_starts_no_thread(monkeypatch):
     def refuse(*_):
         raise AssertionError("a pool was started")
 
-    monkeypatch.setattr("optid.regressors.workers.ThreadPoolExecutor", refuse)
+    monkeypatch.setattr("optid.data.workers.ThreadPoolExecutor", refuse)
     data = random_data(np.random.default_rng(20), [3000], 1, 1)
     layout = layout_of(data, (Triangular(3),), 1, [1], [0])
     collect(data, layout, threads=2)

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 import optid
-from formulations import responses, shape
-from optid.data import Data
+from formulations.constraints import responses, shape
+from optid.data.record import Data
 from optid.errors import StructureError
-from optid.program import Program
+from optid.program.program import Program
+from optid.program.solution import Status
+from optid.program.view import View
 from optid.registry import named_constraint
-from optid.solution import Status
-from optid.solving import solve
-from optid.view import View
+from optid.solving.solve import solve
 
 INPUTS, OUTPUTS, N = ("u1", "u2"), ("y1", "y2"), 3
 

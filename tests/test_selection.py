@@ -6,7 +6,7 @@ from problems import BASIS, record
 
 import optid
 from optid.errors import StructureError
-from optid.selection import default_weights, fit_by_holdout, path
+from optid.identify.selection import default_weights, fit_by_holdout, path
 
 STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
 

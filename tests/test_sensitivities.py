@@ -6,8 +6,8 @@ import pytest
 import optid
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.models import HammersteinARX, Nonlinearity
-from optid.regressors.layout import Layout
-from optid.regressors.sensitivities import PlantPoint, Unknowns, expanded, instruments, linearise, simulate
+from optid.models.layout import Layout
+from optid.statistics.sensitivities import PlantPoint, Unknowns, expanded, instruments, linearise, simulate
 
 
 def case(seed=0, constant=True):

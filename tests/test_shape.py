@@ -7,7 +7,7 @@ from problems import BASIS, NODES, dense, plant, raw_problem, record, search
 from systems import nonlinearity
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.bases import BSpline, Polynomial, Triangular, Trigonometric
 from optid.errors import StructureError
 from optid.models import HammersteinARX

@@ -8,14 +8,14 @@ from scipy.optimize import minimize
 
 import formulations.shift
 import optid
-from formulations.pole_regions import damped, disc, sector, strip
+from formulations.constraints.pole_regions import damped, disc, sector, strip
+from formulations.constraints.stability import stable
 from formulations.shift import constrained_shift
-from formulations.stability import stable
 from optid.backends import Answer, find
+from optid.certificate.infeasibility import explain
 from optid.errors import DataWarning, InfeasibleError, StructureError
-from optid.infeasibility import explain
-from optid.solution import Status
-from optid.solving import Evidence, run
+from optid.program.solution import Status
+from optid.solving.solve import Evidence, run
 
 
 def observability(matrix, outputs, rows, rng, noise=0.0):

@@ -6,12 +6,13 @@ import pytest
 from test_noise_models import BASIS, MU, A, B, quiet, record, system
 
 import optid
-from formulations import shape, shooting
+from formulations import shooting
+from formulations.constraints import shape
 from optid.bases import Polynomial
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
-from optid.solution import Status
+from optid.program.solution import Status
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1, "basis": BASIS}
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from optid.backends import Answer, BackEnd
-from optid.program import Program
-from optid.solution import Solution, Status
-from optid.solving import solve
-from optid.view import View
+from optid.program.program import Program
+from optid.program.solution import Solution, Status
+from optid.program.view import View
+from optid.solving.solve import solve
 
 
 def _program():

@@ -7,10 +7,10 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 import optid
-import optid.solving
+import optid.solving.solve
 from optid.backends import Answer, choose
 from optid.errors import SolverFailed
-from optid.solution import Status
+from optid.program.solution import Status
 
 
 def level(samples=2000, seed=0):
@@ -31,7 +31,7 @@ def failing(program):
 def test_another_back_end_solves_the_programmes_and_that_is_said_once(monkeypatch):
     data = level()
     expected = optid.fit(data, "oe.exact", na=2, nb=2, constraints=["stable:0.999"])
-    monkeypatch.setattr(optid.solving, "choose", failing)
+    monkeypatch.setattr(optid.solving.solve, "choose", failing)
     fit = optid.fit(data, "oe.exact", na=2, nb=2, constraints=["stable:0.999"])
     count = len(fit.steps)
     assert fit.figures["solver fallback"].startswith(f"clarabel gave no usable answer for {count} of {count} program")
@@ -52,7 +52,7 @@ def test_a_solver_that_was_asked_for_is_not_replaced(monkeypatch):
 
     with pytest.raises(SolverFailed, match="clarabel gave no usable answer .*numbers ran out"):
         optid.fit(level(), "oe.exact", na=2, nb=2, solver=replace(optid.backends.find("clarabel"), run=run))
-    monkeypatch.setattr(optid.solving, "choose", failing)
+    monkeypatch.setattr(optid.solving.solve, "choose", failing)
     monkeypatch.setattr(optid.backends, "FALLBACKS", ())
     with pytest.raises(SolverFailed, match="clarabel gave no usable answer .*numbers ran out"):
         optid.fit(level(), "oe.exact", na=2, nb=2)

@@ -11,8 +11,8 @@ from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
 from optid import backends
 from optid.backends import Answer, BackEnd, Settings, back_ends
 from optid.errors import LookupFailed, SolverMissing, StructureError
-from optid.solution import Bound, Status
-from optid.solving import run, solve
+from optid.program.solution import Bound, Status
+from optid.solving.solve import run, solve
 
 
 def projection():

@@ -9,12 +9,12 @@ from problems import BASIS, plant, record
 from systems import nonlinearity
 
 import optid
-from formulations import shape
-from formulations.stability import central, stable
+from formulations.constraints import shape
+from formulations.constraints.stability import central, stable
 from optid.errors import StructureError
-from optid.limits import Limit
 from optid.models import HammersteinARX
-from optid.view import View
+from optid.program.limits import Limit
+from optid.program.view import View
 
 
 def build(rule, na, reference=None, kind="linear"):

@@ -10,18 +10,18 @@ from state_systems import by_hand
 from state_systems import linear as linear_system
 
 import optid
-from formulations import shape
-from formulations.rule import Rule
-from formulations.stability import stable
+from formulations.constraints import shape
+from formulations.constraints.rule import Rule
+from formulations.constraints.stability import stable
 from formulations.state_error import StateError, entered
 from formulations.state_space_exact import exact, linear
 from optid.bases import Linear, Polynomial, Triangular, UserFunctions
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
-from optid.regressors.state_sensitivities import StateUnknowns, linearise_states
-from optid.subspace.expansion import expand
+from optid.statistics.expansion import expand
+from optid.statistics.state_sensitivities import StateUnknowns, linearise_states
 
 
 def problem(innovations, missing, fed, experiments=2, n=3, seed=0, basis=None):

@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 import optid
+from optid.data.stretches import between_gaps, with_whole_inputs
 from optid.errors import DataError, DataWarning, OptidError
-from optid.stretches import between_gaps, with_whole_inputs
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1}
 

@@ -12,13 +12,13 @@ from systems import inputs, mimo, siso
 
 import optid
 from optid.bases import Polynomial
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import RankError
-from optid.validation import validate
-from optid.validation.families import Family
-from optid.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
-from optid.validation.structure import FTest, structure_test
-from optid.validation.structure_design import Design
+from optid.identify.validation import validate
+from optid.identify.validation.families import Family
+from optid.identify.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
+from optid.identify.validation.structure import FTest, structure_test
+from optid.identify.validation.structure_design import Design
 
 benchmark = scripts.benchmark("structure")
 
@@ -99,7 +99,7 @@ def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
     data = hammerstein(900)
     design = Design.of(data)
     whole = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
-    monkeypatch.setattr("optid.validation.structure_design.CHUNK", 100)
+    monkeypatch.setattr("optid.identify.validation.structure_design.CHUNK", 100)
     parts = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
     assert parts == pytest.approx(whole, abs=1e-10) and len(whole) == 900 - len(design.filters) + 1
     several = structure_test(data)
@@ -211,5 +211,5 @@ def test_validation_uses_it():
 
 def test_a_long_record_is_read_in_part(monkeypatch):
     data = hammerstein(4000, 7)
-    monkeypatch.setattr("optid.validation.structure.SAMPLES", 2000)
+    monkeypatch.setattr("optid.identify.validation.structure.SAMPLES", 2000)
     assert structure_test(data) == structure_test(data.split(0.5)[0])

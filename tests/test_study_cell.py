@@ -11,7 +11,7 @@ import pytest
 from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
 from optid.errors import StudyError
-from optid.solution import Status
+from optid.program.solution import Status
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import cell as cells
 from optid.studies.execution import memory

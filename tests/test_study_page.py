@@ -11,7 +11,7 @@ from browser import CHROMIUM, NO_BROWSER, Browser
 from study_rows import rows as synthetic
 
 from optid.errors import DataError
-from optid.solution import Status
+from optid.program.solution import Status
 from optid.studies.page import embedded, render, write_page
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import SUCCESS

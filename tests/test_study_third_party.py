@@ -59,7 +59,7 @@ def test_it_is_listed(installed):
 def test_it_is_conformant(installed):
     code = ("import optid\n"
             "from optid.backends import find\n"
-            "from optid.conformance import check_back_end, check_formulation\n"
+            "from optid.conformance.checks import check_back_end, check_formulation\n"
             "from optid.studies.sources.systems import simulate\n"
             "rows = check_back_end(find('predictor_corrector'))\n"
             "check_formulation('fir.decaying', simulate('linear', 300)[0], length=30)\n"

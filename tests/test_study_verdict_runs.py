@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from study_rows import rows as synthetic
 from study_rows import run, table_of, times_of
 
-from optid import solving
 from optid.backends import Answer
 from optid.errors import DataError
-from optid.solution import Residuals, Status
+from optid.program.solution import Residuals, Status
+from optid.solving import solve as solving
 from optid.studies.verdicts.comparison import compare
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate
 from optid.studies.verdicts.table import columns

@@ -227,8 +227,9 @@ for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behav
     wait_for(lambda: all(gone(child.pid) for child in children))
 
 
-@pytest.mark.parametrize("missing, error, words", [("psutil", StudyError, "pip install 'optid"),
-                                                   ("optid.isolated", ModuleNotFoundError, "optid.isolated")])
+@pytest.mark.parametrize("missing, error, words", [
+    ("psutil", StudyError, "pip install 'optid"),
+    ("optid.solving.isolated", ModuleNotFoundError, "optid.solving.isolated")])
 def test_only_a_missing_psutil_is_said_to_be_missing(monkeypatch, missing, error, words):
     monkeypatch.delitem(sys.modules, "optid.studies.execution.worker_process")
     monkeypatch.setitem(sys.modules, missing, None)

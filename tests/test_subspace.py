@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import optid
-from formulations import shape
-from formulations.stability import stable
+from formulations.constraints import shape
+from formulations.constraints.stability import stable
 from optid.bases import UserFunctions
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.solution import Status
+from optid.program.solution import Status
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])
@@ -205,7 +205,7 @@ def test_innovation_form_predicts_better_than_the_simulation():
 
 
 def test_gain_and_idle_input_are_obeyed():
-    from formulations.responses import no_effect
+    from formulations.constraints.responses import no_effect
 
     data = example1(1500, 0.05, 0.1, closed=False)
     fit = optid.fit(data, "hammerstein_ss.sid", nx=3, constraints=[shape.gain(2.5, channel="u1", output="y1")])

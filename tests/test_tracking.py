@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optid.errors import DataError, ModelFileError, RankError, StructureError
-from optid.tracking import (
+from optid.identify.tracking import (
     SubspaceTracker,
     constrained_reconstruction,
     fantope_certificate,

@@ -11,10 +11,10 @@ from scipy.signal import lfilter
 from scipy.stats import t as student
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.errors import RankError, StructureError
-from optid.intervals import LocalEstimate, project
-from optid.uncertainty import aligned, uncertainty
+from optid.identify.intervals import LocalEstimate, project
+from optid.identify.uncertainty import aligned, uncertainty
 
 A, B = np.array([-1.2, 0.5]), np.array([0.8, 0.6])
 BASIS = optid.Triangular(4, interval=(-1.0, 1.0))

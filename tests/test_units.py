@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import optid
-from formulations import shape
+from formulations.constraints import shape
 from optid.errors import DataWarning
-from optid.uncertainty import uncertainty
-from optid.units import in_units, inverse, own_units
+from optid.identify.uncertainty import uncertainty
+from optid.program.units import in_units, inverse, own_units
 
 GRID = np.linspace(-0.9, 0.9, 7)
 PROBE = np.random.default_rng(5).uniform(-0.9, 0.9, (60, 1))

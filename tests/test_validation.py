@@ -11,10 +11,10 @@ from systems import by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
 from optid.bases import Linear, Triangular
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning
-from optid.validation import Measures, fit_percent, validate
-from optid.validation.correlations import autocorrelation, cross_correlation
+from optid.identify.validation import Measures, fit_percent, validate
+from optid.identify.validation.correlations import autocorrelation, cross_correlation
 
 
 def record(model, count=800, seed=1, noise=0.1):

@@ -7,9 +7,9 @@ import time
 import numpy as np
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.program import Program
-from optid.solution import Status
-from optid.zoo import Case, cases, pose
+from optid.conformance.zoo import Case, cases, pose
+from optid.program.program import Program
+from optid.program.solution import Status
 
 CASES: dict[str, Case] = {case.name: case for case in cases()}
 EVERYTHING = frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one"})

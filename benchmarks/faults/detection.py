@@ -31,8 +31,8 @@ from optid.errors import DataWarning
 from optid.faults import Candidate, Dictionary, dictionary, inject, model_uncertainty, predictor, scan, whiten
 from optid.faults import thresholds as calibrated
 from optid.faults.nuisance import ModelUncertainty, _inflated, _parameters
+from optid.identify.noise import with_noise
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
-from optid.noise import with_noise
 
 WINDOW = 200
 BASIS = "polynomial:5"

@@ -22,7 +22,7 @@ import numpy as np
 from plants import levels, standard_plant
 
 import optid
-from formulations.refit import actuator, parameters
+from formulations.faults.refit import actuator, parameters
 from optid import Data
 from optid.bases import Triangular, UserFunctions
 from optid.errors import OptidError
@@ -31,7 +31,7 @@ from optid.faults.repair.damage import Damage
 from optid.faults.repair.refitting import Prior, Refitting, refitting
 from optid.faults.repair.schedule import refit
 from optid.models import HammersteinSS, Nonlinearity
-from optid.solving import run
+from optid.solving.solve import run
 
 BEFORE, UNSEEN = 100, 1500
 COUNTS = (5, 10, 20, 40, 80, 160, 320, 640)

@@ -15,7 +15,7 @@ from plants import levels, standard_plant
 
 from optid import Data
 from optid.faults import conditional_mean, observer, subspace_projection, trajectory
-from optid.tracking import SubspaceTracker
+from optid.identify.tracking import SubspaceTracker
 
 SAMPLES, SETTLED, LENGTHS, LAGS = 1500, 50, (300, 1000, 4000), 8
 

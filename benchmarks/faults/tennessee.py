@@ -38,7 +38,7 @@ from optid.faults import (
     sliding_scan,
     whiten,
 )
-from optid.noise import with_noise
+from optid.identify.noise import with_noise
 
 OUTPUTS = [f"XMEAS{i}" for i in range(1, 23)]
 INPUTS = [f"XMV{i}" for i in range(1, 12)]

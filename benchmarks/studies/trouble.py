@@ -33,7 +33,7 @@ import time
 import numpy as np
 
 from optid.backends import Answer, BackEnd, find
-from optid.solution import Status
+from optid.program.solution import Status
 
 
 def _segfaults(program, settings):

@@ -10,7 +10,7 @@ import pandas as pd
 
 import optid
 from optid.backends import back_ends
-from optid.solution import GRADIENT, tolerance
+from optid.program.solution import GRADIENT, tolerance
 
 HERE = Path(__file__).with_suffix("")
 

@@ -10,9 +10,9 @@ import time
 import numpy as np
 
 from optid import plants
-from optid.experiment.expansion import expansion_of
-from optid.subspace.hankel import hankel_statistics, windows_of
-from optid.subspace.rq import rq
+from optid.identify.design.expansion import expansion_of
+from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.rq import rq
 
 ROWS = 6
 

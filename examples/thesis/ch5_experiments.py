@@ -12,8 +12,8 @@ from common import feedback_error
 
 import optid
 from optid import plants
-from optid.experiment.expansion import expanded_condition, expansion_of
-from optid.experiment.rules import check_lines
+from optid.identify.design.expansion import expanded_condition, expansion_of
+from optid.identify.design.rules import check_lines
 
 REFERENCES = {"1 sinusoid": ("0.6/6.4", "0.7/9.5"), "2 chirp": ("6.8/3.5", "0.7/2.5"),
               "3 noise": ("5.6/5.1", "2.8/3.2"), "3 levels": ("8.6/5.7", "3.8/3.4")}

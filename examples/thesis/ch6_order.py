@@ -10,9 +10,9 @@ import numpy as np
 from common import panels, run, save, styled
 
 from optid.bases import Linear, fitted_bases
-from optid.model_order import RankTest, order_test
+from optid.identify.order import RankTest, order_test
 from optid.plants import NOISE_CASES, TWO_MODES
-from optid.subspace.expansion import expand
+from optid.statistics.expansion import expand
 
 ROWS, RUNS, LENGTHS, LONGER = 8, 20, (300, 1000), (300, 1000, 3000, 10_000)
 REFERENCE = dict.fromkeys(NOISE_CASES, ("0.82-0.93", "0.97-1.00")) | {"deterministic": ("1.00", "1.00")}

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import optid
-from optid.showing.panels import styled as styled
+from optid.show.panels import styled as styled
 
 BETA = 0.75
 """Gauge of the dissertation: b = v_1 / beta, so that b has norm 4/3."""

@@ -2,7 +2,7 @@
 
 A back end is one function ``run(program, settings) -> Answer`` with its capabilities as data. It registers in the
 entry-point group ``optid.backends``; the target is a `BackEnd` or a function that returns several. What it answers is
-a claim: `optid.solving` measures the point and decides the status.
+a claim: `optid.solve` measures the point and decides the status.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.errors import LookupFailed, SolverMissing, StructureError, nearest
-from optid.solution import Status
+from optid.program.solution import Status
 
 if TYPE_CHECKING:
-    from optid.program import Program
+    from optid.program.program import Program
 
 GROUP = "optid.backends"
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from optid.backends import Answer, Settings
-from optid.nuclear_norm.admm import minimise
-from optid.program import Program
-from optid.solution import Status
+from optid.backends.nuclear_admm import minimise
+from optid.program.program import Program
+from optid.program.solution import Status
 
 
 def run(program: Program, settings: Settings) -> Answer:

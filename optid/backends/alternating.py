@@ -13,9 +13,9 @@ import cvxpy as cp
 import numpy as np
 
 from optid.backends import Answer, Settings
-from optid.program import Program
-from optid.solution import Solution, Status
-from optid.solving import solve
+from optid.program.program import Program
+from optid.program.solution import Solution, Status
+from optid.solving.solve import solve
 
 GAUGE = "gauge"  # name of the structural constraint that fixes the scale between mu and b
 STEPS = 1000

@@ -3,9 +3,9 @@
 import numpy as np
 
 from optid.backends import Answer, Settings
-from optid.group_sparse import minimise
-from optid.program import Program
-from optid.solution import Status
+from optid.backends.group_descent import minimise
+from optid.program.program import Program
+from optid.program.solution import Status
 
 
 def run(program: Program, settings: Settings) -> Answer:

@@ -4,7 +4,7 @@ Every CVXPY expression becomes a CasADi column: its entries in column-major orde
 move entries about (index, reshape, stack, diag, ...) are one rule: the atom itself is evaluated on the numbers of the
 entries. Derivatives are CasADi's, Hessians exact; a limited-memory Hessian does not converge on bilinear fits.
 
-CasADi's other solvers are not offered because they do not pass `optid.conformance`: SLEQP runs for ever on an
+CasADi's other solvers are not offered because they do not pass `optid.conformance.checks`: SLEQP runs for ever on an
 infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay at the start.
 """
 
@@ -19,9 +19,9 @@ import scipy.sparse as sp
 from optid.backends import Answer, Settings
 from optid.backends.dnlp import Smooth, by_name, cache, smooth
 from optid.errors import StructureError
-from optid.gradients import MOVES, sources
-from optid.program import Program
-from optid.solution import Status
+from optid.program.gradients import MOVES, sources
+from optid.program.program import Program
+from optid.program.solution import Status
 
 LIMIT = 3000  # iterations
 

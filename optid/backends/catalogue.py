@@ -44,7 +44,7 @@ CONIC: dict[str, tuple[str, str, str]] = {
     "sdpa": ("LP QP SOCP SDP", "sdpap", "sdpa-python"),
     "xpress": ("LP QP SOCP", "xpress", "xpress"),
 }
-"""{word: (classes that pass `optid.conformance`, package to import, what pip calls it)} of the solvers under CVXPY.
+"""{word: (classes that pass `optid.conformance.checks`, package to import, pip name)} of the solvers under CVXPY.
 
 Left out are glpk_mi and diffcp, other interfaces to glpk (for integers) and to clarabel and scs (for derivatives).
 """

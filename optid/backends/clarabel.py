@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from optid.backends import Settings
 from optid.backends.conic import tolerances
-from optid.solution import Status
+from optid.program.solution import Status
 
 Side = tuple[np.ndarray, np.ndarray]
 """Rows (r, n) and right-hand sides (r,)."""

@@ -7,8 +7,8 @@ import cvxpy as cp
 
 from optid.backends import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
-from optid.program import Program
-from optid.solution import Status
+from optid.program.program import Program
+from optid.program.solution import Status
 
 STATUS = {
     cp.OPTIMAL: Status.OPTIMAL,

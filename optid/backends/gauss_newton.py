@@ -1,8 +1,8 @@
 """Own Gauss-Newton for rank-one least squares; with constraints its steps are QPs of the same layer.
 
-Without constraints the numbers are handled by `optid.rank_one`. With constraints every step minimises the quadratic
-model of the Lagrangian over the programme's own convex constraints and the tangents of the others (`step_qp`). A step
-that the tangents misled is corrected by solving for everything but b, which is convex.
+Without constraints the numbers are handled by `optid.structures.rank_one`. With constraints every step minimises the
+quadratic model of the Lagrangian over the programme's own convex constraints and the tangents of the others. A
+step that the tangents misled is corrected by solving for everything but b, which is convex.
 """
 
 import cvxpy as cp
@@ -11,18 +11,18 @@ from scipy.optimize import nnls
 
 from optid.backends import Answer, Settings, find
 from optid.backends.step_qp import Coordinates, StepQP
+from optid.certificate.infeasibility import satisfiable
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
-from optid.gradients import flat_value
-from optid.infeasibility import satisfiable
-from optid.judging import measure_violation, term_size
-from optid.limits import EQUALITIES, INEQUALITIES
 from optid.models.gauges import gauge_factor
-from optid.program import Program, RankOneForm, Values
-from optid.rank_one import Point, reduce
-from optid.rank_one.bilinear import LocalSolution, minimise, starts
-from optid.solution import Status
+from optid.program.gradients import flat_value
+from optid.program.judging import measure_violation, term_size
+from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.solution import Status
+from optid.structures.bilinear import LocalSolution, minimise, starts
+from optid.structures.rank_one import Point, reduce
 
 STEPS = 100
 DIRECTIONS = 4  # different directions b that are tried, each with both signs, before the full steps

@@ -16,11 +16,11 @@ import numpy as np
 from optid.backends import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
-from optid.gradients import affine_parts, flat_value, jacobians
-from optid.limits import EQUALITIES, INEQUALITIES
-from optid.program import Program, RankOneForm, Values
-from optid.rank_one import Point
-from optid.solution import Status
+from optid.program.gradients import affine_parts, flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.solution import Status
+from optid.structures.rank_one import Point
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import numpy as np
 
 from optid.backends import Answer, Settings
 from optid.backends.dnlp import Derivatives, Smooth, by_name, derivatives, smooth
-from optid.program import Program
-from optid.solution import Status
+from optid.program.program import Program
+from optid.program.solution import Status
 
 ENDED = {
     "ITERATION_LIMIT": Status.LIMIT, "TIME_LIMIT": Status.LIMIT, "EVALUATION_ERROR": Status.FAILED,

@@ -11,8 +11,8 @@ from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 
 if TYPE_CHECKING:
-    from optid.data import Data
-    from optid.streams import Stream
+    from optid.data.record import Data
+    from optid.data.streams import Stream
 
 __all__ = [
     "BSpline",

@@ -11,9 +11,9 @@ from typing import Any, Literal, Protocol, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from optid.arrays import Array
 from optid.errors import DataError, StructureError
 
-Array = NDArray[np.float64]
 Outside = Literal["clamp", "extrapolate", "error"]
 OUTSIDE = ("clamp", "extrapolate", "error")
 

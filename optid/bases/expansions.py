@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from optid.arrays import Array
 from optid.bases.basis import (
-    Array,
     Basis,
     Outside,
     brought_inside,

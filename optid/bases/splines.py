@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from optid.arrays import Array
 from optid.bases.basis import (
-    Array,
     Basis,
     Outside,
     brought_inside,
@@ -91,7 +91,7 @@ class Triangular(Basis):
         """Evaluate the two hats of the cell of each sample."""
         u = samples(u)
         if u.size >= COMPILED:
-            from optid.regressors import kernels
+            from optid.statistics import kernels
 
             lo, hi = span(self)
             return kernels.hats(brought_inside(u, (lo, hi), self.outside), lo, self.p / (hi - lo), self.p)

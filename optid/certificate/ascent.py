@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from optid.certificate.minors import Block, basis_from, cholesky, project_minors
-from optid.rank_one import Array
+from optid.structures.rank_one import Array
 
 
 def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:

@@ -19,10 +19,10 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from optid.certificate.lifting import lift_linear
-from optid.gradients import flat_value, jacobians
-from optid.judging import Lagrangian, has_bounds
-from optid.program import Program, RankOneForm, Values
-from optid.solution import Bound, relative_gap
+from optid.program.gradients import flat_value, jacobians
+from optid.program.judging import Lagrangian, has_bounds
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.solution import Bound, relative_gap
 
 Array = np.ndarray
 

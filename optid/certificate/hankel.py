@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import RankError, StructureError
-from optid.solution import Bound, relative_gap
-from optid.subspace.hankel import Expand, hankel_statistics
+from optid.program.solution import Bound, relative_gap
+from optid.statistics.hankel import Expand, hankel_statistics
 
 CRITERIA = ("measured feedback", "simulation", "one-step", "innovation", "free run")
 """What an error may have been measured with; "simulation" is that of a model without feedback."""
@@ -116,7 +116,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
 
     Args:
         records: one array (N, c) of raw channels per experiment, NaN = missing.
-        expand: raw channels -> signals, as in `optid.subspace.hankel.hankel_statistics`; None for the channels.
+        expand: raw channels -> signals, as in `optid.statistics.hankel.hankel_statistics`; None for the channels.
         inputs: positions of the functions of the inputs among the signals.
         outputs: positions of the outputs.
         feedback: positions of the functions of the outputs that are fed back; a linear function of the outputs among

@@ -26,9 +26,9 @@ from optid.certificate.shape_duals import (
     sign_free_cut,
 )
 from optid.errors import StructureError
-from optid.rank_one import Array, Core, Point, RankOne, matrices, reduce
-from optid.rank_one.bilinear import LocalSolution, best_of, descend, starts
-from optid.solution import Bound
+from optid.program.solution import Bound
+from optid.structures.bilinear import LocalSolution, best_of, descend, starts
+from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
 
 TOLERANCE = 1e-8
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)

@@ -12,11 +12,11 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
-from optid.gradients import affine_parts
-from optid.limits import EQUALITIES, INEQUALITIES
-from optid.program import Program, RankOneForm, Values
-from optid.rank_one import Point, RankOne
-from optid.solution import Bound
+from optid.program.gradients import affine_parts
+from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.solution import Bound
+from optid.structures.rank_one import Point, RankOne
 
 
 @dataclass

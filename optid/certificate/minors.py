@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from optid.rank_one import Array
+from optid.structures.rank_one import Array
 
 _potrf, _trtrs = get_lapack_funcs(("potrf", "trtrs"), dtype=float)
 Block = tuple[slice, tuple[int, int]]  # position in the lifted vector and shape (P, nb)

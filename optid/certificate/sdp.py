@@ -16,7 +16,7 @@ import numpy as np
 
 from optid.certificate.minors import Block, Lagrangian
 from optid.certificate.shape_duals import Linear
-from optid.rank_one import Array
+from optid.structures.rank_one import Array
 
 
 @dataclass(frozen=True, eq=False)

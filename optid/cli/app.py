@@ -12,17 +12,7 @@ from optid.cli.designing import design
 from optid.cli.diagnosing import diagnose
 from optid.cli.isolability import isolability
 from optid.cli.monitoring import monitor
-from optid.cli.options import (
-    MODEL,
-    RECORD,
-    RESULT,
-    SOLVER,
-    Example,
-    Files,
-    Report,
-    Seed,
-    reads_a_record,
-)
+from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Files, Report, Seed, reads_a_record
 from optid.cli.ordering import order
 from optid.cli.reformulating import reformulate
 from optid.cli.results import command_line, conclude
@@ -193,10 +183,10 @@ def fit(
         record: Any
         record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
         import_cvxpy()
-        from optid.fitting import fit as fit_model
-        from optid.selection import fit_by_holdout
-        from optid.showing.printing import describe
-        from optid.validation import validate as check
+        from optid.identify.fitting import fit as fit_model
+        from optid.identify.selection import fit_by_holdout
+        from optid.identify.validation import validate as check
+        from optid.show.printing import describe
 
         arguments = words.suited(suggestion, formulation) if suggestion else {}
         given = {
@@ -235,7 +225,7 @@ def fit(
         if model is not None:
             found.model.save(model)
         if report is not None:
-            from optid.report import write
+            from optid.show.report import write
 
             waiting.step("writing the report")
             write(found, report, held_out, command=command_line())
@@ -263,9 +253,9 @@ def validate(
     Inputs, outputs and sampling time are those of the first model where they are not given.
     """
     from optid.cli import arguments as words
-    from optid.io import load
-    from optid.validation import compare_models
-    from optid.validation import validate as check
+    from optid.identify.validation import compare_models
+    from optid.identify.validation import validate as check
+    from optid.models.files import load
 
     words.check_folders(report)
     with hearing() as heard, Waiting() as waiting:
@@ -282,7 +272,7 @@ def validate(
         else:
             text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
         if report is not None:
-            from optid.report import write_comparison
+            from optid.show.report import write_comparison
 
             waiting.step("writing the report")
             write_comparison(found, report, command=command_line())

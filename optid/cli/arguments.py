@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from optid.data import Data
+from optid.data.record import Data
+from optid.data.streams import Stream
 from optid.errors import DataError, StructureError
-from optid.streams import Stream
 
 
 def read_record(
@@ -26,7 +26,7 @@ def read_record(
     Raises:
         DataError: what `optid.read` refuses.
     """
-    from optid.readers import open_stream, read
+    from optid.data.readers import open_stream, read
 
     time = how["time"]
     options: dict[str, Any] = {
@@ -107,7 +107,7 @@ def state_space_model(path: Path) -> Any:
     Raises:
         StructureError: a model of another kind.
     """
-    from optid.io import load
+    from optid.models.files import load
 
     model = load(path)
     if model.kind != "HammersteinSS":

@@ -170,8 +170,8 @@ def _as_options(text: str) -> str:
 
 def _show(found: Any, posed: str, record: str) -> None:
     from optid.backends import back_ends
-    from optid.showing.wording import number, seconds
-    from optid.solution import GRADIENT
+    from optid.program.solution import GRADIENT
+    from optid.show.wording import number, seconds
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.outcomes import SOLVED
 

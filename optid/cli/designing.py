@@ -94,7 +94,7 @@ def design(
     """
     from optid.cli import arguments as words
     from optid.errors import StructureError
-    from optid.experiment import design as designed
+    from optid.identify.design import design as designed
 
     for name, value in (("--band", band), ("--amplitude", amplitude)):
         if value is not None and (len(value) % 2 or (name == "--band" and len(value) != 2)):

@@ -5,18 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import (
-    MODEL,
-    RECORD,
-    RESULT,
-    SOLVER,
-    Example,
-    Load,
-    Picture,
-    Report,
-    StateJump,
-    reads_a_record,
-)
+from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Load, Picture, Report, StateJump, reads_a_record
 from optid.cli.results import command_line, conclude, save_picture
 from optid.cli.terminal import FILES, Waiting, hearing
 

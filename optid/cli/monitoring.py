@@ -127,7 +127,7 @@ def monitor(
     Example: optid monitor model.json --arl0 10000 < stream.csv
     """
     from optid.cli import arguments as words
-    from optid.reading.rows import RowReader
+    from optid.data.reading.rows import RowReader
 
     words.check_folders(state, thresholds)
     with hearing() as heard, Waiting() as waiting:

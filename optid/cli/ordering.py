@@ -55,7 +55,7 @@ def order(
     Example: optid order data.csv --inputs u1 u2 --outputs y1 y2 --picture order.png
     """
     from optid.cli import arguments as words
-    from optid.model_order import order as study
+    from optid.identify.order import order as study
 
     words.check_folders(picture)
     with hearing() as heard, Waiting() as waiting:

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from optid.cli.terminal import output, say
-from optid.solution import Status
+from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
 LISTED = 12

@@ -12,14 +12,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
-from optid.errors import (
-    DataWarning,
-    InfeasibleError,
-    OptidError,
-    SolverFailed,
-    SolverMissing,
-    UnboundedError,
-)
+from optid.errors import DataWarning, InfeasibleError, OptidError, SolverFailed, SolverMissing, UnboundedError
 
 PATIENCE = 2.0
 """Seconds of silence before progress is shown."""

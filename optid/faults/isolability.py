@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.signature_space import InputRuler, Ruler, SignatureSpace, signature_space
 from optid.faults.signatures import Dictionary

@@ -5,7 +5,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from optid.faults.isolability import GRID, Isolability
-from optid.showing.panels import shorten, styled
+from optid.show.panels import shorten, styled
 
 
 @styled

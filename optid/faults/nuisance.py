@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data, Experiment
+from optid.arrays import Array
+from optid.data.record import Data, Experiment
 from optid.errors import DataError
 from optid.faults.whitening import Predictor, predictor
 from optid.models import state_simulation as simulation

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.faults import Fault, channel_of, place_of
 from optid.faults.scheduled import with_schedules

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data, Experiment
+from optid.arrays import Array
+from optid.data.record import Data, Experiment
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain

@@ -5,10 +5,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array, as_samples, is_scalar_list
+from optid.data.record import Data
 from optid.errors import DataError
-from optid.reading.arrays import as_samples, is_scalar_list
 
 
 class Channels(Protocol):

@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array, Basis, span
+from optid.arrays import Array
+from optid.bases.basis import Basis, span
 from optid.bases.expansions import Linear, Polynomial, Trigonometric
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.errors import OptidError, StructureError, nearest

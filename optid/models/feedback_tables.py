@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array, span
+from optid.arrays import Array
+from optid.bases.basis import span
 from optid.bases.expansions import Linear, Polynomial, Trigonometric
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.models.nonlinearity import Nonlinearity

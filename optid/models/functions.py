@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import Linear
-from optid.data import Data
+from optid.data.record import Data
 from optid.models.nonlinearity import Nonlinearity
 
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import Linear
-from optid.channels import Transform
+from optid.data.channels import Transform
 from optid.errors import StructureError, nearest
 from optid.models.nonlinearity import Nonlinearity
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
-from optid.channels import Transform, numbered_names
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.channels import Transform, numbered_names
+from optid.data.record import Data
 from optid.errors import StructureError
 from optid.models import responses, roots, simulation
 from optid.models.coefficients import check_shapes, checked_horizon, coefficients, listed
@@ -20,7 +20,7 @@ from optid.models.gauges import in_raw_units, regauged
 from optid.models.nonlinearity import Nonlinearity
 
 if TYPE_CHECKING:
-    from optid.regressors.layout import Layout
+    from optid.models.layout import Layout
 
 __all__ = ["HammersteinARX", "Nonlinearity"]
 
@@ -115,7 +115,7 @@ class HammersteinARX:
     @property
     def layout(self) -> "Layout":
         """Columns of the regression this model solves."""
-        from optid.regressors.layout import Layout
+        from optid.models.layout import Layout
 
         bases = tuple(f.basis for f in self.nonlinearities)
         return Layout(self.na, self.nb, self.nk, bases, self.outputs, self.inputs)
@@ -333,7 +333,7 @@ class HammersteinARX:
 
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it exactly."""
-        from optid.io import save
+        from optid.models.files import save
 
         return save(self, path)
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import Linear
-from optid.channels import Transform, numbered_names
-from optid.data import Data
+from optid.data.channels import Transform, numbered_names
+from optid.data.record import Data
+from optid.data.stretches import between_gaps
 from optid.errors import DataError, StructureError
 from optid.models import roots, state_forms, state_responses
 from optid.models import state_simulation as simulation
@@ -21,7 +22,6 @@ from optid.models.experiments import one_or_all, records_of
 from optid.models.feedback_tables import tabulated
 from optid.models.noise_covariances import NoiseCovariances
 from optid.models.nonlinearity import Nonlinearity
-from optid.stretches import between_gaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,7 +439,7 @@ class HammersteinSS:
 
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it exactly."""
-        from optid.io import save
+        from optid.models.files import save
 
         return save(self, path)
 

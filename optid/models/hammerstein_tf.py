@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import Linear
-from optid.channels import Transform
-from optid.data import Data
+from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import StructureError
 from optid.models import noise_filter, roots
 from optid.models.coefficients import checked_horizon, coefficients, listed
@@ -341,7 +341,7 @@ class HammersteinTF:
 
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it exactly."""
-        from optid.io import save
+        from optid.models.files import save
 
         return save(self, path)
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 
 ROUNDING = -1e-4

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.models.recursions import lfilter
 
 PRESENT, MISSING, DEAD = 0, 1, 2

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.models import noise_filter, roots, simulation
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array, Basis
+from optid.arrays import Array
+from optid.bases.basis import Basis
 from optid.errors import StructureError
 
 CHUNK = 65536

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import get_lapack_funcs
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 
 SHORT = 5000
 """Samples up to which a triangular solution takes less time than the import of scipy.signal."""

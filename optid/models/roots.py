@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 
 
 def roots_of(coefficients: Array) -> Any:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import Linear
-from optid.channels import Transform
+from optid.data.channels import Transform
 from optid.errors import StructureError, nearest
 from optid.models.noise_covariances import NoiseCovariances
 from optid.models.nonlinearity import Nonlinearity

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.feedback_tables import Tables
 

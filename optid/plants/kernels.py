@@ -2,9 +2,8 @@
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from optid.arrays import Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

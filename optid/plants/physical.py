@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid import signals
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import StructureError, nearest
 from optid.plants.sampling import as_input, as_state, check_bounded, check_positive, gaussian
 

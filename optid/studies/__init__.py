@@ -13,4 +13,4 @@ _HOME = {
     "write_page": "page",
 }
 
-__getattr__, __dir__ = on_first_use(__name__, _HOME, set())
+__getattr__, __dir__ = on_first_use(__name__, _HOME)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optid.backends import find
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import SolverMissing, StudyError
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.sources.systems import system

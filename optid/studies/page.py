@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 
 from optid import __version__
-from optid.showing.page import template, versions
-from optid.showing.wording import Table, number, seconds
+from optid.show.page import template, versions
+from optid.show.wording import Table, number, seconds
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
 from optid.studies.verdicts.advice import choice_of_solver, evidence
@@ -69,7 +69,7 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
 def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
     head = verdict.headline
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
-    script = "\n".join((files("optid") / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    script = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     several = len(verdict.sections) > 1
     return {
@@ -94,7 +94,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "call": command or "optid study report STUDY.duckdb -o study.html",
         "versions": [*versions(), *_machines(verdict)],
         "text": str(verdict),
-        "style": Markup((files("optid") / "templates" / "study.css").read_text(encoding="utf-8")),
+        "style": Markup((files("optid") / "show" / "templates" / "study.css").read_text(encoding="utf-8")),
         "script": Markup(script),
         "digest": digest,
         "payload": embedded(page_payload(verdict)),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.solution import GRADIENT
+from optid.program.solution import GRADIENT
 from optid.studies.storage.rows import BY_NAME, COLUMNS
 from optid.studies.verdicts.advice import carries_over, choice_of_solver
 from optid.studies.verdicts.agreement import Agreement

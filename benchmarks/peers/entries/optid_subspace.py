@@ -3,8 +3,8 @@
 import numpy as np
 
 import optid
-from optid.subspace.hankel import hankel_statistics
-from optid.subspace.rq import rq
+from optid.statistics.hankel import hankel_statistics
+from optid.statistics.rq import rq
 
 CANNOT = {"hammerstein": "the first entry answers it", "missing": "the first entry answers it",
           "constrained": "the first entry answers it"}

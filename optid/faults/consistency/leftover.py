@@ -6,7 +6,7 @@ the rest for a further fault of it.
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.whitening import Whitened
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
 from optid.faults.signatures import Dictionary

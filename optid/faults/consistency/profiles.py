@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.signatures import Candidate

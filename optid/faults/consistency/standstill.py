@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.diagnosis.records import Flattened
 from optid.faults.signatures import Candidate, Dictionary

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.screening import FlatLine, flat_lines
 from optid.faults.signatures import Candidate, Dictionary

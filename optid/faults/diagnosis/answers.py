@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.signatures import Candidate
 
@@ -355,7 +355,7 @@ class Diagnosis:
         Args:
             path: the file, replaced when it exists.
         """
-        from optid.io import write
+        from optid.models.files import write
 
         return write(self.to_dict(), path, FORMAT, VERSION)
 
@@ -370,7 +370,7 @@ def load_diagnosis(path: str | Path) -> Diagnosis:
         FileNotFoundError: no such file.
         ModelFileError: the file is truncated, damaged, of another version, or not a diagnosis.
     """
-    from optid.io import read
+    from optid.models.files import read
 
     return read(path, FORMAT, VERSION, _built)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.consistency.noise_changes import noise_search
 from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation, marginal

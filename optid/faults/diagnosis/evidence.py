@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.search.scanning import Scan
 
 

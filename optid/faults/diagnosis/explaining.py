@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.consistency.leftover import UNFIT, further_fault, left_over
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.looking import Seen

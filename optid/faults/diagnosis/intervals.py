@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.diagnosis.posterior import Explanation
 

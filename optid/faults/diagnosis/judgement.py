@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data import Data, Experiment
+from optid.data.record import Data, Experiment
 from optid.faults.consistency.standstill import frozen
 from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate
 from optid.faults.diagnosis.courses import LONGEST

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data, Experiment
+from optid.arrays import Array
+from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.excitation import untestable
 from optid.faults.consistency.leftover import alarm_probability, left_over

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import StructureError
 from optid.faults.diagnosis.answers import Certificate
 from optid.faults.diagnosis.explaining import FAR, Ranking, ranked, singles
@@ -47,7 +47,7 @@ class Way(NamedTuple):
 
 def _solved(name: str, solver: Any, *given: Any, **settings: Any) -> Any:
     from optid.registry import fault_formulation
-    from optid.solving import run
+    from optid.solving.solve import run
 
     return run(fault_formulation(name)(*given, **settings), solver).model
 

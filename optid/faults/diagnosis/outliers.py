@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Experiment
+from optid.arrays import Array
+from optid.data.record import Experiment
 from optid.faults.diagnosis.posterior import marginal
 from optid.faults.diagnosis.records import without
 from optid.faults.search.scanning import Scan, scan

@@ -14,8 +14,8 @@ from optid.faults.diagnosis.words import (
     remaining_words,
     size_words,
 )
-from optid.showing.page import figure, template, versions
-from optid.showing.wording import Table, number
+from optid.show.page import figure, template, versions
+from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "faulty": "bad"}
 """How a verdict looks; the others are neither good nor bad."""

@@ -6,12 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.diagnosis.answers import Diagnosis
 from optid.faults.diagnosis.evidence import Evidence
 from optid.faults.diagnosis.words import headline
-from optid.showing.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, styled, thinned
+from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, styled, thinned
 
 WIDE = 26
 """Characters of a name beside a panel."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data, Experiment
+from optid.arrays import Array
+from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
 from optid.faults.screening import FlatLine, check_channels, flat_lines
@@ -62,7 +62,7 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
         _check_readings(data[1])
         record = Data(data[0], data[1], model.dt, list(model.inputs), list(model.outputs))
     else:
-        from optid.readers import read
+        from optid.data.readers import read
 
         record = read(data, inputs=list(model.inputs), outputs=list(model.outputs), dt=model.dt)
     raw = in_units_of(model, record)

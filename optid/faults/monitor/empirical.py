@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.monitor.arl import Calibration
 from optid.faults.search.empirical import COMMON, LEAST, SURE, sliding_scan

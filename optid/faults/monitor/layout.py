@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 
 LASTING, DRIFT, JUMP, DRIVEN = range(4)
 """The course of a column after its onset: 1, 1 2 3 .., 1 0 0 .., minus f of the input."""

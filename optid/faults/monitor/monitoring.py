@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.bases.expansions import UserFunctions
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor import layout as at
 from optid.faults.monitor.arl import Calibration, calibrate, held_levels
@@ -21,9 +21,9 @@ from optid.faults.monitor.layout import State, Tables
 from optid.faults.monitor.tables import blank, monitored, tables, with_thresholds
 from optid.faults.signatures import Dictionary, dictionary
 from optid.faults.whitening import health, whiten
+from optid.identify.recursive.intake import as_block
 from optid.models.feedback_tables import tabulated
 from optid.models.state_simulation import state_like
-from optid.recursion.intake import as_block
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS

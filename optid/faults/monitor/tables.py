@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.monitor import layout as at
 from optid.faults.monitor.layout import State, Tables

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults.rank.order_power import Positions, coefficients, least_order
 from optid.faults.rank.zero_tests import ZeroTest, smallest_excitation, zero_test
-from optid.model_order.ranks import RankTest, rank_test
-from optid.subspace.hankel import HankelStatistics, hankel_statistics
+from optid.identify.order.ranks import RankTest, rank_test
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.bases.basis import Array
-from optid.model_order.ranks import RankTest
-from optid.subspace.hankel import HankelStatistics
+from optid.arrays import Array
+from optid.identify.order.ranks import RankTest
+from optid.statistics.hankel import HankelStatistics
 
 Positions = Sequence[int] | NDArray[np.intp]
 

@@ -6,7 +6,7 @@ others o do not explain, normalised, and e_t the residuals of y, normalised. If 
     T = |(1/j) sum_t e_t z_t^T|_F^2
 
 is nearly g chi2_h / j, with g and h from the covariances of e and z at every lag at which windows overlap
-(`optid.model_order.ranks`). If they are Theta instead, T grows by |C_z^(1/2) Theta C_e^(-1/2)|^2: with Theta of a
+(`optid.identify.order.ranks`). If they are Theta instead, T grows by |C_z^(1/2) Theta C_e^(-1/2)|^2: with Theta of a
 healthy record this says whether a test on another record can tell anything at all.
 """
 
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.bases.basis import Array
-from optid.model_order.ranks import moments_of_sum, shifted_moments
-from optid.subspace.hankel import HankelStatistics
+from optid.arrays import Array
+from optid.identify.order.ranks import moments_of_sum, shifted_moments
+from optid.statistics.hankel import HankelStatistics
 
 Positions = Sequence[int] | NDArray[np.intp]
 

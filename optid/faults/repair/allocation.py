@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
 from optid.faults.repair.allocation_problem import AllocationProblem, Member
 from optid.faults.repair.inversion import Inverse, inverse
@@ -17,7 +17,7 @@ from optid.faults.repair.virtual_sensor import check_stabilisable
 if TYPE_CHECKING:
     from optid.faults.repair.control import Controller
     from optid.models import HammersteinSS
-    from optid.solution import Solution
+    from optid.program.solution import Solution
 
 REACHED = 1e-4
 """A target is reached when its distance is below this share of the scale of the outputs."""
@@ -102,7 +102,7 @@ class Allocation:
         if self.route == "nlp":
             return self._resting(r)
         from optid.registry import fault_formulation
-        from optid.solving import solve
+        from optid.solving.solve import solve
 
         assert self.problem is not None
         program = fault_formulation("allocation.target")(self.problem, reference=r)

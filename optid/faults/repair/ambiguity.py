@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.repair.allocation import ACTIVE, REACHED, Target
 from optid.faults.repair.allocation_problem import AllocationProblem, Member
@@ -23,7 +23,7 @@ from optid.faults.whitening import predictor
 if TYPE_CHECKING:
     from optid.faults.diagnosis.answers import Answer
     from optid.models import HammersteinSS
-    from optid.solution import Solution
+    from optid.program.solution import Solution
 
 APART = 4.0
 """Distance of two explanations in the whitened innovations at which one of them is dropped nearly always."""
@@ -96,7 +96,7 @@ class Robust:
             StructureError: a reference of the wrong size, or a solver that finds no point.
         """
         from optid.registry import fault_formulation
-        from optid.solving import solve
+        from optid.solving.solve import solve
 
         r = np.atleast_1d(np.asarray(reference, dtype=float))
         if r.shape != self.problem.weights.shape or not np.all(np.isfinite(r)):
@@ -133,7 +133,7 @@ class Robust:
             StructureError: not one state per member, or a solver that finds no point.
         """
         from optid.registry import fault_formulation
-        from optid.solving import solve
+        from optid.solving.solve import solve
 
         if len(states) != len(self.labels):
             raise StructureError(f"{len(states)} states for {len(self.labels)} members ({', '.join(self.labels)}).")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ class Controller:
 
     def _by_program(self, x: Array, r: Array, goal: Any, before: Array | None) -> Move:
         from optid.registry import fault_formulation
-        from optid.solving import solve
+        from optid.solving.solve import solve
 
         a, pose = self.allocation, fault_formulation("allocation.track")
         assert a.problem is not None

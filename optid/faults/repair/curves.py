@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from optid.arrays import Array
 from optid.bases import Triangular
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.data.record import Data
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.bases import Triangular
-from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.faults.faults import channel_of
 from optid.faults.signatures import Candidate

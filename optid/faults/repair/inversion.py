@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from optid.arrays import Array
 from optid.bases import BSpline, PiecewiseConstant, Triangular
-from optid.bases.basis import Array
 from optid.errors import StructureError
 from optid.models.nonlinearity import Nonlinearity
 

@@ -8,8 +8,8 @@ import numpy as np
 from optid import __version__
 from optid.faults.repair.reformulation import Reformulation
 from optid.faults.repair.words import HEADS, member_lines
-from optid.showing.page import figure, template, versions
-from optid.showing.wording import Table, number
+from optid.show.page import figure, template, versions
+from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "ambiguous": "bad"}
 

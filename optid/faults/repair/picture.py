@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from optid.showing.panels import BLUE, GREEN, INK, MUTED, ORANGE, plain, shorten, styled
+from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, plain, shorten, styled
 
 if TYPE_CHECKING:
     from optid.faults.repair.allocation import Allocation

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.bases import Linear
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.windows import Window, cut, fed, observed

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
 from optid.faults.repair.allocation import Allocation, Target, allocate
@@ -134,8 +134,8 @@ def reformulate(
         diagnosis: of the record.
         data: the record with the fault: Data, a pair (u, y) of arrays, or a frame or file with the channels of the
             model as columns; without it the plant is what the diagnosis alone says.
-        constraints: of a damaged nonlinearity: rules of `formulations.shape` or their words; "default": monotone as
-            before and nowhere steeper.
+        constraints: of a damaged nonlinearity: constraints on f or their words; "default": monotone as before and
+            nowhere steeper.
         prior: what is believed beforehand; by default with the curvature that makes the record most probable.
         nodes: values of a damaged nonlinearity that has no nodes of its own.
         stage: "affected only", "all with prior", or "auto": by hold-out.

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataWarning, RankError
 from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
@@ -17,7 +17,7 @@ from optid.faults.repair.refitting import NODES, Prior, Refitting, refitting
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
-    from optid.solution import Solution
+    from optid.program.solution import Solution
 
 HELD_OUT = 0.3
 """Share of the samples after the fault that decides between the two."""
@@ -127,7 +127,7 @@ def refit(
         model: the healthy model.
         data: the record with the fault.
         damage: what broke.
-        constraints: of the damaged nonlinearities; see `formulations.refit`.
+        constraints: of the damaged nonlinearities; see `formulations.faults.refit`.
         prior: what is believed beforehand; by default with the curvature that makes the record most probable.
         nodes: values of a nonlinearity that has no nodes of its own.
         stage: "affected only", "all with prior", or "auto": by hold-out.
@@ -197,7 +197,7 @@ def _scores(narrow: Refitting, wide: Refitting, constraints: Sequence[Any] | str
 def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -> Any:
     from optid.errors import SolverFailed
     from optid.registry import fault_formulation
-    from optid.solving import run
+    from optid.solving.solve import run
 
     name = "refit.parameters" if problem.whole else "refit.actuator"
     found = run(fault_formulation(name)(problem, constraints=constraints), solver)

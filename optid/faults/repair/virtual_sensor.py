@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.bases.basis import Array
-from optid.data import Data
+from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.faults import channel_of
 from optid.models.experiments import in_units_of, one_or_all
@@ -127,7 +127,7 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
     if model.noise is None:
         raise StructureError(
             "The model has no noise covariances, and the best filter depends on them: estimate them with "
-            "optid.noise.with_noise(model, data)."
+            "optid.identify.noise.with_noise(model, data)."
         )
     gone = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
     left = [o for o in range(model.l) if o not in gone]

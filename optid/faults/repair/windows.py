@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
+from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning
 from optid.faults.whitening import Predictor
-from optid.stretches import interpolated
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS

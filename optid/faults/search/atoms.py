@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.search.sweeps import inverse_roots
 from optid.faults.signatures import response

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signature_space import family_thresholds

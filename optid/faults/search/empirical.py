@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.search.calibration import EXCEEDING, Thresholds, simulated, thresholds
 from optid.faults.search.sweeps import sweep

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.faults.search.atoms import Atoms
 
 ALIKE = 2e-6

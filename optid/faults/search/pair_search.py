@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.search.calibration import Thresholds
 from optid.faults.search.scanning import Magnitude, Scan

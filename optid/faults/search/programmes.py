@@ -7,7 +7,7 @@ from optid.errors import SolverFailed
 from optid.registry import fault_formulation
 
 if TYPE_CHECKING:
-    from optid.data import Data
+    from optid.data.record import Data
     from optid.faults.consistency.bounded_noise import Membership
     from optid.faults.consistency.noise_matching import CovarianceMatch
     from optid.faults.consistency.profiles import Profile
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def _solved(name: str, *arguments: Any, solver: Any, settings: dict[str, Any] | None, **structure: Any) -> Any:
-    from optid.solving import run
+    from optid.solving.solve import run
 
     outcome = run(fault_formulation(name)(*arguments, **structure), solver, **(settings or {}))
     if outcome.model is None:
@@ -40,7 +40,7 @@ def signature_estimate(
         penalty: lambda; at one something is active exactly when the search raises an alarm.
         constraints: further constraints on the named variables ``a[label]`` and ``size[label]`` (onsets, d).
         solver: the back end's word, "auto", or a back end of your own.
-        settings: of `optid.solving.solve`, such as accuracy and time_limit.
+        settings: of `optid.solve`, such as accuracy and time_limit.
 
     Returns:
         The result with its gap; where the solver fails it is not `certified` and says why.

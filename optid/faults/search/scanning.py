@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary

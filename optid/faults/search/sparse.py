@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 
 REACH = 10
 """Onsets on either side of an active one at which the exact search looks, for every candidate."""

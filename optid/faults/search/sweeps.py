@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from optid.bases.basis import Array
+from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.scheduled import change
 from optid.faults.signatures import Candidate, Dictionary

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from optid.data import Data
+from optid.data.record import Data
 
 
 @dataclass(frozen=True)
@@ -171,12 +171,7 @@ class Study:
                 solver fails where it succeeds without.
         """
         from optid.studies.definition.problems import Problems
-        from optid.studies.definition.trial import (
-            Records,
-            note_impossible,
-            note_unreadable,
-            note_wrong_options,
-        )
+        from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
 
         if self.data_checked:
             return

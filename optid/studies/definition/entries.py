@@ -8,10 +8,10 @@ from typing import Any
 
 from optid.backends import back_ends
 from optid.bases import parse
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
-from optid.solving import solve
+from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.positions import Path
 from optid.studies.definition.problems import Problems, one_or_several, shown

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
+from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
-from optid.solution import Status
-from optid.solving import solve
+from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Problems
 from optid.studies.sources.systems import simulate, system
@@ -85,8 +85,8 @@ def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Pr
 
 def _note_trouble(path: tuple[str | int, ...], entry: DataEntry, records: Records, problems: Problems) -> None:
     """Note what is wrong with the files of one entry, at the key that is to blame."""
-    from optid.reading.columns import choose
-    from optid.reading.tables import open_table
+    from optid.data.reading.columns import choose
+    from optid.data.reading.tables import open_table
 
     options, key = dict(entry.options), "file"
     for number, name in enumerate(entry.files):

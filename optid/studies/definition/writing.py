@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import StudyError
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.entries import ALL

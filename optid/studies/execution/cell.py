@@ -16,25 +16,15 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError, SolverMissing, SolverRefused
-from optid.fitting import Fit, fit
-from optid.solution import Solution, Times
-from optid.solving import NOT_FINITE, solve
+from optid.identify.fitting import Fit, fit
+from optid.program.solution import Solution, Times
+from optid.solving.solve import NOT_FINITE, solve
 from optid.studies.execution.environment import machine
 from optid.studies.execution.memory import Peak
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash
 from optid.studies.sources.records import Record, load
-from optid.studies.storage.rows import (
-    DONE,
-    ERROR,
-    MEMORY_LIMIT,
-    NON_FINITE,
-    REFUSED,
-    SUCCESS,
-    as_json,
-    complete,
-    place,
-)
+from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete, place
 from optid.studies.versions import determining
 
 KEPT = 3
@@ -108,7 +98,7 @@ def _held(cell: Cell, mb: float) -> str:
 def prepare() -> None:
     """Import what every fit needs and load compiled kernels, so that no cell of this process pays for it."""
     from optid.examples import dead_zone
-    from optid.validation.predictions import one_step, simulated
+    from optid.identify.validation.predictions import one_step, simulated
 
     data = dead_zone(n=100).data
     tried: dict[str, dict[str, Any]] = {"hammerstein_arx.exact": {"basis": "triangular:4"}, "arx": {}}
@@ -264,8 +254,8 @@ def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: flo
 
 def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str, Any]:
     """The figures of a model; one that cannot be had is left out, with a remark where that is a failure."""
-    from optid.validation import fit_percent
-    from optid.validation.predictions import one_step, simulated
+    from optid.identify.validation import fit_percent
+    from optid.identify.validation.predictions import one_step, simulated
 
     def attempt(what: str, compute: Callable[[], Any]) -> Any:
         try:

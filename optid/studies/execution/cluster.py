@@ -16,7 +16,7 @@ from queue import Empty, SimpleQueue
 from time import monotonic
 from typing import Any
 
-from optid.clusters import PACKAGES, connected, difference
+from optid.data.clusters import PACKAGES, connected, difference
 from optid.errors import ClusterError, StudyError
 from optid.studies.execution import cluster_worker
 from optid.studies.execution.cell import lost_row, run_cell
@@ -44,7 +44,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         cells: what to run; their own limits hold. Data files are read where they are when a worker sees the same
             content under the same path; else they are sent to it once.
         function: what makes a row of a cell; workers import it by its name.
-        scheduler: as for `optid.clusters.connected`.
+        scheduler: as for `optid.data.clusters.connected`.
 
     Raises:
         ClusterError: no scheduler, no worker, workers with other versions (also those that join later), or a scheduler

@@ -34,8 +34,8 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         study: what to run.
         db: the database; made when it is not there.
         workers: processes on this machine; one per core when not given.
-        scheduler: Dask scheduler whose workers run the cells instead, as for `optid.clusters.connected`: an address, a
-            scheduler file or a Client.
+        scheduler: Dask scheduler whose workers run the cells instead, as for `optid.data.clusters.connected`: an
+            address, a scheduler file or a Client.
         progress: called with (cells that have a row, all cells, None) before work starts and with the row after each.
         accept_changed_data: run cells again whose data file is not what it was; their former rows are set aside.
         retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit"; rows of other

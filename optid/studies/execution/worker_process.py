@@ -16,7 +16,7 @@ from typing import Any
 
 import psutil
 
-from optid.isolated import death
+from optid.solving.isolated import death
 from optid.studies.execution.cell import lost_row, without_warm
 from optid.studies.execution.memory import MB
 from optid.studies.grid import Cell

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait
 from typing import TYPE_CHECKING, Any
 
 from optid.errors import StudyError
-from optid.isolated import GRACE
+from optid.solving.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell
 from optid.studies.execution.worker import KEEP, RAISED, READY
 from optid.studies.grid import Cell

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.studies.definition.description import DataEntry
 from optid.studies.grid import Cell
@@ -66,6 +66,6 @@ def read_entry(entry: DataEntry) -> Data:
     """
     if entry.record is not None:
         return entry.record
-    from optid.readers import read
+    from optid.data.readers import read
 
     return read(list(entry.files), **entry.options)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid import examples, plants
-from optid.data import Data
+from optid.data.record import Data
 from optid.errors import DataError, LookupFailed, nearest
 from optid.models.recursions import lfilter
 from optid.plants.feedback import EXAMPLE1, TWO_MODES, FeedbackSystem

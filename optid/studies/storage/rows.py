@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from optid.solution import Status
+from optid.program.solution import Status
 
 SCHEMA_VERSION = 1
 

@@ -1,6 +1,6 @@
 """The verdict in words: recommendations with the numbers they rest on, warnings, and what cannot be told."""
 
-from optid.showing.wording import seconds
+from optid.show.wording import seconds
 from optid.studies.verdicts.averages import Paired, paired_ratio
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, listed
 from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
-from optid.showing.wording import seconds
+from optid.show.wording import seconds
 from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.choice import listed
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate

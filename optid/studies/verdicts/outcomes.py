@@ -6,17 +6,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from optid.errors import DataError
-from optid.solution import GRADIENT, Status, tolerance
-from optid.studies.storage.rows import (
-    CRASHED,
-    DONE,
-    ERROR,
-    MEMORY_LIMIT,
-    NON_FINITE,
-    REFUSED,
-    SUCCESS,
-    TIME_LIMIT,
-)
+from optid.program.solution import GRADIENT, Status, tolerance
+from optid.studies.storage.rows import CRASHED, DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, TIME_LIMIT
 
 SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Status.INFEASIBLE)

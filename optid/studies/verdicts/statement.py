@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from optid.solution import tolerance
+from optid.program.solution import tolerance
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one

@@ -5,7 +5,7 @@ import numpy as np
 
 from optid import Data, HammersteinARX, Linear, Nonlinearity, Program
 from optid.errors import RankError, StructureError
-from optid.view import View
+from optid.program.view import View
 
 
 def decaying(data: Data, *, length: int, decay: float = 0.8, weight: float = 1e-3, constraints: tuple = ()) -> Program:

@@ -13,8 +13,8 @@ from cvxpy.reductions.solvers import utilities
 from cvxpy.reductions.solvers.qp_solvers.qp_solver import QpSolver
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.program import Program
-from optid.solution import Status
+from optid.program.program import Program
+from optid.program.solution import Status
 
 STATUS = {cp.OPTIMAL: Status.OPTIMAL, cp.USER_LIMIT: Status.LIMIT}
 

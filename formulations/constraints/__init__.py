@@ -1,0 +1,1 @@
+"""Named constraints: one word, one function."""

@@ -1,0 +1,373 @@
+"""Reusable constraints on the nonlinearity and the static behaviour: each works in exact and relaxed formulations.
+
+Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kinds of statement exist:
+
+* about the *shape* of f, free of scale and sign (monotone, odd, dead zone, known up to a factor). In the exact
+  formulations they act on ``mu`` and the sign is carried by ``b``: a monotone f with negative b is a falling static
+  characteristic. In the relaxed ones they act on ``Theta``; an inequality then speaks of the static characteristic,
+  the sum over the lags, which is implied by the exact statement when the lags sum to a positive number.
+* about the *static characteristic* ``y = (f(u) sum(b) + d) / (1 + sum(a))``, in units of the output: slope, range,
+  points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge. They
+  include ``1 + sum(a) > 0``, which every stable model satisfies: without it there is no static characteristic.
+
+For state-space models they act in the step that chooses B and D ("realisation"), where the static characteristic
+``C (I - A)^-1 B f(u) + D f(u) + d`` is linear in the unknowns; an output that is fed back through a nonlinearity or an
+observer gain is held at its mean there. The rules of `formulations.constraints.responses` belong to that step alone.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.constraints.rule import Rule
+from formulations.constraints.stability import stable
+from formulations.constraints.static_curve import basis_of, denominator, offset_of, settles, static_theta
+from optid.bases import Triangular
+from optid.errors import StructureError
+from optid.program.limits import Limit
+from optid.program.view import View
+
+__all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
+           "shared", "sign", "slope", "stable", "through", "value_range"]
+
+FACTORED = ("exact", "tangent", "realisation")  # kinds whose variables are mu and b
+RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
+
+
+def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
+    """The nonlinearity is increasing or decreasing over the interval of its basis.
+
+    Exact for piecewise linear and constant bases, sufficient for splines (control points), on a dense grid otherwise.
+
+    Args:
+        direction: "increasing" or "decreasing".
+        channel: name of the input; None means every input.
+
+    Raises:
+        StructureError: unknown direction or channel.
+    """
+    sign = _sign(direction, "increasing", "decreasing")
+    return _cone("monotone", direction, channel, lambda basis: sign * basis.increments())
+
+
+def convex(channel: str | None = None) -> Rule:
+    """The nonlinearity is convex over the interval of its basis."""
+    return _cone("convex", "", channel, lambda basis: basis.curvature(), heights=False)
+
+
+def concave(channel: str | None = None) -> Rule:
+    """The nonlinearity is concave over the interval of its basis."""
+    return _cone("concave", "", channel, lambda basis: -basis.curvature(), heights=False)
+
+
+def odd(channel: str | None = None) -> Rule:
+    """f(u) - f(0) is odd; the offset of the model stays free.
+
+    Exact where the interval of the basis is symmetric about zero; elsewhere it holds at as many points as the basis
+    has functions of the other parity.
+    """
+    return _linear("odd", channel, lambda basis: _mirror(basis, +1.0))
+
+
+def even(channel: str | None = None) -> Rule:
+    """The nonlinearity is even, in the sense of `odd`."""
+    return _linear("even", channel, lambda basis: _mirror(basis, -1.0))
+
+
+def dead_zone(low: float, high: float, channel: str | None = None) -> Rule:
+    """The nonlinearity is constant on [low, high]; cells that the zone only touches become constant as a whole.
+
+    Raises:
+        StructureError: an empty zone.
+    """
+    if not low < high:
+        raise StructureError(f"dead_zone needs low < high; got {low!r}, {high!r}")
+    return _linear(f"dead_zone:{low:g},{high:g}", channel, lambda basis: _flat(basis, low, high))
+
+
+def saturation(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
+    """The nonlinearity is constant below ``low`` and above ``high``.
+
+    Raises:
+        StructureError: neither level given.
+    """
+    if low is None and high is None:
+        raise StructureError("saturation needs a level: low=, high= or both")
+
+    def rows(basis: Any) -> np.ndarray:
+        lo, hi = basis.interval
+        parts = [_flat(basis, lo, low)] if low is not None and low > lo else []
+        parts += [_flat(basis, high, hi)] if high is not None and high < hi else []
+        if not parts:
+            raise StructureError(f"saturation levels ({low}, {high}) lie outside the interval [{lo:g}, {hi:g}]")
+        return np.vstack(parts)
+
+    return _linear("saturation", channel, rows)
+
+
+def slope(low: float | None = None, high: float | None = None, channel: str | None = None,
+          output: str | None = None) -> Rule:
+    """The slope of the static characteristic lies in [low, high] (units of output per unit of input)."""
+    return _static("slope", low, high, channel, output, lambda basis: basis.slope_rows(), offset=False)
+
+
+def value_range(low: float | None = None, high: float | None = None, channel: str | None = None,
+                output: str | None = None) -> Rule:
+    """The static characteristic lies in [low, high] over the interval of the basis (units of the output).
+
+    Exact for `Triangular`, on a dense grid for the other bases.
+    """
+    return _static("range", low, high, channel, output, _everywhere, offset=True)
+
+
+def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None,
+            output: str | None = None) -> Rule:
+    """The static characteristic passes through the points (u, y).
+
+    Args:
+        u: input values inside the interval of the basis.
+        y: output values in steady state.
+        channel: name of the input.
+        output: name of the output, where there are several.
+
+    Raises:
+        StructureError: different numbers of u and y.
+    """
+    us, ys = np.atleast_1d(np.asarray(u, dtype=float)), np.atleast_1d(np.asarray(y, dtype=float))
+    if us.shape != ys.shape:
+        raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
+
+    def build(view: View) -> Any:
+        basis, theta = basis_of(view, channel), static_theta(view, channel, output)
+        curve = basis.values(us) @ theta + offset_of(view, output)
+        size = denominator(view)
+        points = Limit(curve == cp.multiply(ys, size), size, None, step=_range_of(basis, theta, size), words=RANGE)
+        return [points, *settles(view)]
+
+    return Rule(_label("through", channel, output), build)
+
+
+def gain(value: float | None = None, low: float | None = None, high: float | None = None, at: float | None = None,
+         channel: str | None = None, output: str | None = None) -> Rule:
+    """The static gain at an operating point equals ``value`` or lies in [low, high].
+
+    Args:
+        value: gain in units of output per unit of input.
+        low: lower bound instead of a value.
+        high: upper bound instead of a value.
+        at: operating point; default the middle of the interval.
+        channel: name of the input.
+        output: name of the output, where there are several.
+
+    Raises:
+        StructureError: neither value nor bound given.
+    """
+    if value is None and low is None and high is None:
+        raise StructureError("gain needs a value, or low= and/or high=")
+
+    def rows(basis: Any) -> np.ndarray:
+        return basis.slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))
+
+    if value is not None:
+        low = high = value
+    return _static("gain", low, high, channel, output, rows, offset=False)
+
+
+def coefficients(name: str, low: float | None = None, high: float | None = None, index: int | None = None) -> Rule:
+    """Bounds on the entries of a named variable: ``a``, ``offset``, or ``b`` where its scale is fixed.
+
+    Args:
+        name: name of the variable.
+        low: lower bound.
+        high: upper bound.
+        index: a single entry, default all.
+
+    Raises:
+        StructureError: no bound, or ``b``/``mu`` in the gauge "norm", where their scale is not a fact of the plant.
+    """
+    if low is None and high is None:
+        raise StructureError("coefficients needs low= and/or high=")
+
+    def build(view: View) -> Any:
+        if view.kind in FACTORED and view.gauge == "norm" and name not in ("a", "offset"):
+            raise StructureError(f"bounds on {name!r} depend on the gauge, and 'norm' only fixes a length; choose "
+                                 "gauge='b0' or gauge='gain', or bound the static gain or slope instead")
+        variable = view[name] if index is None else cp.hstack([view[name][int(index)]])
+        return ([Limit(variable >= low, bound="low")] if low is not None else []) + (
+            [Limit(variable <= high, bound="high")] if high is not None else [])
+
+    return Rule(_label(f"coefficients:{name}", None), build)
+
+
+def fixed(name: str, value: Any) -> Rule:
+    """A known parameter: ``a`` and ``offset`` by value, ``mu`` and ``b`` up to the factor between them.
+
+    Args:
+        name: variable name (``mu[valve]`` with several inputs).
+        value: array of its shape.
+
+    Raises:
+        StructureError: wrong shape.
+    """
+    known = np.asarray(value, dtype=float)
+
+    def build(view: View) -> Any:
+        word, _, channel = name.partition("[")
+        if word in ("mu", "b") and view.kind != "linear":
+            direction = np.ravel(known, order="F") / np.linalg.norm(known)
+            rest = np.eye(direction.size) - np.outer(direction, direction)
+            rest = _independent(rest)
+            if view.kind in FACTORED:
+                _check_shape(name, known, view[name].shape)
+                target = view[name] if view[name].ndim == 1 else cp.vec(view[name], order="F")
+                return rest @ target == 0
+            theta = view["Theta[" + channel if channel else "Theta"]
+            return rest @ (theta if word == "mu" else theta.T) == 0
+        _check_shape(name, known, view[name].shape)
+        return view[name] == known
+
+    return Rule(f"fixed:{name}", build)
+
+
+def shared(name: str, first: str, second: str) -> Rule:
+    """Two inputs share ``b`` (the dynamics) or ``mu`` (the nonlinearity), each in the gauge of the formulation."""
+
+    def build(view: View) -> Any:
+        equal = view[view.key(name, first)] == view[view.key(name, second)]
+        return Limit(equal, band=np.eye(equal.size), span=np.eye(equal.size))
+
+    return Rule(f"shared:{name}:{first},{second}", build)
+
+
+def sign(name: str = "b", direction: str = "positive") -> Rule:
+    """All entries of a named variable have one sign; for ``b`` or ``mu`` this also fixes the sign of the other."""
+    factor = _sign(direction, "positive", "negative")
+    return Rule(f"sign:{name}:{direction}", lambda view: factor * view[name] >= 0)
+
+
+def _sign(word: str, positive: str, negative: str) -> float:
+    if word not in (positive, negative):
+        raise StructureError(f"the direction is {positive!r} or {negative!r}; got {word!r}")
+    return 1.0 if word == positive else -1.0
+
+
+def _label(word: str, channel: str | None, output: str | None = None) -> str:
+    named = [name for name in (channel, output) if name is not None]
+    return f"{word}[{','.join(named)}]" if named else word
+
+
+def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list[Any]:
+    """Build for one input, or for every input where none is named."""
+    parts = [build(c) for c in ([channel] if channel is not None else view.channels)]
+    return [member for part in parts for member in (part if isinstance(part, list) else [part])]
+
+
+def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
+          ) -> Rule:
+    """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
+
+    def build(view: View, one: str) -> Any:
+        basis = basis_of(view, one)
+        matrix = rows(basis)
+        if view.kind in FACTORED and view.key("mu", one) in view:
+            coefficients = [view[view.key("mu", one)]]
+        else:
+            outputs = view.outputs if view.kind == "realisation" else (None,)
+            coefficients = [static_theta(view, one, output) for output in outputs or (None,)]
+        return [Limit(matrix @ each >= 0, bound=one, step=_range_of(basis, each) if heights else None,
+                      words=RANGE if heights else "") for each in coefficients]
+
+    return Rule(_label(f"{word}:{direction}" if direction else word, channel),
+                lambda view: _every(view, channel, lambda one: build(view, one)))
+
+
+def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
+    def build(view: View, one: str) -> Any:
+        basis = basis_of(view, one)
+        whole = rows(basis)
+        matrix = _independent(whole)
+        factored = view.kind in FACTORED and view.key("mu", one) in view
+        coefficients = view[view.key("mu" if factored else "Theta", one)]
+        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(basis, coefficients),
+                     words=RANGE)
+
+    return Rule(_label(word, channel), lambda view: _every(view, channel, lambda one: build(view, one)))
+
+
+def _static(word: str, low: float | None, high: float | None, channel: str | None, output: str | None,
+            rows: Callable[[Any], np.ndarray], *, offset: bool) -> Rule:
+    if low is None and high is None:
+        raise StructureError(f"{word} needs low= and/or high=")
+    if low is not None and high is not None and low > high:
+        raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
+
+    def build(view: View) -> Any:
+        basis, theta, size = basis_of(view, channel), static_theta(view, channel, output), denominator(view)
+        curve = rows(basis) @ theta
+        if offset:
+            curve = curve + offset_of(view, output)
+        meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
+                                   "words": RANGE if offset else f"{RANGE} over the width of its interval"}
+        if low == high:
+            return [Limit(curve - low * size == 0, size, "value", **meaning), *settles(view)]
+        return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
+            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + settles(view)
+
+    return Rule(_label(word, channel), build)
+
+
+def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) -> Callable[[], float]:
+    """Return what 1 % of the range of f is at the assigned point, per width of its interval to a power."""
+
+    def step() -> float:
+        matrix = np.asarray(coefficients.value, dtype=float)
+        curve = basis.values(basis.grid()) @ (matrix if matrix.ndim == 1 else matrix.sum(axis=1))
+        scale = float(np.asarray(size.value if isinstance(size, cp.Expression) else size))
+        low, high = basis.interval or (0.0, 1.0)
+        return 0.01 * float(np.ptp(curve)) / abs(scale) / (high - low) ** power
+
+    return step
+
+
+def _everywhere(basis: Any) -> np.ndarray:
+    """Values of f at the nodes of a piecewise linear basis, which are enough, or on a dense grid."""
+    return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
+
+
+def _independent(rows: np.ndarray) -> np.ndarray:
+    """Return independent rows that span the same conditions, so that solvers see no redundant equality."""
+    _, values, vectors = np.linalg.svd(np.atleast_2d(rows), full_matrices=False)
+    keep = values > 1e-10 * max(float(values[0]) if values.size else 0.0, 1e-300)
+    if not np.any(keep):
+        raise StructureError("the condition holds for every function of this basis: it constrains nothing")
+    return vectors[keep]
+
+
+def _mirror(basis: Any, parity: float) -> np.ndarray:
+    lo, hi = basis.interval
+    reach = min(-lo, hi)
+    if reach <= 0:
+        raise StructureError(f"the interval [{lo:g}, {hi:g}] of the input does not contain zero: "
+                             "a symmetry about zero says nothing there")
+    # as many points as the family has functions of the other parity: more would overdetermine a family whose nodes are
+    # not mirror images of each other, and leave only straight lines
+    count = max(basis.size // 2 if parity > 0 else (basis.size + 1) // 2, 1)
+    points = reach * np.arange(1, count + 1) / count
+    both = basis.values(points) + parity * basis.values(-points)
+    return both - 2 * basis.values(np.zeros(1)) if parity > 0 else both
+
+
+def _flat(basis: Any, low: float, high: float) -> np.ndarray:
+    lo, hi = basis.interval
+    low, high = max(low, lo), min(high, hi)
+    if not low < high:
+        raise StructureError(f"the zone lies outside the interval [{lo:g}, {hi:g}] of the input")
+    points = np.linspace(low, high, max(64, 8 * basis.size))
+    return basis.values(points) - basis.values(np.array([low]))
+
+
+def _check_shape(name: str, value: np.ndarray, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise StructureError(f"{name!r} has shape {shape}, the known value has {value.shape}")

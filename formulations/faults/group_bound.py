@@ -1,0 +1,94 @@
+"""The proof of a group-sparse programme: a lower bound recomputed from a feasible dual point.
+
+For ``min 1/2 ‖r - M a‖² + lambda sum w_g ‖a_g‖`` under affine constraints whose multipliers make the part ``c' a + k``
+of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. What a solver
+returns is scaled into that set, v and multipliers together, so that the bound holds whatever it was.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import cvxpy as cp
+import numpy as np
+
+from optid.program.gradients import flat_value, jacobians
+from optid.program.judging import multiplier_terms
+from optid.program.program import GroupForm, Program, Values
+from optid.program.solution import Bound, relative_gap
+
+PROVED = 1e-6
+"""Relative gap below which a point counts as optimal."""
+
+
+def certify(program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+    """Return the best bound from the residual at the point and from the multipliers that the solver gave."""
+    form = program.group
+    assert form is not None
+    penalty = float(np.asarray(program.parameters[form.penalty].value))
+    program.assign({name: value for name, value in values.items() if name not in program.derived})
+    objective = float(np.asarray(program.objective.expr.value))
+    problem, residual = form.problem, np.asarray(program.variables[form.residual].value)
+    slope, constant = _lagrangian(program, form, duals)
+    candidates = [residual]
+    if form.residual in duals and np.size(duals[form.residual]) == residual.size:
+        candidates.append(-np.ravel(np.asarray(duals[form.residual], dtype=float)))
+    bounds = [_bound(problem, v, penalty, slope, constant) for v in candidates]
+    bounds += [_bound(problem, v, penalty, 0.0 * slope, 0.0) for v in candidates]
+    value, point = max(bounds, key=lambda pair: pair[0])
+    gap = relative_gap(objective, value, program.scale)
+    return Bound(value, gap < PROVED, "group-sparse dual", f"feasible dual point, relative gap {gap:.1e}",
+                 multipliers=point), None
+
+
+def _bound(problem, v: np.ndarray, penalty: float, slope: np.ndarray, constant: float) -> tuple[float, np.ndarray]:
+    """Scale v and the multipliers into the feasible set and return the value there."""
+    if not np.isfinite(v).all():
+        return -np.inf, np.zeros_like(v)
+    most = float(np.max(problem.norms(problem.design.T @ v - slope) / (penalty * problem.weights), initial=0.0))
+    square, along = float(v @ v), float(problem.target @ v) + constant
+    best = 0.0 if square == 0.0 else max(along, 0.0) / square
+    scale = best if most == 0.0 else min(best, 1.0 / most)
+    if not scale > 0 or not np.isfinite(scale):  # also a most or along that is not a number
+        return 0.0, np.zeros_like(v)
+    return scale * along - 0.5 * scale**2 * square, scale * v
+
+
+def _lagrangian(program: Program, form: GroupForm, duals: Values) -> tuple[np.ndarray, float]:
+    """Return c (p,) and k of the user's affine constraints; one that is no help counts with multiplier zero."""
+    slope, constant = np.zeros(problem_size(form)), 0.0
+    for name, group in program.user_constraints.items():
+        position = 0
+        for member in group:
+            length = sum(d.size for d in member.dual_variables)
+            given = np.ravel(duals[name])[position : position + length] if name in duals else np.zeros(0)
+            position += length
+            terms = multiplier_terms(member, given) if given.size == length and np.isfinite(given).all() else None
+            part = None if terms is None else _affine(terms, program.variables, form)
+            if part is not None:
+                slope, constant = slope + part[0], constant + part[1]
+    return slope, constant
+
+
+def problem_size(form: GroupForm) -> int:
+    """Return the number of coefficients."""
+    return int(form.problem.edges[-1])
+
+
+def _affine(terms: Iterable[tuple[cp.Expression, np.ndarray]], variables: Mapping[str, cp.Variable], form: GroupForm
+            ) -> tuple[np.ndarray, float] | None:
+    """Return slope and constant of a sum of weighted affine expressions of the coefficients; None for others."""
+    known = {variables[name].id: name for name in form.blocks}
+    slopes = {name: np.zeros(shape) for name, shape in form.blocks.items()}
+    constant = 0.0
+    for expression, weights in terms:
+        if not expression.is_affine():
+            return None
+        constant += float(flat_value(expression) @ weights)
+        found = jacobians(expression)
+        if found is None or any(variable.id not in known for variable in found):
+            return None
+        for variable, jacobian in found.items():
+            part = jacobian.T @ weights
+            name = known[variable.id]
+            slopes[name] = slopes[name] + part.reshape(form.blocks[name], order="F")
+            constant -= float(flat_value(variable) @ part)
+    return np.concatenate([part.ravel() for part in slopes.values()]), constant

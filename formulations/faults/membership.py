@@ -1,0 +1,238 @@
+"""Set membership: the least factor of the bounds of the noise at which a window is possible, as linear programmes.
+
+    min t   subject to   x(k + 1) - A x(k) = w(k),  |w| <= t w̄,   e(k) - C x(k) = v(k),  |v| <= t v̄
+
+with x the deviation of the states from a simulation from zero, and e the readings less that simulation. t > 1 proves
+that no healthy plant has made the window; the multipliers of the measurements are near the parity vector that shows it
+(`optid.faults.consistency.bounded_noise`). With a fault of unknown size the same programme tells whether a candidate is
+possible.
+Its onset is searched by branch and bound: what a step with any onset between two samples can do, a free course between
+them followed by a step can do, too. Bounds of t are recomputed from parity vectors, never copied from a solver.
+
+Named variables: ``t``; named expressions: ``x`` (N, n) and, with a candidate, ``size``.
+"""
+
+from collections.abc import Generator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import cvxpy as cp
+import numpy as np
+import scipy.sparse as sp
+
+from optid.data.record import Data
+from optid.errors import StructureError
+from optid.faults.consistency.bounded_noise import (
+    SIGMAS,
+    BoundedWindow,
+    Membership,
+    ParityProof,
+    bounded_window,
+    parity_proof,
+)
+from optid.faults.signatures import Candidate, Dictionary
+from optid.program.program import Program, Values
+from optid.program.solution import Bound, Solution, Status, relative_gap
+from optid.program.view import View
+from optid.solving.solve import Evidence, Procedure
+
+Array = np.ndarray
+
+PROVED = 1e-6
+"""Relative gap below which a factor counts as least."""
+
+
+class Signature(NamedTuple):
+    """Additions of unknown sizes.
+
+    Attributes:
+        state: (N, n, c) to x(k).
+        output: (N, l, c) to y(k).
+    """
+
+    state: Array
+    output: Array
+
+
+def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictionary | None = None,
+               onsets: Sequence[int] | str = "all", candidates: bool = True, constraints: Sequence[Any] = ()
+               ) -> Procedure:
+    """Find the least factor of the bounds for a healthy plant and whether every candidate is possible.
+
+    Args:
+        model: the healthy model.
+        data: the window; one experiment, some ten to a hundred samples.
+        bounds: of the noise: a number of standard deviations, or {"process": (n,), "output": (l,)}.
+        faults: the candidates; none by default.
+        onsets: "all", the onsets that are tried, or "course": a fault of any course, which takes one programme for
+            every candidate and excludes fewer.
+        candidates: whether candidates are tried although a healthy plant is possible.
+        constraints: further constraints on ``x`` and ``t`` of the healthy programme.
+
+    Returns:
+        An `optid.faults.consistency.bounded_noise.Membership`.
+
+    Raises:
+        DataError, StructureError: see `optid.faults.consistency.bounded_noise.bounded_window`; onsets outside the
+            window.
+    """
+    window = bounded_window(model, data, bounds)
+    tried = _onsets(onsets, window.count)
+    solution = yield membership_programme(window).subject_to(*constraints)
+    proof = _proof_of(solution)
+    factor = solution.objective if solution.has_point else float("nan")
+    factors: dict[str, float] = {}
+    where: dict[str, int | None] = {}
+    proofs: dict[str, dict[tuple[int, int], ParityProof]] = {}
+    untested: dict[str, str] = {}
+    impossible = proof is not None and proof.proved
+    for candidate in () if faults is None or not (candidates or impossible) else faults.candidates:
+        if not (candidate.additive or candidate.columns):
+            untested[candidate.label] = "it has no signature: test it as an arbitrary waveform"
+            continue
+        per_sample = _per_sample(faults, candidate, window)
+        found = yield from _possible(window, candidate, per_sample, tried)
+        factors[candidate.label], where[candidate.label], proofs[candidate.label] = found
+    status = "" if solution.status in (Status.OPTIMAL, Status.LOCAL) else f"{solution.status}: {solution.reason}"
+    result = Membership(factor, proof, factors, where, proofs, untested, window, status)
+    bound = solution.bound or Bound(-np.inf, False, "none", solution.reason)
+    return Evidence(result, factor, bound, solution.status, solution.reason,
+                    {"least factor of the bounds": factor, "candidates possible": len(result.consistent)})
+
+
+def _possible(window: BoundedWindow, candidate: Candidate, per_sample: Signature, tried: list[int] | None
+              ) -> Generator[Program, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
+    """Return a factor and onset at which a candidate is possible; or the least factor proved, with all proofs.
+
+    The factor is NaN where the solver gave neither.
+    """
+    if tried is None:
+        solution = yield membership_programme(window, _between(candidate, per_sample, 0, window.count))
+        proof = _proof_of(solution)
+        if proof is not None and proof.proved:
+            return proof.factor, None, {(0, window.count - 1): proof}
+        return (solution.objective if solution.has_point else float("nan")), None, {}
+    proofs: dict[tuple[int, int], ParityProof] = {}
+    waiting: list[tuple[float, int, int]] = [(0.0, 0, len(tried) - 1)]
+    while waiting:
+        waiting.sort()  # the smallest factor first: there the candidate may be possible
+        _, first, last = waiting.pop(0)
+        a, b = tried[first], tried[last]
+        solution = yield membership_programme(window, _between(candidate, per_sample, a, b))
+        proof = _proof_of(solution)
+        if proof is not None and proof.proved:
+            proofs[a, b] = proof
+        elif first == last:
+            return (solution.objective if solution.has_point else float("nan")), a, {}
+        else:
+            value = solution.objective if solution.has_point else 0.0
+            middle = (first + last) // 2
+            waiting += [(value, first, middle), (value, middle + 1, last)]
+    return min(proof.factor for proof in proofs.values()), None, proofs
+
+
+def _per_sample(faults: Dictionary | None, candidate: Candidate, window: BoundedWindow) -> Signature:
+    """What a unit of the course in each sample adds, (N, n, d) and (N, l, d)."""
+    assert faults is not None
+    if not candidate.additive:
+        return Signature(*faults.additions(candidate, window.count, 0, window.u))
+    parts = (np.broadcast_to(part, (window.count, *part.shape)) for part in
+             (candidate.into_state, candidate.into_output))
+    return Signature(*parts)
+
+
+def _between(candidate: Candidate, per_sample: Signature, first: int, last: int) -> Signature:
+    """Columns of which some combination is the fault with any onset from first to last; last = N: any course."""
+    count = len(per_sample.state)
+    k = np.arange(count)
+    courses = [k == at for at in range(first, min(last + (candidate.kind == "jump"), count))]
+    if last < count and candidate.kind != "jump":
+        if candidate.kind == "drift":
+            courses += [np.maximum(k - last + 1, 0)] + [k >= last] * (first < last)
+        else:
+            courses += [k >= last]
+    shapes = np.array(courses, dtype=float)
+    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(count, part.shape[1], -1) for part in per_sample)
+    sizes = np.maximum(np.abs(state[1:]).max(axis=(0, 1), initial=0.0), np.abs(output).max(axis=(0, 1), initial=0.0))
+    seen = sizes > 0
+    return Signature(state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen])
+
+
+def membership_programme(window: BoundedWindow, signature: Signature | None = None) -> Program:
+    """Pose the linear programme of the healthy plant, or with additions of unknown sizes.
+
+    Args:
+        window: the window.
+        signature: the additions.
+    """
+    n, count = window.A.shape[0], window.count
+    later, earlier = (sp.diags_array(np.ones(count - 1), offsets=k, shape=(count - 1, count)) for k in (1, 0))
+    steps = sp.kron(later, np.eye(n)) - sp.kron(earlier, window.A)
+    matrix = sp.vstack([-steps, sp.kron(sp.eye_array(count), window.C)]).tocsr()
+    level = np.concatenate([np.zeros((count - 1) * n), window.e.ravel()])
+    bounds = np.concatenate([np.tile(window.process, count - 1), np.tile(window.output, count)])
+    known = np.concatenate([np.repeat(window.steps[:-1], n), window.present.ravel()])
+    t, x = cp.Variable(name="t"), cp.Variable(count * n, name="states")
+    variables: dict[str, cp.Variable] = {"t": t, "states": x}
+    expressions: dict[str, cp.Expression] = {"t": t, "x": cp.reshape(x, (count, n), order="C")}
+    added = np.zeros((level.size, 0))
+    if signature is not None and signature.state.shape[2]:
+        d = signature.state.shape[2]
+        variables["size"] = expressions["size"] = cp.Variable(d, name="size")
+        added = np.vstack([signature.state[1:].reshape(-1, d), signature.output.reshape(-1, d)])
+    bounded, exact = np.flatnonzero(known & (bounds > 0)), np.flatnonzero(known & (bounds == 0))
+
+    def noise(rows: Array, units: Array) -> Any:
+        """The noise in some rows, in units, as an expression of as few parts as possible: it is judged often."""
+        found = level[rows] / units - (sp.diags_array(1 / units) @ matrix[rows]) @ x
+        return found - (added[rows] / units[:, None]) @ variables["size"] if "size" in variables else found
+
+    relative = noise(bounded, bounds[bounded])
+    constraints: dict[str, tuple[Any, ...]] = {"noise": (relative <= t, -relative <= t)}
+    if exact.size:
+        constraints["no noise"] = (noise(exact, np.ones(exact.size)) == 0,)
+    return Program(
+        "fault.membership", cp.Minimize(t), constraints, variables,
+        {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions, kind="membership"),
+        structural=frozenset(constraints), scale=1.0, compressed=window,
+        certify=partial(_certified, window, signature, bounded, exact, bounds))
+
+
+def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
+               program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+    """Return the factor that the parity vector near the multipliers proves."""
+    program.assign(values)
+    objective = float(np.asarray(program.objective.expr.value))
+    if np.size(duals.get("noise", ())) != 2 * bounded.size:
+        return Bound(-np.inf, False, "parity", "the solver gave no multipliers"), None
+    weights = np.zeros(bounds.size)
+    upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
+    weights[bounded] = (upper - lower) / bounds[bounded]
+    if exact.size and np.size(duals.get("no noise", ())) == exact.size:
+        weights[exact] = np.asarray(duals["no noise"], dtype=float)
+    p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
+    unseen = window.unseen(None, None) if signature is None else window.unseen(signature.state, signature.output)
+    proof = parity_proof(window, p, unseen)
+    gap = relative_gap(objective, proof.factor, program.scale)
+    if program.user_constraints:
+        return Bound(proof.factor, False, "parity", "the bound is that without the further constraints",
+                     multipliers=proof), None
+    words = f"parity vector, relative gap {gap:.1e}"
+    return Bound(proof.factor, gap < PROVED, "parity", words, multipliers=proof), None
+
+
+def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
+    if isinstance(onsets, str):
+        if onsets not in ("all", "course"):
+            raise StructureError(f"onsets={onsets!r}: use 'all', 'course' or whole numbers.")
+        return list(range(count)) if onsets == "all" else None
+    chosen = sorted({int(k) for k in onsets})
+    if not chosen or chosen[0] < 0 or chosen[-1] >= count:
+        raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
+    return chosen
+
+
+def _proof_of(solution: Solution) -> ParityProof | None:
+    if not solution.has_point or solution.bound is None:
+        return None
+    return solution.bound.multipliers

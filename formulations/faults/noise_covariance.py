@@ -1,0 +1,118 @@
+"""Where has the noise grown? Covariance matching as a convex programme: several places at once (F8).
+
+White noise of variance rho at a place adds rho Lambda(l) to the covariance at lag l of the whitened innovations, which
+is I at lag 0 and zero beyond for a healthy plant. With S(l) the sample covariances of the window,
+
+    min over rho >= 0:  1/2 sum_l ‖W_l (S(l) - I delta_l - sum_c rho_c Lambda_c(l))‖²            ("places")
+
+is a non-negative least-squares problem; weights W are the inverse standard deviations of S when healthy. With full
+covariances of the added process and sensor noise, positive semidefinite, in place of rho it is a semidefinite
+programme ("full"), which asks for no candidates but cannot tell directions apart that leave the same covariances.
+
+Named variables: ``rho`` (C,), variances in units of the places; or ``Q`` (n, n) and ``R`` (l, l).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from optid.errors import StructureError, nearest
+from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
+from optid.faults.signatures import Dictionary
+from optid.faults.whitening import Whitened
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status
+from optid.program.view import View
+from optid.solving.solve import Evidence, Procedure
+
+FORMS = ("places", "full")
+
+NOTHING = 1e-4
+"""Covariances of this many standard deviations are what interior-point methods leave of a zero."""
+
+
+def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", lags: int | None = None, onset: int = 0,
+               constraints: Sequence[Any] = ()) -> Procedure:
+    """Match the covariances of a window.
+
+    Args:
+        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
+        whitened: the window; one experiment.
+        form: "places" (non-negative variances of the candidates) or "full" (covariances of any noise).
+        lags: largest lag; None for the settling of the predictor, at most a tenth of the window.
+        onset: first sample that is used.
+        constraints: further constraints on the named variables.
+
+    Returns:
+        An `optid.faults.consistency.noise_matching.CovarianceMatch`.
+
+    Raises:
+        DataError: too few readings.
+        StructureError: words or numbers that do not fit.
+    """
+    if form not in FORMS:
+        raise StructureError(f"form={form!r}. {nearest(str(form), FORMS)}")
+    problem = covariance_problem(found, whitened, lags=lags, onset=onset)
+    pose = places_programme if form == "places" else full_programme
+    solution = yield pose(problem).subject_to(*constraints)
+    ok = solution.status in (Status.OPTIMAL, Status.LOCAL) and solution.proof
+    result = matched(problem, solution, ok)
+    bound = solution.bound or Bound(-np.inf, False, "none", solution.reason)
+    return Evidence(result, solution.objective, bound, solution.status, solution.reason, {"lags": problem.lags})
+
+
+def places_programme(problem: CovarianceProblem) -> Program:
+    """Pose the non-negative least-squares problem of the candidates."""
+    sizes = np.linalg.norm(problem.signatures, axis=0)
+    scaled, residual = cp.Variable(sizes.size, name="scaled"), cp.Variable(problem.target.size, name="residual")
+    misfit = problem.target - (problem.signatures / sizes) @ scaled
+    view = View({"rho": cp.multiply(1 / sizes, scaled)}, kind="covariance")
+    return Program(
+        "fault.noise_covariance", cp.Minimize(0.5 * cp.sum_squares(residual)),
+        {"residual": (residual == misfit,), "variances": (scaled >= 0,)}, {"scaled": scaled, "residual": residual},
+        {"scaled": np.maximum((problem.signatures / sizes).T @ problem.target, 1.0)}, dict, view,
+        structural=frozenset({"residual", "variances"}),
+        derived={"residual": misfit}, scale=0.5 * float(problem.target @ problem.target))
+
+
+def full_programme(problem: CovarianceProblem) -> Program:
+    """Pose the semidefinite programme of full covariances of the added process and sensor noise."""
+    n, l = problem.nx, problem.l  # noqa: E741
+    Q, R = cp.Variable((n, n), symmetric=True, name="Q"), cp.Variable((l, l), symmetric=True, name="R")
+    residual = cp.Variable(problem.target.size, name="residual")
+    units = np.sqrt(np.outer(problem.state_units, problem.state_units)), np.sqrt(
+        np.outer(problem.output_units, problem.output_units))
+    process, sensor = cp.multiply(units[0], Q), cp.multiply(units[1], R)
+    misfit = problem.target - problem.by_process @ cp.vec(process, order="F") - problem.by_sensor @ cp.vec(
+        sensor, order="F")
+    return Program(
+        "fault.noise_covariance full", cp.Minimize(0.5 * cp.sum_squares(residual)),
+        {"residual": (residual == misfit,), "process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)},
+        {"Q": Q, "R": R, "residual": residual}, {"Q": np.eye(n), "R": np.eye(l)}, dict,
+        View({"Q": process, "R": sensor}, kind="covariance"),
+        structural=frozenset({"residual", "process covariance", "sensor covariance"}), derived={"residual": misfit},
+        scale=0.5 * float(problem.target @ problem.target))
+
+
+def matched(problem: CovarianceProblem, solution: Solution, certified: bool) -> CovarianceMatch:
+    """Read the solution.
+
+    Args:
+        problem: the numbers.
+        solution: of either programme.
+        certified: whether it is proved.
+    """
+    rho, gains, Q, R = np.full(len(problem.labels), np.nan), np.full(len(problem.labels), np.nan), None, None
+    if solution.has_point and "scaled" in solution.values:
+        sizes = np.linalg.norm(problem.signatures, axis=0)
+        scaled = np.asarray(solution.values["scaled"])
+        scaled = np.where(scaled > NOTHING, scaled, 0.0)
+        rho, gains = scaled / sizes, scaled
+    elif solution.has_point:
+        Q = np.asarray(solution.values["Q"]) * np.sqrt(np.outer(problem.state_units, problem.state_units))
+        R = np.asarray(solution.values["R"]) * np.sqrt(np.outer(problem.output_units, problem.output_units))
+    status = "" if certified else f"{solution.status}: {solution.reason}".rstrip(": ")
+    return CovarianceMatch(problem.labels, rho, gains, Q, R, solution.objective, solution.gap, certified, problem.lags,
+                           status)

@@ -1,0 +1,147 @@
+"""Faults as a group-sparse programme: few candidates at few onsets explain the whitened innovations of a window.
+
+    min over a:   1/2 ‖r - sum Q_c,theta a_c,theta‖²  +  lambda sum sqrt(q_c) ‖a_c,theta‖
+
+Q has orthonormal columns, q is the threshold of the exact search for one fault. At lambda = 1 something is active
+exactly when that search raises an alarm: zero is optimal if and only if ‖Q' r‖² <= q for every candidate and onset.
+The sum-of-norms form is that of Ohlsson, Gustafsson, Ljung and Boyd (Automatica 48, 2012). Its magnitudes are biased
+and onsets next to one another share the work, so that the result says where to look, not what the answer is.
+
+Named variables: ``a[label]`` (onsets, d); named expressions: ``size[label]`` (onsets, d), in the units of the fault.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.faults.group_bound import certify
+from optid.errors import StructureError
+from optid.faults.search.atoms import Atoms, atoms_of
+from optid.faults.search.calibration import Thresholds
+from optid.faults.search.scanning import Scan
+from optid.faults.search.sparse import ActiveGroup, SparseResult
+from optid.program.program import GroupForm, Program
+from optid.program.solution import Bound, Solution, Status
+from optid.program.view import View
+from optid.solving.solve import Evidence, Procedure
+from optid.structures.group_sparse import GroupProblem
+
+
+def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constraints: Sequence[Any] = ()) -> Procedure:
+    """Estimate the signatures of several faults at once.
+
+    Args:
+        found: the search of the window.
+        limits: its thresholds.
+        penalty: lambda.
+        constraints: further constraints on ``a[label]`` and ``size[label]``.
+
+    Returns:
+        An `optid.faults.search.sparse.SparseResult`.
+
+    Raises:
+        StructureError: a penalty that is not positive, thresholds that do not fit, a window that is too long.
+    """
+    atoms = atoms_of(found, limits)
+    program = signature_programme(atoms, found.whitened.r.ravel(), penalty).subject_to(*constraints)
+    solution = yield program
+    result = sparse_result(program, solution, atoms, len(found.whitened.r))
+    none = Bound(-np.inf, False, "none", solution.reason)
+    return Evidence(result, solution.objective, solution.bound or none, solution.status, solution.reason,
+                    {"groups active": len(result.active), "clusters": len(result.clusters),
+                     "relative gap": result.gap, "smallest penalty without a fault": result.largest})
+
+
+def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 1.0) -> Program:
+    """Pose the programme.
+
+    Args:
+        atoms: of every candidate.
+        r: (N l,) the window.
+        penalty: lambda.
+
+    Raises:
+        StructureError: a penalty that is not positive, or nothing to look for.
+    """
+    if not (np.isfinite(penalty) and penalty > 0):
+        raise StructureError(f"penalty={penalty!r}; a positive number is needed.")
+    if not atoms:
+        raise StructureError("No candidate is tested at any onset: there is nothing to look for.")
+    level = cp.Parameter(nonneg=True, name="lambda", value=penalty)
+    variables = {f"a[{atom.label}]": cp.Variable((atom.onsets.size, atom.dimension), name=f"a[{atom.label}]")
+                 for atom in atoms}
+    designs = [np.moveaxis(atom.axes, 1, 0).reshape(r.size, -1) for atom in atoms]
+    fit: Any = sum(design @ cp.vec(a, order="C") for design, a in zip(designs, variables.values()))
+    norms: Any = sum(np.sqrt(atom.threshold) * _lengths(a) for atom, a in zip(atoms, variables.values()))
+    edges = np.concatenate([[0], np.cumsum(np.concatenate([[a.dimension] * a.onsets.size for a in atoms]))])
+    weights = np.concatenate([np.full(atom.onsets.size, np.sqrt(atom.threshold)) for atom in atoms])
+    form = GroupForm(GroupProblem(np.hstack(designs), r, edges, weights),
+                     {name: a.shape for name, a in variables.items()})
+    residual, misfit = cp.Variable(r.size, name="residual"), r - fit
+    sizes = {f"size[{atom.label}]": _sizes(atom, a) for atom, a in zip(atoms, variables.values())}
+    return Program(
+        "fault.signature", cp.Minimize(0.5 * cp.sum_squares(residual) + level * norms),
+        {"residual": (residual == misfit,)}, {**variables, "residual": residual},
+        {name: _alone(atom, r) for name, atom in zip(variables, atoms)}, dict,
+        View({**variables, **sizes}, kind="signature"),
+        structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, group=form,
+        certify=partial(certify), scale=0.5 * float(r @ r))
+
+
+def _alone(atom: Atoms, r: np.ndarray) -> np.ndarray:
+    """What every candidate would be if it were alone, at its best onset: a start, and the size that is usual."""
+    along = np.einsum("tkd,k->td", atom.axes, r)
+    best = int(np.argmax(np.sum(along**2, axis=1)))
+    start = np.zeros_like(along)
+    start[best] = along[best]
+    return start
+
+
+def _lengths(a: cp.Variable) -> Any:
+    return cp.norm1(a) if a.shape[1] == 1 else cp.sum(cp.norm(a, 2, axis=1))
+
+
+def _sizes(atom: Atoms, a: cp.Variable) -> Any:
+    """Magnitudes (T, d) as an expression: size[t] = back[t] a[t]."""
+    ones = np.ones((1, atom.dimension))
+    return sum(cp.multiply(atom.back[:, :, j], a[:, [j]] @ ones) for j in range(atom.dimension))
+
+
+def sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], count: int) -> SparseResult:
+    """Read the solution; groups that rounding has left of zeros are zeros.
+
+    Args:
+        program: that of `signature_programme`, constrained or not.
+        solution: its solution.
+        atoms: as there.
+        count: samples of the window.
+    """
+    form = program.group
+    assert form is not None
+    problem, penalty = form.problem, float(np.asarray(program.parameters["lambda"].value))
+    free = not program.user_constraints
+    certified = bool(solution.has_point and solution.proof and solution.status in (Status.OPTIMAL, Status.LOCAL))
+    zero = np.zeros(problem.weights.size, dtype=bool)
+    point = solution.bound.multipliers if solution.bound is not None else None
+    if certified and free and point is not None and solution.bound is not None:
+        zero = problem.certainly_zero(point, solution.objective - solution.bound.value, penalty)
+    active: list[ActiveGroup] = []
+    masks = {atom.label: np.zeros(count, dtype=bool) for atom in atoms}
+    norms = problem.norms(form.flat(solution.values)) if solution.has_point else np.zeros(problem.weights.size)
+    floor = 1e-6 * max(float(norms.max()), float(np.sqrt(2 * program.scale)) * 1e-3)
+    first = 0
+    for atom in atoms:
+        here = slice(first, first + atom.onsets.size)
+        masks[atom.label][atom.onsets] = zero[here]
+        for t in np.flatnonzero((norms[here] > floor) & ~zero[here]):
+            size = atom.back[t] @ np.asarray(solution.values[f"a[{atom.label}]"])[t]
+            active.append(ActiveGroup(atom.label, int(atom.onsets[t]), size, float(norms[here][t])))
+        first += atom.onsets.size
+    active.sort(key=lambda group: -group.deflection)
+    return SparseResult(tuple(active), count, solution.objective,
+                        -np.inf if solution.bound is None else solution.bound.value, solution.gap, certified,
+                        problem.largest(), penalty, masks, f"{solution.status}: {solution.reason}".rstrip(": "),
+                        solution.solver, tuple(program.user_constraints))

@@ -1,0 +1,185 @@
+"""Intake of arrays: what the caller passes becomes a read-only, time-first float64 copy, or a named error."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.errors import DataError, DataWarning
+
+Array = NDArray[np.floating]
+
+EXACT_INTEGER = 2**53
+"""Largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)."""
+
+LARGEST = 1e150
+"""Largest magnitude accepted: beyond it squares overflow, and no sensor reads it (it is a marker of lost samples)."""
+
+WRAP = 0.75
+"""A step between neighbours above this share of an integer type's range looks like a wrap-around."""
+
+
+def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np.ndarray:
+    """Copy one record of a signal into a read-only float64 array with time along the first axis.
+
+    Args:
+        values: (N,) or (N, channels) numbers, any real numeric type; NaN (or a masked entry) means missing.
+        what: the argument's name, for messages ("u", "experiment 2 of y").
+        names: channel names for messages, where they are known already.
+
+    Returns:
+        (N, channels) float64, C order, not writeable, independent of the caller's memory.
+
+    Raises:
+        DataError: not numbers, infinite, empty, more than two axes, more channels than samples (transposed), or
+            integers that float64 cannot hold.
+
+    Warns:
+        DataWarning: integer samples at the limit of their type, or steps that look like a wrap-around.
+    """
+    array = _as_numbers(values, what)
+    if array.ndim == 1:
+        array = array[:, None]
+    _check_shape(array, what)
+    labels = [f"{what}, channel {name!r}" for name in names] if names and len(names) == array.shape[1] else None
+    labels = labels or ([what] if array.shape[1] == 1 else [f"{what}, channel {c + 1}" for c in range(array.shape[1])])
+    if array.dtype.kind in "iu":
+        check_integers(array, labels)
+    with np.errstate(over="ignore"):
+        samples = np.array(array, dtype=np.float64, order="C")
+    check_finite(samples, labels)
+    samples.flags.writeable = False
+    return samples
+
+
+def is_scalar_list(values: Any) -> bool:
+    """Tell one record written as a list of numbers from a list of records (one array per experiment).
+
+    Raises:
+        DataError: a nested list, which could mean either.
+    """
+    if not isinstance(values, list | tuple):
+        return True
+    kinds = {_kind(item) for item in values}
+    if kinds <= {"number"}:
+        return True
+    if kinds == {"array"}:
+        return False
+    raise DataError(
+        "a list may hold the numbers of one record, or one array per experiment; this one is nested or mixed. "
+        "Wrap each record in numpy.asarray(...)."
+    )
+
+
+def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> None:
+    """Refuse infinite and absurdly large samples; NaN passes, it means missing.
+
+    Args:
+        samples: (N, channels) float64.
+        labels: one text per channel for the message.
+        first: index of the first sample in the whole record, for chunked sources.
+
+    Raises:
+        DataError: names the channel and the sample.
+    """
+    # One fused pass decides the usual case; NaN makes both comparisons false and is accepted.
+    if not (np.fmax.reduce(samples, axis=None) > LARGEST or np.fmin.reduce(samples, axis=None) < -LARGEST):
+        return
+    k, c = np.argwhere(np.abs(samples) > LARGEST)[0]
+    raise DataError(
+        f"{labels[c]}: sample {first + k} is {samples[k, c]:g}. "
+        "Write NaN where a sample is missing, or remove the fault that produced it."
+    )
+
+
+def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
+    """Refuse integers that float64 cannot hold; warn about signs of saturation and of wrap-around.
+
+    Args:
+        array: (N, channels) of an integer type.
+        labels: one text per channel for the message.
+        first: index of the first sample in the whole record, for chunked sources.
+        limits: look for saturation and wrap-around too.
+
+    Raises:
+        DataError: a magnitude above 2**53, named by channel and sample.
+
+    Warns:
+        DataWarning: samples at the limits of the type, or steps above three quarters of its range.
+    """
+    info = np.iinfo(array.dtype)
+    for column, label in zip(array.T, labels):
+        lo, hi = int(column.min()), int(column.max())
+        if max(hi, -lo) > EXACT_INTEGER:
+            k = int(np.argmax((column > EXACT_INTEGER) | (column < -EXACT_INTEGER)))
+            raise DataError(
+                f"{label}: sample {first + k} is {column[k]} ({array.dtype}), beyond 2**53, so its digits would be "
+                "lost. A negative number stored in an unsigned type looks like this; subtract the offset or rescale "
+                "before passing the record."
+            )
+        if limits and (hi == info.max or (info.min < 0 and lo == info.min)):
+            _warn_at_limit(column, label, info)
+        elif limits and hi - lo > WRAP * (int(info.max) - int(info.min)):
+            _warn_if_wrapped(column, label, info)
+
+
+def _warn_at_limit(column: np.ndarray, label: str, info: np.iinfo) -> None:
+    at_limit = (column == info.max) | ((column == info.min) & (info.min < 0))
+    warnings.warn(
+        f"{label}: {int(at_limit.sum())} sample(s) at the limits of {info.dtype} "
+        f"(first at sample {int(np.argmax(at_limit))}): the values are saturated or have overflowed. "
+        "Convert to float before any arithmetic, and set saturated samples to NaN.",
+        DataWarning,
+        stacklevel=5,
+    )
+
+
+def _warn_if_wrapped(column: np.ndarray, label: str, info: np.iinfo) -> None:
+    steps = np.abs(np.diff(column.astype(np.float64)))
+    wrapped = steps > WRAP * (float(info.max) - float(info.min))
+    if wrapped.any():
+        warnings.warn(
+            f"{label}: {int(wrapped.sum())} step(s) above {WRAP:.0%} of the range of {info.dtype} "
+            f"(first at sample {int(np.argmax(wrapped)) + 1}): the values may have wrapped around. "
+            "Convert to float before any arithmetic.",
+            DataWarning,
+            stacklevel=5,
+        )
+
+
+def _kind(item: Any) -> str:
+    if hasattr(item, "ndim") or hasattr(item, "__array__"):
+        return "array" if np.ndim(item) else "number"
+    return "nested" if isinstance(item, list | tuple) else "number"
+
+
+def _as_numbers(values: Any, what: str) -> np.ndarray:
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise DataError(f"{what}: the rows have different lengths; pass a rectangular array.") from error
+    if array.dtype.kind not in "iuf":
+        kind = {"b": "truth values", "c": "complex numbers", "O": "objects", "U": "text", "S": "text",
+                "M": "dates", "m": "time differences"}.get(array.dtype.kind, "not numbers")
+        raise DataError(
+            f"{what}: the samples are {kind} (dtype {array.dtype}), real numbers are needed. "
+            "Convert with numpy.asarray(x, dtype=float), with NaN where a sample is missing."
+        )
+    return array
+
+
+def _check_shape(array: np.ndarray, what: str) -> None:
+    if array.ndim != 2:
+        raise DataError(f"{what} has shape {array.shape}; (samples,) or (samples, channels) is needed.")
+    rows, channels = array.shape
+    if array.size == 0:
+        raise DataError(f"{what} is empty (shape {array.shape}); at least one sample of one channel is needed.")
+    if channels > rows:
+        raise DataError(
+            f"{what} has shape {array.shape}: {channels} channels but only {rows} sample(s). "
+            "Time runs along the first axis; pass the transpose (x.T) if the array is channels by samples."
+        )

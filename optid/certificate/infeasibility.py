@@ -1,0 +1,92 @@
+"""Explain an infeasible set of constraints by a smallest conflicting subset, in the user's names."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import cvxpy as cp
+
+from optid.certificate.lifting import lift_exact, places
+from optid.program.gradients import flat_value, jacobians
+from optid.program.limits import EQUALITIES
+from optid.program.program import Program
+
+
+def explain(program: Program) -> str:
+    """Return a sentence that lists a conflicting subset of the user's constraints.
+
+    The subset is irreducible: without any one of its members the rest can be satisfied (deletion filter, Chinneck
+    and Dravnieks 1991). Constraints that are neither convex nor linear in ``mu bᵀ`` take part through their
+    linearisation at the start, and the sentence says so.
+    """
+    names = list(program.user_constraints)
+    stand_in = {} if program.rank_one is None else places(program, program.rank_one).stand_in
+    linearised = [name for name in names
+                  if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
+    conflict = conflicting_subset(program)
+    if conflict is None:
+        return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(names) or 'none'}) can be "
+                "satisfied together; try another solver (optid solvers)")
+    if len(conflict) == 1:
+        text = f"constraint {conflict[0]!r} cannot be satisfied by any model of this structure; relax it or drop it"
+    else:
+        text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
+                "relax or drop one of them (each subset without one of them can be satisfied)")
+    used = [name for name in linearised if name in conflict]
+    return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")
+
+
+def conflicting_subset(program: Program) -> list[str] | None:
+    """Return the names of an irreducible infeasible subset, or None where all can be satisfied together.
+
+    What can be satisfied is judged on a convex outer approximation, so that a subset returned is a contradiction
+    indeed: bilinear constraints are read as constraints on the matrices ``mu bᵀ``.
+    """
+    kept = list(program.user_constraints)
+    if satisfiable(program, kept):
+        return None
+    for name in list(kept):
+        trial = [other for other in kept if other != name]
+        if not satisfiable(program, trial):
+            kept = trial
+    return kept
+
+
+def satisfiable(program: Program, names: Sequence[str]) -> bool:
+    """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
+    form = program.rank_one
+    # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
+    found = [c for name in program.structural for c in program.constraints[name] if c.is_dcp()]
+    where = None if form is None else places(program, form)
+    if program.start:
+        program.assign(program.start)
+    for member in (c for name in names for c in program.constraints[name]):
+        copy = member if where is None else member.tree_copy(where.stand_in)
+        found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
+    if form is not None and where is not None:
+        lifted = lift_exact(program.without(*(set(program.user_constraints) - set(names))), form)
+        lifted.rows, lifted.right, lifted.equality = [], [], []  # these are there already
+        lifted.add_products(form.problem)
+        rows = lifted.linear()
+        if rows is not None:
+            thetas = [cp.vec(theta, order="F") for theta in where.stand_in.values()]
+            found.append(rows[0][:, form.problem.linear :] @ cp.hstack(thetas) <= rows[1])
+    if not found:
+        return True
+    problem = cp.Problem(cp.Minimize(0), found)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an inaccurate proof of a conflict is one as well
+        problem.solve(solver=cp.CLARABEL)
+    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+
+
+def _linearised(member: Any) -> Any:
+    expression, slopes = member.expr, jacobians(member.expr)
+    if slopes is None:  # nothing is known of it, so it cannot be blamed
+        return cp.Constant(0.0) <= 0
+    linear: Any = flat_value(expression)
+    for variable, slope in slopes.items():
+        flat = variable if variable.ndim == 1 else cp.vec(variable, order="F")
+        linear = linear + slope @ (flat - flat_value(variable))
+    equal = isinstance(member, EQUALITIES)
+    return linear == 0 if equal else linear <= 0

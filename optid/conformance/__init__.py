@@ -1,0 +1,1 @@
+"""Conformance of back ends and formulations."""

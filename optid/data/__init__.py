@@ -1,0 +1,1 @@
+"""Records of inputs and outputs: in memory, from files, in chunks."""

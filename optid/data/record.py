@@ -1,0 +1,390 @@
+"""Records of inputs and outputs: one or several experiments with names, units and a sampling time."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import as_samples, is_scalar_list
+from optid.data import preprocessing
+from optid.data.channels import Channel, Transform, channel_names, channel_units, check_distinct, listed, sampling_time
+from optid.errors import DataError, nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One uninterrupted record.
+
+    Attributes:
+        u: (N, m) inputs, float64, read-only; NaN = missing.
+        y: (N, l) outputs, float64, read-only; NaN = missing.
+        start: time of the first sample.
+    """
+
+    u: np.ndarray
+    y: np.ndarray
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.u.shape[0] != self.y.shape[0]:
+            raise DataError(
+                f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. "
+                "Cut both to the samples that were recorded together, or fill the lost ones with NaN."
+            )
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples N."""
+        return self.u.shape[0]
+
+
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class Data:
+    """Inputs and outputs of one or several experiments, sampled every dt.
+
+    Attributes:
+        experiments: the records, each with read-only arrays u (N, m) and y (N, l).
+        dt: sampling time, in the user's unit of time (seconds where units matter).
+        inputs: names of the m inputs.
+        outputs: names of the l outputs.
+        input_units: their units, "" where unknown.
+        output_units: their units, "" where unknown.
+        name: name of the data set.
+        transform: how to return to raw units; identity unless `detrend` or `scale` was used.
+    """
+
+    experiments: tuple[Experiment, ...]
+    dt: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    name: str
+    transform: Transform = field(repr=False)
+
+    def __init__(
+        self,
+        u: Any,
+        y: Any,
+        dt: float = 1.0,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        input_units: str | Sequence[str] | None = None,
+        output_units: str | Sequence[str] | None = None,
+        name: str = "",
+        start: float | Sequence[float] = 0.0,
+    ) -> None:
+        """Copy and check the record.
+
+        Args:
+            u: (N,) or (N, m), or a list of such arrays, one per experiment; NaN = missing.
+            y: (N,) or (N, l), or a list of as many arrays; NaN = missing.
+            dt: sampling time, positive.
+            inputs: names of the inputs; u, or u1, u2, ... when not given.
+            outputs: names of the outputs; y, or y1, y2, ... when not given.
+            input_units: one unit per input.
+            output_units: one unit per output.
+            name: name of the data set, for reports.
+            start: time of the first sample, one for all experiments or one for each.
+
+        Raises:
+            DataError: wrong shape or type, infinite sample, different lengths, wrong number of names; the message
+                names the channel and the sample.
+
+        Warns:
+            DataWarning: integer samples that look saturated or wrapped around.
+        """
+        us = _as_records(u, "u", listed(inputs))
+        ys = _as_records(y, "y", listed(outputs))
+        if len(us) != len(ys):
+            raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
+        starts = np.atleast_1d(np.asarray(start, dtype=float))
+        if starts.shape not in ((1,), (len(us),)) or not np.isfinite(starts).all():
+            raise DataError(f"start = {start!r}: one finite time, or one for each of the {len(us)} experiments.")
+        experiments = []
+        for k, (ue, ye, s) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)))):
+            try:
+                experiments.append(Experiment(ue, ye, float(s)))
+            except DataError as error:
+                raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
+        m, l = us[0].shape[1], ys[0].shape[1]  # noqa: E741
+        input_names, output_names = channel_names(inputs, "u", m, "inputs"), channel_names(outputs, "y", l, "outputs")
+        check_distinct(input_names + output_names)
+        _filled(
+            self,
+            experiments=tuple(experiments),
+            dt=sampling_time(dt),
+            inputs=input_names,
+            outputs=output_names,
+            input_units=channel_units(input_units, m, "input_units"),
+            output_units=channel_units(output_units, l, "output_units"),
+            name=str(name),
+            transform=Transform.identity(m, l),
+        )
+        self._check_present()
+
+    def _check_present(self) -> None:
+        for channel, share in self.missing.items():
+            if share == 1.0:
+                raise DataError(f"channel {channel!r}: every sample is missing. Check the column, or leave it out.")
+
+    # -- sizes and arrays ---------------------------------------------------------------------------------------
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples of all experiments together."""
+        return sum(e.n_samples for e in self.experiments)
+
+    @property
+    def n_experiments(self) -> int:
+        """Number of experiments."""
+        return len(self.experiments)
+
+    @property
+    def u(self) -> Any:
+        """Inputs (N, m), or a tuple of such arrays when there are several experiments."""
+        return _one_or_all([e.u for e in self.experiments])
+
+    @property
+    def y(self) -> Any:
+        """Outputs (N, l), or a tuple of such arrays when there are several experiments."""
+        return _one_or_all([e.y for e in self.experiments])
+
+    @property
+    def time(self) -> Any:
+        """Sampling instants (N,), or a tuple of such arrays when there are several experiments."""
+        return _one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
+
+    # -- what the data look like ---------------------------------------------------------------------------------
+
+    @cached_property
+    def missing(self) -> dict[str, float]:
+        """Share of missing samples of each channel, 0 to 1."""
+        lost = np.zeros(self.m + self.l)
+        for e in self.experiments:
+            for samples, columns in ((e.u, slice(0, self.m)), (e.y, slice(self.m, None))):
+                nan = np.isnan(samples)
+                if nan.any():  # a long record without gaps is told at once
+                    lost[columns] += nan.sum(axis=0)
+        return dict(zip(self.inputs + self.outputs, (lost / self.n_samples).tolist()))
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:
+        """Range, mean, standard deviation, distinct values and missing share of each channel, inputs first."""
+        units = self.input_units + self.output_units
+        summaries = []
+        for c, (name, unit) in enumerate(zip(self.inputs + self.outputs, units)):
+            x = np.concatenate([e.u[:, c] if c < self.m else e.y[:, c - self.m] for e in self.experiments])
+            summaries.append(Channel.of(x, name, unit, "input" if c < self.m else "output"))
+        return tuple(summaries)
+
+    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest sample of every input, (m,) each; NaN where every sample is missing."""
+        low, high = np.full(self.m, np.nan), np.full(self.m, np.nan)
+        for e in self.experiments:
+            if e.n_samples:
+                channels = np.ascontiguousarray(e.u.T)  # the reduction of long rows is compiled for it
+                low = np.fmin(low, np.fmin.reduce(channels, axis=1))
+                high = np.fmax(high, np.fmax.reduce(channels, axis=1))
+        return low, high
+
+    def __repr__(self) -> str:
+        runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
+        title = f"Data {self.name!r}: " if self.name else "Data: "
+        lines = [f"{title}{runs}{self.n_samples} samples, dt = {self.dt:g}"]
+        labels = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.channels]
+        width = max(map(len, labels))
+        for c, label in zip(self.channels, labels):
+            levels = f", {c.levels} levels" if c.levels <= 20 else ""
+            missing = f", {c.missing:.2%} missing" if c.missing else ""
+            lines.append(f"  {c.role:<6} {label:<{width}}  {c.low:.4g} to {c.high:.4g}{levels}{missing}")
+        if not self.transform.is_identity:
+            lines.append("  detrended or scaled; reports are in raw units")
+        return "\n".join(lines)
+
+    # -- parts -----------------------------------------------------------------------------------------------------
+
+    def split(self, at: float | int) -> tuple["Data", "Data"]:
+        """Cut every experiment in two, for estimation and validation.
+
+        Args:
+            at: a float in (0, 1) is the share of the samples of each experiment that goes to the first part; an int
+                is a number of samples.
+
+        Raises:
+            DataError: a part would be empty.
+        """
+        if isinstance(at, bool | np.bool_) or not isinstance(at, int | float | np.integer | np.floating):
+            raise DataError(f"split at {at!r}: a share such as 0.7 or a number of samples is needed.")
+        whole = isinstance(at, int | np.integer)
+        if not whole and not 0 < at < 1:
+            raise DataError(f"split at {at}: a share lies between 0 and 1; write int({at}) for a number of samples.")
+        cuts = [int(at) if whole else round(float(at) * e.n_samples) for e in self.experiments]
+        for k, (cut, e) in enumerate(zip(cuts, self.experiments)):
+            if not 0 < cut < e.n_samples:
+                raise DataError(
+                    f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
+                )
+        first = [self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts)]
+        second = [self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts)]
+        return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
+
+    def window(self, first: int, last: int) -> "Data":
+        """Return samples first to last - 1 of every experiment.
+
+        Raises:
+            DataError: the window does not lie inside an experiment.
+        """
+        for k, e in enumerate(self.experiments):
+            if not 0 <= first < last <= e.n_samples:
+                raise DataError(f"window {first}:{last} is not inside experiment {k + 1} of {e.n_samples} samples.")
+        return self._with(experiments=tuple(self._cut(e, first, last) for e in self.experiments))
+
+    def select(
+        self,
+        inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None,
+        experiments: int | Sequence[int] | None = None,
+    ) -> "Data":
+        """Keep some channels and some experiments, in the order given.
+
+        Args:
+            inputs: names of inputs; all when not given.
+            outputs: names of outputs; all when not given.
+            experiments: indices of experiments, from 0; all when not given.
+
+        Raises:
+            DataError: unknown name (the nearest is named) or index.
+        """
+        i = _positions(inputs, self.inputs, "input")
+        o = _positions(outputs, self.outputs, "output")
+        picked = range(self.n_experiments) if experiments is None else np.atleast_1d(experiments).tolist()
+        for k in picked:
+            if not 0 <= k < self.n_experiments:
+                raise DataError(f"experiment {k} does not exist; there are {self.n_experiments}, counted from 0.")
+        if not (i and o and len(picked)):
+            raise DataError("select leaves no input, no output or no experiment; name at least one of each.")
+        kept = [self.experiments[k] for k in picked]
+        t = self.transform
+        return self._with(
+            experiments=tuple(Experiment(_frozen(e.u[:, i]), _frozen(e.y[:, o]), e.start) for e in kept),
+            inputs=_take(self.inputs, i),
+            outputs=_take(self.outputs, o),
+            input_units=_take(self.input_units, i),
+            output_units=_take(self.output_units, o),
+            transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
+        )
+
+    @staticmethod
+    def join(*parts: "Data") -> "Data":
+        """Return the experiments of several data sets as one data set.
+
+        Raises:
+            DataError: names, units, sampling times or transforms differ.
+        """
+        if not parts:
+            raise DataError("join needs at least one data set.")
+        head = parts[0]
+        for k, part in enumerate(parts[1:], start=2):
+            for what in ("inputs", "outputs", "input_units", "output_units"):
+                if getattr(part, what) != getattr(head, what):
+                    raise DataError(
+                        f"data set {k} has {what} {getattr(part, what)}, the first has {getattr(head, what)}; "
+                        "give them the same names and units, or use select."
+                    )
+            if abs(part.dt - head.dt) > 1e-9 * head.dt:
+                raise DataError(f"data set {k} has dt {part.dt:g}, the first has {head.dt:g}; decimate the faster one.")
+            if part.transform != head.transform:
+                raise DataError(f"data set {k} was detrended or scaled differently; join first, or call raw() on both.")
+        return head._with(experiments=tuple(e for part in parts for e in part.experiments))
+
+    # -- changes of the samples --------------------------------------------------------------------------------------
+
+    def detrend(self, order: int = 0) -> "Data":
+        """Subtract the means (order 0), and a drift of the outputs too (order 1): `preprocessing.detrend`."""
+        return preprocessing.detrend(self, order)
+
+    def scale(self, factors: Mapping[str, float] | None = None) -> "Data":
+        """Divide by the standard deviations or by the factors given: `preprocessing.scale`."""
+        return preprocessing.scale(self, factors)
+
+    def decimate(self, q: int) -> "Data":
+        """Low-pass with zero phase and keep every q-th sample: `preprocessing.decimate`."""
+        return preprocessing.decimate(self, q)
+
+    def raw(self) -> "Data":
+        """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
+        return self.mapped(
+            self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l)
+        )
+
+    def without_transform(self) -> "Data":
+        """Return the same samples without the way back to raw units."""
+        return self._with(transform=Transform.identity(self.m, self.l))
+
+    def mapped(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
+        """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y).
+
+        Args:
+            of_u: function from (N, m) to (n, m); must not change its argument.
+            of_y: function from (N, l) to (n, l); must not change its argument.
+            changes: further fields to replace, such as dt or transform.
+        """
+        experiments = tuple(Experiment(_frozen(of_u(e.u)), _frozen(of_y(e.y)), e.start) for e in self.experiments)
+        return self._with(experiments=experiments, **changes)
+
+    def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
+        return Experiment(e.u[first:last], e.y[first:last], e.start + first * self.dt)
+
+    def _with(self, **changes: Any) -> "Data":
+        return _filled(object.__new__(Data), **{f.name: getattr(self, f.name) for f in fields(self)} | changes)
+
+
+def _filled(data: Data, **values: Any) -> Data:
+    for name, value in values.items():
+        object.__setattr__(data, name, value)
+    return data
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
+def _as_records(values: Any, what: str, names: Sequence[str] | None) -> list[np.ndarray]:
+    if is_scalar_list(values):
+        return [as_samples(values, what, names)]
+    records = [as_samples(item, f"{what} of experiment {k + 1}", names) for k, item in enumerate(values)]
+    widths = {r.shape[1] for r in records}
+    if len(widths) > 1:
+        raise DataError(f"{what}: the experiments have {sorted(widths)} channels; each needs the same channels.")
+    return records
+
+
+def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:
+    wanted = list(known) if wanted is None else listed(wanted)
+    for name in wanted or ():
+        if name not in known:
+            raise DataError(f"no {what} {name!r}. {nearest(name, known)}")
+    return [known.index(name) for name in wanted or ()]
+
+
+def _take(values: tuple, positions: Sequence[int]) -> tuple:
+    return tuple(values[p] for p in positions)
+
+
+def _one_or_all(arrays: list[np.ndarray]) -> np.ndarray | tuple[np.ndarray, ...]:
+    return arrays[0] if len(arrays) == 1 else tuple(arrays)

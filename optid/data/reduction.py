@@ -1,0 +1,93 @@
+"""Reduce the parts of a record to one result: on the threads of this machine, or as a tree of tasks on a Dask cluster.
+
+The tree is fixed by the parts alone, not by who is done first: the result is the same to the last digit on one thread
+and on any number of workers, also when some of them die and their parts are read again elsewhere.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from optid.data.reading.parts import Part
+from optid.data.workers import mapped
+
+Result = TypeVar("Result")
+
+FAN_IN = 8
+"""Results that one task merges."""
+
+
+def reduced(
+    parts: Sequence[Part],
+    leaf: Callable[[Part], Result],
+    merge: Callable[[Sequence[Result]], Result],
+    scheduler: Any = None,
+    threads: int = 1,
+) -> Result:
+    """Return the merged results of all parts.
+
+    Args:
+        parts: at least one, in order.
+        leaf: what is made of a part; it travels to the workers.
+        merge: what is made of at most `FAN_IN` results that are neighbours, in order; it must not change them.
+        scheduler: address of a Dask scheduler, a `distributed.Client`, or None for this machine, where the partitions
+            of Dask collections are computed by Dask's current scheduler.
+        threads: threads that read parts on this machine.
+
+    Raises:
+        ClusterError: the cluster cannot be used.
+    """
+    if scheduler is None and all(part.content is None for part in parts):
+        return _streamed(mapped(leaf, parts, threads), merge)
+    from dask.delayed import delayed
+
+    task, join = delayed(_of_part, pure=False), delayed(merge, pure=False)
+    level = [task(leaf, _with_content(part, None), part.content) for part in parts]
+    while len(level) > 1:
+        level = [join(level[i : i + FAN_IN]) for i in range(0, len(level), FAN_IN)]
+    return _computed(level[0], scheduler)
+
+
+def fetched(part: Part, scheduler: Any = None) -> Part:
+    """Return a part whose content is here: what Dask is to compute is computed."""
+    return part if part.content is None else _with_content(part, _computed(part.content, scheduler))
+
+
+def _computed(task: Any, scheduler: Any) -> Any:
+    if scheduler is None:
+        from dask.base import compute
+
+        return compute(task)[0]
+    from optid.data.clusters import connected, result_of
+
+    with connected(scheduler) as client:
+        return result_of(client, task)
+
+
+def _streamed(results: Iterable[Result], merge: Callable[[Sequence[Result]], Result]) -> Result:
+    """Merge by the same tree with at most `FAN_IN` results of each level in memory."""
+    levels: list[list[Result]] = [[]]
+    for result in results:
+        levels[0].append(result)
+        for depth, level in enumerate(levels):
+            if len(level) < FAN_IN:
+                break
+            if depth + 1 == len(levels):
+                levels.append([])
+            levels[depth + 1].append(merge(level))
+            level.clear()
+    for level, above in zip(levels, levels[1:]):
+        if level:
+            above.append(merge(level))
+    top = levels[-1]
+    while len(top) > 1:
+        top = [merge(top[i : i + FAN_IN]) for i in range(0, len(top), FAN_IN)]
+    return top[0]
+
+
+def _of_part(leaf: Callable[[Part], Any], part: Part, content: Any) -> Any:
+    return leaf(_with_content(part, content))
+
+
+def _with_content(part: Part, content: Any) -> Part:
+    return part if content is part.content else replace(part, content=content)

@@ -1,0 +1,291 @@
+"""Records larger than memory: files, folders and Dask collections read chunk by chunk, again on every pass."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from optid.data.channels import Transform, channel_names, channel_units, check_distinct, sampling_time
+from optid.data.reading.chunks import Channels, Chunk
+from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
+from optid.data.reading.parts import Part
+from optid.data.reading.sources import Source, open_source
+from optid.data.reading.survey import Survey, joined, surveyed, widened
+from optid.data.reduction import fetched, reduced
+from optid.data.workers import available_threads
+from optid.errors import DataError
+
+CHUNK = 131072
+"""Samples read at a time: two channels of float64 fit into the second-level cache of a common processor."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A record that is read chunk by chunk; every iteration is a new pass.
+
+    Iterating yields (u (n, m), y (n, l)), float64, in time order; NaN = missing. An infinite sample raises a
+    `DataError` that names the channel and the sample when its chunk is reached.
+
+    Attributes:
+        inputs: names of the m inputs.
+        outputs: names of the l outputs.
+        dt: sampling time.
+        input_units: their units, "" where unknown.
+        output_units: their units, "" where unknown.
+        name: name of the data set.
+        n_samples: number of samples, None where only a pass can tell (CSV, Dask data frames).
+        parts: what can be read apart, in order; empty where the record is one experiment that is read from its
+            beginning to its end.
+        scheduler: the Dask cluster that reads the parts; None for this machine.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    dt: float
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    name: str
+    n_samples: int | None
+    _channels: Channels = field(repr=False, compare=False)
+    _whole: Source = field(repr=False, compare=False)
+    parts: tuple[Part, ...] = field(default=(), repr=False)
+    scheduler: Any = field(default=None, repr=False)
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        if not self.parts:
+            return _not_empty(self._channels.read(self._whole), self._whole.label)
+        if self.n_experiments > 1:
+            raise DataError(f"this stream has {self.n_experiments} experiments; one at a time can be read in order.")
+        return _not_empty(self._in_order(), self.name)
+
+    def _in_order(self) -> Iterator[Chunk]:
+        """Chunks of all parts of the one experiment; the clock must run on from each part to the next."""
+        last, before = None, ""
+        for part in self.parts:
+            begun = False
+            for u, y, stamps in self._channels.read(fetched(part, self.scheduler)):
+                if stamps is not None and stamps.size:
+                    if last is not None and not begun:
+                        self._channels.check_border(last, before, stamps[:1], part.label)
+                    begun, last, before = True, stamps[-1:].copy(), part.label
+                yield u, y, stamps
+
+    @property
+    def n_experiments(self) -> int:
+        """Number of experiments."""
+        return self.parts[-1].experiment + 1 if self.parts else 1
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def transform(self) -> Transform:
+        """Identity: a stream is in raw units."""
+        return Transform.identity(self.m, self.l)
+
+    def in_units(self, units: Transform) -> "Stream":
+        """Return the same record in other units: ``raw = value * scale + offset`` with the raw values of this one."""
+        found = replace(self, _channels=replace(self._channels, units=units))
+        if "_survey" in self.__dict__:  # counting its samples once is enough
+            found.__dict__["_survey"] = self._survey
+        return found
+
+    def first_chunk(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (u, y) of the first chunk in which every output has a sample; of the last one where none has."""
+        source = fetched(self.parts[0], self.scheduler) if self.parts else self._whole
+        found = np.empty((0, self.m)), np.empty((0, self.l))
+        for u, y, _ in self._channels.read(source):
+            found = u, y
+            if not np.isnan(y).all(axis=0).any():
+                break
+        return found
+
+    def reduced(
+        self,
+        leaf: Callable[[Part, Iterable[Chunk]], Result],
+        merge: Callable[[Sequence[Result]], Result],
+        threads: int = 1,
+    ) -> Result:
+        """Reduce the parts to one result, each where it is read; see `optid.data.reduction.reduced`.
+
+        Args:
+            leaf: what is made of a part and the chunks that are read from it.
+            merge: what is made of results that are neighbours.
+            threads: threads that read parts on this machine.
+        """
+        return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Samples of each experiment; a pass is made where only that can tell."""
+        if not self.parts:
+            return (sum(len(u) for u, _ in self) if self.n_samples is None else self.n_samples,)
+        totals = [0] * self.n_experiments
+        for part in self.parts:
+            if part.n_samples is None:
+                return tuple(self._survey.lengths[i] for i in range(self.n_experiments))
+            totals[part.experiment] += part.n_samples
+        return tuple(totals)
+
+    def ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and the largest sample (m,) of each input, from one pass that is made once.
+
+        Raises:
+            DataError: every sample of an input is missing.
+        """
+        lo, hi = self._ranges
+        return lo.copy(), hi.copy()
+
+    @cached_property
+    def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        lo, hi = np.full(self.m, np.nan), np.full(self.m, np.nan)
+        if self.parts:
+            lo, hi = widened(lo, hi, np.array([self._survey.lo, self._survey.hi]))
+        for u, _ in () if self.parts else self:
+            lo, hi = widened(lo, hi, u)
+        for name, value in zip(self.inputs, lo):
+            if np.isnan(value):
+                raise DataError(f"channel {name!r}: every sample is missing. Check the column, or leave it out.")
+        return lo, hi
+
+    @cached_property
+    def _survey(self) -> Survey:
+        return self.reduced(surveyed, partial(joined, self._channels), available_threads(None))
+
+
+def open_stream(
+    source: Any,
+    inputs: Wanted = None,
+    outputs: Wanted = None,
+    dt: float | None = None,
+    chunk: int = CHUNK,
+    *,
+    time: str | int | bool | None = None,
+    columns: Sequence[str] | None = None,
+    input_units: str | Sequence[str] | None = None,
+    output_units: str | Sequence[str] | None = None,
+    name: str | None = None,
+    delimiter: str = ",",
+    decimal: str = ".",
+    time_tolerance: float = TIME_TOLERANCE,
+    scheduler: Any = None,
+) -> Stream:
+    """Open a record that need not fit into memory; nothing but headers is read yet.
+
+    Args:
+        source: path of a .csv, .txt, .parquet or .npy file; {channel: path of an .npy file (N,)}; a folder whose
+            .parquet files, in the order of their names (2 before 10), are one experiment; a Dask data frame, a Dask
+            array (N, channels) or {channel: Dask array (N,)}; or a list of these, one per experiment. An npy file holds
+            (N, channels) numbers; it is read, not mapped, because mapped pages count as resident memory.
+        inputs: columns by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
+        outputs: likewise; y, or y1, y2, ..., when not given.
+        dt: sampling time; when not given from the first block or part with two time stamps, 1 without stamps.
+        chunk: samples read at a time.
+        time: column of time stamps, checked on every pass; a column t or time when not given; False ignores it.
+        columns: names of the columns of an npy file, a Dask array, or a CSV file without a header.
+        input_units: one unit per input.
+        output_units: one unit per output.
+        name: name of the data set; the file's when not given.
+        delimiter: character between the cells of a CSV file.
+        decimal: decimal mark of a CSV file.
+        time_tolerance: largest deviation of a time step from the first chunk's median step, relative to it.
+        scheduler: address of a Dask scheduler ("tcp://host:8786"), or an open `distributed.Client`, whose workers read
+            the parts of the record: row groups of Parquet files, whole files of another kind, partitions of Dask
+            collections. They must see files under the same path, and run the same versions. The result of a fit is the
+            same to the last digit on any number of workers, and on this machine when it reads the same parts. A fit
+            makes two passes: `persist` a Dask collection that is costly to compute.
+
+    Raises:
+        DataError: as `read`, here or when the chunk is reached.
+        ClusterError: the cluster cannot be used.
+    """
+    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
+        raise DataError(f"chunk = {chunk!r}: a positive number of samples is needed.")
+    several = list(source) if isinstance(source, list | tuple) else [source]
+    if not several:
+        raise DataError("the list of sources is empty; give at least one.")
+    opened = [open_source(one, int(chunk), columns, delimiter, decimal) for one in several]
+    ins, outs, clock = _chosen(opened, inputs, outputs, time)
+    dt = None if dt is None else sampling_time(dt)
+    if scheduler is not None:
+        from optid.data.clusters import connected
+
+        with connected(scheduler):  # refused now, not at the first pass
+            pass
+    parts: list[Part] = []
+    read = [*ins.values(), *outs.values(), *([clock] if clock else [])]
+    if scheduler is not None or len(opened) > 1 or opened[0].blocks is None:
+        parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts(read)]
+        if len({part.experiment for part in parts}) < len(opened):
+            raise DataError("a source of the list has no rows.")
+    if clock is not None:
+        found, where = _step((fetched(part, scheduler) for part in parts) if parts else opened, clock, time_tolerance)
+        dt = agreed_step(found, dt, time_tolerance, where)
+    step = 1.0 if dt is None else dt
+    lengths = [one.n_samples for one in opened]
+    label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
+    return Stream(
+        inputs=channel_names(list(ins), "u", len(ins), "inputs"),
+        outputs=channel_names(list(outs), "y", len(outs), "outputs"),
+        dt=step,
+        input_units=channel_units(input_units, len(ins), "input_units"),
+        output_units=channel_units(output_units, len(outs), "output_units"),
+        name=label if name is None else name,
+        n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
+        _channels=Channels(ins, outs, clock, step, time_tolerance),
+        _whole=opened[0],
+        parts=tuple(parts),
+        scheduler=scheduler,
+    )
+
+
+def _chosen(
+    opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
+) -> tuple[dict[str, str], dict[str, str], str | None]:
+    """Return {channel: column} of inputs and outputs and the clock, the same for all sources."""
+    found = []
+    for one in opened:
+        ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
+        check_distinct((*ins, *outs))
+        found.append((ins, outs, time_column(one.names, time, [*ins.values(), *outs.values()], one.label)))
+        if found[-1] != found[0]:
+            raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "
+                            f"has {found[0][:2]} and {found[0][2]!r}: name the columns, or pass time=False.")
+    return found[0]
+
+
+def _step(sources: Iterable[Any], clock: str, tolerance: float) -> tuple[float | None, str]:
+    """Return the step of the first stamps that have one, and where they are; None where no source has two stamps."""
+    for one in sources:
+        stamps = np.empty(0)
+        for block in one.blocks([clock], clock):
+            more = as_stamps(block[clock], f"{one.label}, column {clock!r}")
+            stamps = np.concatenate([stamps, more]) if stamps.size else more
+            if stamps.size > 1:
+                return uniform_step(stamps, tolerance, one.label), one.label
+    return None, ""
+
+
+def _of_part(leaf: Callable[[Part, Iterable[Chunk]], Any], channels: Channels, part: Part) -> Any:
+    return leaf(part, channels.read(part))
+
+
+def _not_empty(chunks: Iterable[Chunk], label: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    done = 0
+    for u, y, _ in chunks:
+        done += len(u)
+        yield u, y
+    if not done:
+        raise DataError(f"{label} has no rows.")

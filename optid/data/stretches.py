@@ -1,0 +1,81 @@
+"""Gaps: records cut where an input is missing, since no state is known beyond, and straight lines across."""
+
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning
+
+
+def runs_of(present: ArrayLike) -> NDArray[np.intp]:
+    """Return first and one past the last position of every run of marks, (R, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(present, dtype=np.int8), [0]]))).reshape(-1, 2)
+
+
+def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
+    """Fill what is missing of samples (N, c) linearly, column by column; zeros where nothing is present."""
+    filled = np.array(samples, dtype=float)
+    for column in filled.T:
+        lost = np.isnan(column)
+        if lost.any() and not lost.all():
+            column[lost] = np.interp(np.flatnonzero(lost), np.flatnonzero(~lost), column[~lost])
+    return np.nan_to_num(filled)
+
+
+def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice]]]:
+    """Cut a record where an input is missing.
+
+    Args:
+        data: the record.
+        shortest: outputs (of every channel) that a stretch must hold to be kept.
+
+    Returns:
+        The stretches as experiments, and for each the index of its experiment and its samples there.
+
+    Raises:
+        DataError: no stretch is long enough.
+    """
+    if not any(data.missing[name] for name in data.inputs) and all(
+        np.min(np.sum(~np.isnan(e.y), axis=0)) >= shortest for e in data.experiments
+    ):
+        return data, [(i, slice(0, e.n_samples)) for i, e in enumerate(data.experiments)]
+    kept, places = [], []
+    for i, e in enumerate(data.experiments):
+        for first, last in runs_of(np.isfinite(e.u).all(axis=1)):
+            # more outputs than states, or the initial state would repeat them
+            if np.min(np.sum(~np.isnan(e.y[first:last]), axis=0)) >= shortest:
+                kept.append(data.select(experiments=i).window(int(first), int(last)))
+                places.append((i, slice(int(first), int(last))))
+    if not kept:
+        raise DataError(f"no stretch of {shortest} samples has every input: interpolate them, or leave an input out")
+    return Data.join(*kept), places
+
+
+def with_whole_inputs(data: Data, shortest: int) -> Data:
+    """Return a record in which no input is missing: the stretches between the gaps as experiments of their own.
+
+    A record without such a gap is returned as it is; otherwise a `DataWarning` says what remains.
+
+    Args:
+        data: the record.
+        shortest: as in `between_gaps`.
+
+    Raises:
+        DataError: no stretch is long enough.
+    """
+    gaps = [~np.isfinite(e.u) for e in data.experiments]
+    lost = np.sum([gap.sum(axis=0) for gap in gaps], axis=0)
+    if not lost.any():
+        return data
+    cut, _ = between_gaps(data, shortest)
+    total = sum(len(runs_of(~gap.any(axis=1))) for gap in gaps)
+    channels = ", ".join(f"{name!r} ({count} samples)" for name, count in zip(data.inputs, lost) if count)
+    dropped = total - cut.n_experiments
+    short = f"; {dropped} shorter than {shortest} outputs {'is' if dropped == 1 else 'are'} left out" if dropped else ""
+    warnings.warn(
+        f"missing inputs: {channels}. The record is cut there: {cut.n_samples} of {data.n_samples} samples remain in "
+        f"{cut.n_experiments} stretch{'es' if cut.n_experiments > 1 else ''}, each with an initial state of its own"
+        f"{short}. Interpolated inputs would lose less where gaps are short", DataWarning, stacklevel=5)
+    return cut

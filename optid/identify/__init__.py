@@ -1,0 +1,1 @@
+"""Identification: fit, order, validation, uncertainty, experiment design."""

@@ -1,0 +1,219 @@
+"""Design an excitation for a plant of which one record exists, and say what it promises."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optid import signals
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning, StructureError, nearest
+from optid.identify.design.expansion import Bases, FeedbackBases
+from optid.identify.design.promises import Promise, promised
+from optid.identify.design.response import FrequencyResponse, frequency_response
+from optid.identify.design.rules import FEW_LEVELS
+
+KINDS = ("multisine", "chirp", "noise", "levels")
+REFUSED = {
+    "prbs": "two levels cannot identify a static nonlinearity: any function is a straight line there",
+    "binary": "two levels cannot identify a static nonlinearity: any function is a straight line there",
+    "sinusoid": "a sinusoid through a polynomial of degree p has p harmonics and excites 2 p + 1 regressors",
+}
+SWEEPS = 4
+"""Sweeps of a chirp."""
+
+FAINT = 0.05
+"""A frequency belongs to the band when its measured gain is above this share of the largest."""
+
+TRUSTED = 0.5
+"""Coherence below which the measured gain says more of the disturbance than of the plant."""
+
+WANTED, WIDER = 1e4, 1.3
+"""A band that was not asked for grows by this factor until the condition number is no larger."""
+
+BOOST = 4.0
+"""Shaping raises no frequency by more than this factor over another: what is left of a resonance would drown in dead
+zone and noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """An excitation to be applied, with what it promises.
+
+    Attributes:
+        u: (N, m) inputs, read-only.
+        dt: sampling time.
+        inputs: names of the inputs.
+        input_units: their units.
+        kind: "multisine", "chirp", "noise" or "levels".
+        promise: what may be expected of a record taken with it.
+    """
+
+    u: Array
+    dt: float
+    inputs: tuple[str, ...]
+    input_units: tuple[str, ...]
+    kind: str
+    promise: Promise
+
+    def __str__(self) -> str:
+        return f"{self.kind}, {len(self.u)} samples every {self.dt:g}\n{self.promise}"
+
+    def save(self, path: Path | str) -> Path:
+        """Write time and inputs as CSV with a header; `optid.read` reads it, and so does a signal generator."""
+        path = Path(path)
+        columns = np.column_stack([self.dt * np.arange(len(self.u)), self.u])
+        # 15 digits: the values read back are those written, to rounding.
+        np.savetxt(path, columns, fmt="%.15g", delimiter=",", header=",".join(["time", *self.inputs]), comments="")
+        return path
+
+
+def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels: int | None = None,
+           band: tuple[float, float] | None = None, amplitude: Any = None, shaped: bool = False,
+           basis: Bases = "polynomial:4", feedback_basis: FeedbackBases = None, rows: int = 10, hold: int = 5,
+           periods: int = 1, candidates: int = 8, seed: int = 0) -> Excitation:
+    """Design an excitation for the plant of a record.
+
+    Of several random realisations the one is kept whose expanded regressor (functions of the inputs, and of the outputs
+    predicted through the measured frequency response) has the smallest condition number.
+
+    Args:
+        like: a record of the plant: channels, sampling time, ranges, frequency response and disturbance.
+        kind: "multisine" (random phases), "chirp" (linear, four sweeps), "noise" (white in the band, clipped) or
+            "levels" (uniform, held).
+        n: samples; as many as the longest experiment of the record when not given.
+        levels: number of equally spaced values that each input takes; any value when not given.
+        band: lowest and highest frequency (1/unit of dt); when not given, from the lowest line to the last one with a
+            measured gain above 5 % of its largest and a coherence above one half, and further where the lags of slow
+            signals would be too much alike (condition number above 10,000).
+        amplitude: (low, high) for all inputs or one pair per input; the ranges of the record when not given.
+        shaped: weight the spectrum (multisine) or the envelope (chirp) by the inverse of the measured gain, so that the
+            outputs move alike at every frequency.
+        basis: basis of the nonlinearities to be identified.
+        feedback_basis: basis of the functions of the outputs; None without feedback.
+        rows: lags of every function in the expanded regressor (block rows of a subspace method, nb of an
+            equation-error one).
+        hold: samples for which "levels" holds a value.
+        periods: periods of a multisine.
+        candidates: realisations to choose from.
+        seed: of the first of them.
+
+    Raises:
+        StructureError: an unknown or refused kind, an argument out of its range, or an excitation that breaks a rule
+            of design (too few levels, too few lines).
+        DataError: a record that shows no frequency response.
+
+    Warns:
+        DataWarning: an excitation that weakens the answer.
+    """
+    _check(kind, band, shaped, candidates, rows, levels)
+    n = max(e.n_samples for e in like.experiments) if n is None else n
+    ranges = _ranges(like, amplitude)
+    measured = frequency_response(like)
+    # held levels have the spectrum that holding gives them
+    limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
+    few = FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
+    top = 0.9 * float(measured.frequency[-1])
+
+    def realised(draw: int) -> tuple[Array, Promise]:
+        columns = []
+        for c, span in enumerate(ranges):
+            weight = (lambda f: _inverse_gain(measured, c, f)) if shaped else None  # noqa: B023 - used at once
+            x = _signal(kind, n, span, like.dt, limits, weight, hold, periods, seed + draw * like.m + c)
+            if kind == "chirp":
+                x = np.roll(x, c * n // (SWEEPS * like.m))  # inputs that sweep in step could not be told apart
+            columns.append(x if levels is None else _quantised(x, *span, levels))
+        u = np.column_stack(columns)
+        return u, promised(u, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
+
+    while True:
+        draws = map(realised, range(1 if kind == "chirp" else candidates))
+        u, promise = min(draws, key=lambda pair: pair[1].condition)
+        if promise.condition <= WANTED or band is not None or kind == "levels" or limits[1] >= top:
+            break
+        limits = limits[0], min(WIDER * limits[1], top)
+    for check in promise.checks:
+        if check.severity == "error":
+            raise StructureError(f"this {kind} breaks a rule of design: {check.sentence}")
+        if check.severity == "warning":
+            warnings.warn(check.sentence, DataWarning, stacklevel=2)
+    u.flags.writeable = False
+    return Excitation(u, like.dt, like.inputs, like.input_units, kind, promise)
+
+
+def _check(kind: str, band: Any, shaped: bool, candidates: int, rows: int, levels: int | None) -> None:
+    if kind in REFUSED:
+        raise StructureError(f"kind {kind!r} is refused: {REFUSED[kind]}. Use one of {', '.join(KINDS)}.")
+    if kind not in KINDS:
+        raise StructureError(f"no excitation {kind!r}. {nearest(kind, KINDS)}")
+    if band is not None and kind == "levels":
+        raise StructureError("levels have the band that holding gives them; set hold, or use kind 'noise'.")
+    if shaped and kind not in ("multisine", "chirp"):
+        raise StructureError(f"shaping changes the spectrum of a multisine or the envelope of a chirp, not {kind!r}.")
+    for name, value, least in (("candidates", candidates, 1), ("rows", rows, 1), ("levels", levels, 2)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least):
+            raise StructureError(f"{name} = {value!r}: a whole number, at least {least}, is needed.")
+
+
+def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:
+    """Return (low, high) of every input."""
+    if amplitude is None:
+        return [(float(low), float(high)) for low, high in zip(*like.ranges())]
+    try:
+        pairs = np.broadcast_to(np.asarray(amplitude, dtype=float), (like.m, 2))
+    except (TypeError, ValueError):
+        raise StructureError(f"amplitude = {amplitude!r}: (low, high), or one such pair for each of the {like.m} "
+                             "inputs, is needed.") from None
+    return [(float(low), float(high)) for low, high in pairs]
+
+
+def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tuple[float, float]:
+    """Return the band as given, or from zero to where the measured gain of the widest input has become faint."""
+    top = float(measured.frequency[-1])
+    if band is None:
+        f = measured.frequency
+        gain = np.max([measured.gain(f, c) / np.max(measured.gain(f, c)) for c in range(len(measured.inputs))], axis=0)
+        heard = (gain > FAINT) & (measured.coherence.max(axis=1) > TRUSTED)
+        if not heard.any():
+            raise DataError("no frequency at which the inputs explain half of the power of an output: the record shows "
+                            "no band; give one (band=, --band), or a record with more excitation.")
+        return 0.0, float(min(f[np.flatnonzero(heard)[-1]], 0.9 * top))
+    if len(band) != 2 or not 0 <= band[0] < band[1] <= top:
+        raise StructureError(f"band = {band}: two rising frequencies from 0 to half the sampling rate, {top:g}.")
+    return float(band[0]), float(band[1])
+
+
+def _inverse_gain(measured: FrequencyResponse, c: int, frequency: Array) -> Array:
+    gain = measured.gain(frequency, c)
+    return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
+
+
+def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple[float, float], weight: Any,
+            hold: int, periods: int, seed: int) -> Array:
+    """Return one input (n,) that fills its range."""
+    low, high = band
+    if kind == "multisine":
+        return signals.multisine(n, *span, dt=dt, band=band, spectrum=weight, phases="random", periods=periods,
+                                 seed=seed)
+    if kind == "levels":
+        return signals.uniform_levels(n, *span, hold=hold, seed=seed)
+    if kind == "noise":
+        edge = min(high, 0.499 / dt)
+        return signals.band_limited_noise(n, *span, cutoff=(low, edge) if low > 0 else edge, dt=dt, seed=seed)
+    sweep = -(-n // SWEEPS)
+    # From one period per sweep, so that every sweep starts where the last one ended.
+    first = max(low, 1 / (sweep * dt))
+    x = signals.chirp(SWEEPS * sweep, f0=first, f1=max(high, first), dt=dt, repeats=SWEEPS)[:n]
+    if weight is not None:
+        x = x * weight(first + (high - first) * (np.arange(n) % sweep) / sweep)
+        x = x / np.max(np.abs(x))
+    return sum(span) / 2 + (span[1] - span[0]) / 2 * x
+
+
+def _quantised(x: Array, low: float, high: float, levels: int) -> Array:
+    """Round to equally spaced values from low to high."""
+    step = (high - low) / (levels - 1)
+    return low + step * np.round((x - low) / step)

@@ -1,0 +1,113 @@
+"""The frequency response a record shows, nonlinear plant or not: the best linear approximation for that excitation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError, StructureError
+
+SILENT = 1e-4
+"""Input power, relative to its largest over frequency, below which nothing is read off."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """A measured frequency response.
+
+    Attributes:
+        frequency: (F,) in 1/unit of dt, from the first bin above zero to half the sampling rate.
+        response: (F, l, m) complex; NaN where the inputs have no power.
+        coherence: (F, l) share of the output power that the inputs explain linearly, 0 to 1.
+        disturbance: (F, l) power spectral density of the rest, squared unit per unit of frequency.
+        segments: number of segments averaged.
+        inputs: names of the m inputs.
+        outputs: names of the l outputs.
+    """
+
+    frequency: Array
+    response: np.ndarray
+    coherence: Array
+    disturbance: Array
+    segments: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def at(self, frequency: Array) -> np.ndarray:
+        """Return the response (K, l, m) at some frequencies (K,), linear between the bins, constant beyond."""
+        known = ~np.isnan(self.response).any(axis=(1, 2))
+        found = np.empty((len(frequency), *self.response.shape[1:]), dtype=complex)
+        for i, c in np.ndindex(*self.response.shape[1:]):
+            found[:, i, c] = np.interp(frequency, self.frequency[known], self.response[known, i, c])
+        return found
+
+    def gain(self, frequency: Array, c: int) -> Array:
+        """Return how strongly input c moves the outputs at some frequencies (K,), each relative to its largest.
+
+        The root mean square over the outputs of |G| / max |G|.
+        """
+        largest = np.nanmax(np.abs(self.response[:, :, c]), axis=0)
+        return np.sqrt(np.mean((np.abs(self.at(frequency)[:, :, c]) / largest) ** 2, axis=1))
+
+
+def frequency_response(data: Data, segment: int | None = None) -> FrequencyResponse:
+    """Measure the frequency response by averaged spectra (Welch 1967; Bendat and Piersol, Random Data, for coherence).
+
+    Hann windows that overlap by half; segments that touch a missing sample are left out; experiments are averaged.
+    G = S_yu S_uu^-1 at every frequency.
+
+    Args:
+        data: the record.
+        segment: samples of a segment; when not given a quarter of the longest experiment (less with four inputs or
+            more), and at least 32. Resonances narrower than its inverse are flattened, and leave disturbance behind.
+
+    Raises:
+        StructureError: a segment of fewer than 8 samples.
+        DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
+    """
+    longest = max(e.n_samples for e in data.experiments)
+    size = max(32, longest // max(4, data.m + 1)) if segment is None else segment
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 8:
+        raise StructureError(f"segment = {segment!r}: a whole number of samples, at least 8, is needed.")
+    window = np.hanning(size + 1)[:-1]
+    m, l = data.m, data.l  # noqa: E741 - the field's letter
+    sums, count = np.zeros((size // 2 + 1, m + l, m + l), dtype=complex), 0
+    for e in data.experiments:
+        samples = np.hstack([e.u, e.y])
+        samples = samples - np.nanmean(samples, axis=0)
+        for start in range(0, len(samples) - size + 1, max(1, size // 2)):
+            part = samples[start : start + size]
+            if np.isnan(part).any():
+                continue
+            spectrum = np.fft.rfft(window[:, None] * part, axis=0)
+            sums += spectrum[:, :, None] * np.conj(spectrum[:, None, :])
+            count += 1
+    if count < 2 * m:
+        raise DataError(f"{count} complete segments of {size} samples: at least {2 * m} are needed for {m} inputs. "
+                        "Use a longer record without gaps or a smaller segment.")
+    spectra = sums[1:] * (2 * data.dt / (count * np.sum(window**2)))
+    frequency = np.arange(1, size // 2 + 1) / (size * data.dt)
+    uu, yu = spectra[:, :m, :m], spectra[:, m:, :m]
+    yy = np.real(np.diagonal(spectra[:, m:, m:], axis1=1, axis2=2))
+    response = np.full((frequency.size, l, m), np.nan, dtype=complex)
+    coherence, disturbance = np.zeros((frequency.size, l)), yy.copy()
+    for k in np.flatnonzero(_excited(uu)):
+        response[k] = np.linalg.solve(uu[k].T, yu[k].T).T
+        explained = np.real(np.sum(response[k] * np.conj(yu[k]), axis=1))
+        coherence[k] = np.clip(explained / np.where(yy[k] > 0, yy[k], 1.0), 0.0, 1.0)
+        # The estimate takes m of the averaged segments' degrees of freedom.
+        disturbance[k] = yy[k] * (1 - coherence[k]) * count / (count - m)
+    if np.isnan(response).all():
+        raise DataError("the inputs cannot be told apart at any frequency: they are collinear or hardly move.")
+    return FrequencyResponse(frequency, response, coherence, disturbance, count, data.inputs, data.outputs)
+
+
+def _excited(uu: np.ndarray) -> np.ndarray:
+    """Mark the frequencies (F,) at which every input has power of its own; uu (F, m, m)."""
+    power = np.real(np.diagonal(uu, axis1=1, axis2=2))
+    heard = (power > SILENT * power.max(axis=0)).all(axis=1)
+    for k in np.flatnonzero(heard):
+        scale = np.sqrt(power[k])
+        heard[k] = np.linalg.cond(uu[k] / np.outer(scale, scale)) < 1e6
+    return heard

@@ -1,0 +1,233 @@
+"""Noise statistics of a state-space model: gain of the innovations, covariances, spectrum, colour.
+
+With A and C known, what the inputs and the measured feedback do not explain is ``r = (I + C (qI - A)^-1 K) e``. The
+gain K and the covariance of the innovations e minimise the prediction errors (`optid.models.innovation_gain`, started
+from several observers and from long autoregressions of their errors: Hannan and Rissanen 1982). The covariances
+reported are those of the residuals of the state and the output equation along the states of that predictor, ``w = K e``
+and ``v = e``: Q = K Re K', S = K Re, R = Re (Van Overschee and De Moor, Subspace Identification for Linear Systems,
+1996, chapter 3). They are positive semidefinite and belong to K by construction. Q, R and S are not unique: every
+process and measurement noise with the same spectrum gives the same outputs. What the data determine is the spectrum,
+hence K and Re.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import itemgetter
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.data.stretches import between_gaps, runs_of
+from optid.errors import StructureError
+from optid.identify.subspace.innovations import innovation_form
+from optid.identify.validation.correlations import Correlation, autocorrelation
+from optid.identify.validation.predictions import one_step
+from optid.models.innovation_gain import (
+    covariance_of,
+    information,
+    innovations_covariance,
+    log_determinant,
+    refined,
+    whitened,
+)
+from optid.models.kalman import kalman_gain
+from optid.models.noise_covariances import NoiseCovariances
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_ss import HammersteinSS
+
+ROUNDING = 1e-10
+"""Residuals below this share of the outputs are rounding: there is no noise to describe."""
+
+NEARLY_MARGINAL = 1 - 1e-4
+"""Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
+
+RATIOS = (1e-2, 1.0, 1e2)
+"""Process over measurement noise of the observers behind the starts, in units of C."""
+
+TRIED = 2
+"""Observers whose errors are whitened, and then starts that are refined, the best of all."""
+
+BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
+"""Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
+in."""
+
+NEARLY, ELSEWHERE = 0.1, 1.0
+"""Gain of the log-likelihood to be expected that is of no account in a part of a record, and the difference beyond
+which two gains are not the same optimum of it."""
+
+
+class Noise(NamedTuple):
+    """The noise model of a state-space model.
+
+    Attributes:
+        K: (n, l) gain of the innovations; A - K C is stable.
+        covariances: Q, R, S and the covariance of the innovations.
+    """
+
+    K: Array
+    covariances: NoiseCovariances
+
+
+def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
+    """Return the model with the gain and the noise covariances that a record shows, see `estimate_noise`."""
+    found = estimate_noise(model, data)
+    return replace(model, K=found.K, noise=found.covariances)
+
+
+def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
+    """Estimate the noise model from what A, B, C, D, E and L leave unexplained.
+
+    Args:
+        model: the model; its K and noise do not matter.
+        data: the record, in the units of the model (a transform is not undone: a formulation calls this before the
+            model returns to raw units). Samples may be missing.
+
+    Raises:
+        DataError: other channels than the model's, or no stretch long enough without a missing input.
+        StructureError: a pole on or outside the unit circle that the outputs do not see.
+    """
+    observer = _observer(model)
+    data, _ = between_gaps(data.without_transform(), 2 * model.nx + 1)
+    rest = residuals(replace(model, K=observer, noise=None), data)
+    if not _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
+        return Noise(observer, NoiseCovariances.of_innovations(observer, covariance_of(rest)))
+    A = model.A - observer @ model.C
+    gain, covariance = _most_likely(A, model.C, rest)
+    return Noise(observer + gain, NoiseCovariances.of_innovations(observer + gain, covariance))
+
+
+def residuals(model: "HammersteinSS", data: Data) -> list[Array]:
+    """Return the one-step prediction errors (N, l) of every experiment in the units of the model, NaN = missing."""
+    data = data.without_transform()
+    return [e.y - p for e, p in zip(data.experiments, one_step(model, data))]
+
+
+def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
+    """Return the spectral density of the noise at the outputs, H Re H* with H = I + C (zI - A)^-1 K.
+
+    Args:
+        model: a model with noise covariances.
+        w: (F,) frequencies in radians per unit of time, up to pi / dt.
+
+    Returns:
+        (F, l, l) complex, Hermitian; its mean over (-pi/dt, pi/dt) is the covariance of the noise at the outputs.
+
+    Raises:
+        StructureError: the model has no noise covariances.
+    """
+    if model.noise is None:
+        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
+    z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * model.dt)
+    states = np.linalg.solve(z[:, None, None] * np.eye(model.nx) - model.A, model.K.astype(complex))
+    shaped = np.eye(model.l) + model.C @ states
+    return np.asarray(shaped @ model.noise.innovation @ np.conj(np.swapaxes(shaped, 1, 2)))
+
+
+def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Correlation]:
+    """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
+
+    Args:
+        model: the model.
+        data: the record, in raw units or with the transform to them.
+        lags: largest lag.
+
+    Returns:
+        {output: test}; one that fails says that the noise of that output is coloured.
+    """
+    raw = data.raw()
+    rest = residuals(replace(model, K=_observer(model), noise=None), raw)
+    lags = max(1, min(lags, int(np.sum(~np.isnan(np.vstack(rest)), axis=0).min()) // 4))
+    return {name: autocorrelation([r[:, o] for r in rest], name, lags) for o, name in enumerate(model.outputs)}
+
+
+def output_noise(model: "HammersteinSS") -> Array:
+    """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
+
+    It is the mean of the spectrum; infinite where a pole on or outside the unit circle is driven by the noise.
+
+    Raises:
+        StructureError: the model has no noise covariances.
+    """
+    from scipy.linalg import solve_discrete_lyapunov
+
+    if model.noise is None:
+        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
+    if not model.K.any():
+        return np.array(model.noise.innovation)
+    if not model.is_stable:
+        return np.full((model.l, model.l), np.inf)
+    states = solve_discrete_lyapunov(model.A, model.K @ model.noise.innovation @ model.K.T)
+    return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
+
+
+def _largest(signals: Sequence[Array]) -> float:
+    """Largest modulus of any sample that is present."""
+    return max(float(np.nanmax(np.abs(s), initial=0.0)) for s in signals)
+
+
+def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
+    """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part.
+
+    The optimum of the part lies a few standard errors of the whole away, which two or three steps overcome.
+    """
+    part = _part(rest, C.size)
+    starts = _starts(A, C, part)[:TRIED]
+    if part is not rest:
+        found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
+        found.sort(key=lambda pair: log_determinant(pair[1]))
+        same, total = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part)), sum(map(len, rest))
+        optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
+        found = [refined(A, C, gain, rest, total * information(A, C, gain, part)) for gain in optima]
+    else:
+        found = [refined(A, C, gain, rest) for gain in starts]
+    return min(found, key=lambda pair: log_determinant(pair[1]))
+
+
+def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
+    """Blocks spread evenly over a long record; all of it where it is short or where they show too little."""
+    wanted, total = max(BLOCK * BLOCKS, PER_ENTRY * entries), sum(map(len, rest))
+    blocks = [r[start : start + BLOCK] for r in rest for start in range(0, len(r), BLOCK)]
+    part = blocks[:: max(1, total // wanted)]
+    complete = sum(int(np.sum(~np.isnan(r).any(axis=1))) for r in part)
+    shown = 2 * complete >= wanted and np.all(np.diag(covariance_of(part)) > 0)
+    return part if total > 2 * wanted and shown else rest
+
+
+def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
+    """Gains to start from, the most promising first: of observers, and from the whitening of the errors of the best.
+
+    The observers are those of equal noise in all states and equal noise at all outputs.
+    """
+    def measured(gain: Array) -> tuple[float, Array]:
+        return log_determinant(innovations_covariance(A, C, gain, rest)), gain
+
+    size = np.linalg.norm(C, axis=1)
+    unit = np.diag(np.where(size > 0, size, 1.0) ** 2)
+    observers: list[Array] = [np.zeros((len(A), len(C)))]
+    for ratio in RATIOS:
+        try:
+            observers.append(np.array(kalman_gain(A, C, ratio * np.eye(len(A)), unit).K))
+        except StructureError:
+            continue
+    found = sorted(map(measured, observers), key=itemgetter(0))
+    for _, gain in found[:TRIED]:
+        errors = whitened(A, C, gain, rest)
+        whole = [e[start:stop] for e in errors for start, stop in runs_of(~np.isnan(e).any(axis=1))]
+        try:
+            found.append(measured(np.array(innovation_form(A, C, gain, whole)[0])))
+        except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
+            continue
+    return [gain for _, gain in sorted(found, key=itemgetter(0))]
+
+
+def _observer(model: "HammersteinSS") -> Array:
+    """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
+    if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
+        return np.zeros((model.nx, model.l))
+    size = np.linalg.norm(model.C, axis=1)
+    unit = np.diag(np.where(size > 0, size, 1.0) ** 2)
+    return np.array(kalman_gain(model.A, model.C, 0.1 * np.eye(model.nx), unit).K)

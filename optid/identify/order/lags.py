@@ -1,0 +1,184 @@
+"""Lags of ARX and Hammerstein-ARX models: every (na, nb, nk) from the statistics of the largest layout.
+
+A smaller layout is a subset of the columns, so its least squares come from the triangular factor of the largest one
+and the record is read once. With a basis, the nonlinearities are taken from the rank-one fit of the largest layout;
+then every lag of an input has one column, f(u(k - lag)), and one coefficient.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases.basis import Basis
+from optid.data.record import Data
+from optid.errors import RankError, StructureError
+from optid.statistics import Layout, Statistics, collect
+
+ROWS_PER_COLUMN = 3
+CLOSE = 0.1
+
+
+@dataclass(frozen=True)
+class Lags:
+    """One structure: na, and nb and nk by input, with its criteria (smaller is better) and its hold-out fit in %."""
+
+    na: int
+    nb: tuple[int, ...]
+    nk: tuple[int, ...]
+    aic: float
+    aicc: float
+    bic: float
+    fit: float
+
+    def __str__(self) -> str:
+        nb, nk = (str(v[0]) if len(set(v)) == 1 else " ".join(map(str, v)) for v in (self.nb, self.nk))
+        return f"na = {self.na}, nb = {nb}, nk = {nk}"
+
+
+@dataclass(frozen=True)
+class LagScan:
+    """All structures that were compared.
+
+    Attributes:
+        candidates: in the order of the scan.
+        rows: rows that all of them share.
+    """
+
+    candidates: tuple[Lags, ...]
+    rows: int
+
+    @property
+    def at_the_edge(self) -> tuple[str, ...]:
+        """Which of na, nb and nk are the largest ones compared, so that larger ones may be better."""
+        best, found = self.best(), []
+        for name in ("na", "nb", "nk"):
+            values = [np.max(getattr(c, name)) for c in self.candidates]
+            if np.max(getattr(best, name)) == max(values):
+                found.append(name)
+        return tuple(found)
+
+    def best(self, criterion: str = "bic") -> Lags:
+        """The best by "aic", "aicc", "bic" or "fit"; of fits within 0.1 points the one with the least BIC."""
+        if criterion == "fit":
+            most = max(c.fit for c in self.candidates)
+            return min((c for c in self.candidates if c.fit >= most - CLOSE), key=lambda c: c.bic)
+        return min(self.candidates, key=lambda c: getattr(c, criterion))
+
+
+def scan_lags(
+    data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, nk: int = 8, test: Data | None = None
+) -> LagScan:
+    """Compare all structures up to the given lags; the inputs share nb and nk first and are then refined one by one.
+
+    Args:
+        data: the record; NaN = missing. All candidates use the rows of the largest one.
+        bases: one basis per input, with an interval; `Linear` for an ARX model.
+        na: largest number of output lags; fewer where the record is short.
+        nb: largest number of input lags; likewise.
+        nk: largest delay; likewise.
+        test: a part held out, judged by the coefficients of `data`; None for none.
+
+    Raises:
+        StructureError: orders that are not whole numbers, na, nk >= 0 and nb >= 1.
+        RankError: too short a record, or one that does not excite the basis.
+    """
+    for name, value, least in (("na", na, 0), ("nb", nb, 1), ("nk", nk, 0)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+            raise StructureError(f"{name}: a whole number from {least} is needed; got {value!r}.")
+    width, rows = sum(basis.size for basis in bases), data.n_samples
+    while na * data.l + (nb + nk) * width + 1 > rows / ROWS_PER_COLUMN and na + nb + nk > 1:
+        na, nb, nk = max(na - 1, 0), max(nb - 1, 1), max(nk - 1, 0)
+    layout = Layout(na, (nb + nk,) * data.m, (0,) * data.m, tuple(bases), data.outputs, data.inputs)
+    statistics = collect(data, layout)
+    change = _contraction(statistics)
+    root = statistics.root @ change
+    other = None
+    if test is not None:
+        other_statistics = collect_part(test, layout)
+        other = change.T @ other_statistics.gram @ change, other_statistics.rows
+    shape = sum(basis.size - 1 for basis in bases)
+    scan = _Scan(root, statistics.rows, data.m, data.l, na, nb + nk, shape, other)
+    found = [scan.judged(a, (b,) * data.m, (k,) * data.m)
+             for a in range(na + 1) for k in range(nk + 1) for b in range(1, nb + 1)]
+    if data.m > 1:
+        best = min(found, key=lambda c: c.bic)
+        for c in range(data.m):
+            found += [scan.judged(best.na, _put(best.nb, c, b), _put(best.nk, c, k))
+                      for k in range(nk + 1) for b in range(1, nb + 1)]
+            best = min(found, key=lambda c: c.bic)
+        found += [scan.judged(a, best.nb, best.nk) for a in range(na + 1)]
+    return LagScan(tuple(dict.fromkeys(found)), statistics.rows)
+
+
+def collect_part(data: Data, layout: Layout) -> Statistics:
+    """Take the statistics of a part that need not determine the parameters."""
+    from optid.statistics import accumulate
+
+    long = [i for i, e in enumerate(data.experiments) if e.n_samples > layout.first_row]
+    if not long:
+        raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
+    return accumulate(data.select(experiments=long), layout)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    root: Array
+    rows: int
+    m: int
+    l: int  # noqa: E741
+    na: int
+    lags: int
+    shape: int
+    other: tuple[Array, int] | None
+
+    def judged(self, na: int, nb: tuple[int, ...], nk: tuple[int, ...]) -> Lags:
+        past = self.na * self.l
+        inputs = [past + c * self.lags + lag for c in range(self.m) for lag in range(nk[c], nk[c] + nb[c])]
+        constant = past + self.m * self.lags
+        columns = np.array([*range(na * self.l), *inputs, constant])
+        targets = np.arange(constant + 1, constant + 1 + self.l)
+        theta, *_ = np.linalg.lstsq(self.root[:, columns], self.root[:, targets], rcond=1e-12)
+        error = self.root[:, targets] - self.root[:, columns] @ theta
+        energy = np.sum(self.root[:, targets] ** 2, axis=0)
+        covariance = (error.T @ error + np.diag(1e-16 * energy)) / self.rows
+        k = self.l * columns.size + self.shape
+        likelihood = self.rows * float(np.linalg.slogdet(covariance)[1])
+        spare = max(self.rows * self.l - k - 1, 1)
+        fit = float("nan")
+        if self.other is not None:
+            gram, rows = self.other
+            both = np.concatenate([columns, targets])
+            gram = gram[np.ix_(both, both)]
+            weights = np.vstack([-theta, np.eye(self.l)])
+            mean = gram[columns.size - 1, columns.size :] / rows
+            spread = np.diag(gram)[columns.size :] / rows - mean**2
+            errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / rows
+            fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
+        aic = likelihood + 2 * k
+        bic = likelihood + np.log(self.rows) * k
+        return Lags(na, nb, nk, aic, aic + 2 * k * (k + 1) / spare, bic, fit)
+
+
+def _contraction(statistics: Statistics) -> Array:
+    """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit."""
+    from optid.identify.order.several_outputs import weighted_problem
+    from optid.structures.bilinear import minimise
+
+    layout = statistics.layout
+    shapes = [np.ones(1)] * layout.m
+    if any(basis.size > 1 for basis in layout.bases):
+        shapes = list(minimise(weighted_problem(statistics), count=3).point.mus)
+    past, lags = layout.na * layout.l, layout.nb[0]
+    change = np.zeros((layout.n_columns + layout.l, past + layout.m * lags + 1 + layout.l))
+    change[:past, :past] = np.eye(past)
+    for c, mu in enumerate(shapes):
+        block = layout.block(c)
+        change[block, past + c * lags : past + (c + 1) * lags] = np.kron(np.eye(lags), np.reshape(mu, (-1, 1)))
+    change[layout.offset :, past + layout.m * lags :] = np.eye(1 + layout.l)
+    return change
+
+
+def _put(values: tuple[int, ...], c: int, value: int) -> tuple[int, ...]:
+    return (*values[:c], value, *values[c + 1 :])

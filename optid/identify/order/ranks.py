@@ -1,0 +1,248 @@
+"""How many singular values are more than noise: largest ratio, and a threshold from their distribution.
+
+With the instruments orthonormal and the regressors removed, R22 = Gamma X + noise / sqrt(j). If the order is n0, the
+trailing singular vectors U2, V2 of R22 see noise alone:
+
+    T(n0) = sum_{i > n0} s_i^2 = |(1/j) sum_t e_t z_t^T|_F^2 + higher terms,
+
+e_t the outputs of window t along U2 that instruments and regressors do not explain, z_t the instruments along V2.
+Windows overlap, so that both are correlated from window to window even where the noise is white; their covariances
+at lag tau are read off the moments of longer windows. Then T is nearly g chi2_h with the same mean and variance
+(Satterthwaite 1946, Box 1954). Neither a noise model nor a second pass over the record is needed.
+Sources: perturbation of singular values, Stewart and Sun 1990; largest ratio, Wellstead 1978.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.errors import RankError, StructureError
+from optid.statistics.hankel import HankelStatistics
+from optid.statistics.rq import rq
+
+LEVEL = 0.01
+SPAN = 10.0
+"""The level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows."""
+
+FLOOR = 10.0
+"""Singular values below this many roundings of the outputs, times the size of R22, are zero."""
+
+Positions = Sequence[int] | NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class RankTest:
+    """Singular values of R22 and what they would be, were the order n0 = 0, 1, ..., r - 1.
+
+    Attributes:
+        singular_values: (r,) of R22 / sqrt(j), in units of the output, or without unit where the outputs are scaled.
+        statistics: (r,) T(n0), the sum of the squares of those after the first n0.
+        expected: (r,) expectation of T(n0) if the order is n0; it falls like 1 / j.
+        thresholds: (r,) quantile of T(n0) at the level if the order is n0.
+        p_values: (r,) probability of a larger T(n0) if the order is n0.
+        floor: singular values up to here are rounding.
+        level: probability with which a true order is to be rejected.
+        windows: number j of windows.
+        largest: largest order that the shift of the block rows can show, or None.
+    """
+
+    singular_values: Array
+    statistics: Array
+    expected: Array
+    thresholds: Array
+    p_values: Array
+    floor: float
+    level: float
+    windows: int
+    largest: int | None = None
+
+    @property
+    def order(self) -> int:
+        """The smallest order that is not rejected; the largest possible one where all are."""
+        accepted = np.flatnonzero((self.statistics <= self.thresholds) | (self.singular_values <= self.floor))
+        chosen = int(accepted[0]) if accepted.size else self.singular_values.size
+        return chosen if self.largest is None else min(chosen, self.largest)
+
+    @property
+    def choice(self) -> tuple[int, str]:
+        """The order, at least 1, and the reason: the rule behind nx="auto"."""
+        if self.order == 0:
+            return 1, "1: no singular value is more than noise; the outputs may not depend on the inputs at all"
+        return self.order, self.reason
+
+    @property
+    def exact(self) -> bool:
+        """Whether the singular values after the order are rounding: a record without noise."""
+        return self.order < self.singular_values.size and bool(self.singular_values[self.order] <= self.floor)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether every order that the block rows can show was rejected."""
+        limit = self.singular_values.size if self.largest is None else self.largest
+        return self.order == limit and not (
+            limit < self.singular_values.size and self.statistics[limit] <= self.thresholds[limit]
+        )
+
+    @property
+    def ratios(self) -> Array:
+        """s_i / s_{i+1} for i = 1 ... r - 1, singular values below the floor raised to it."""
+        raised = np.maximum(self.singular_values, max(self.floor, np.finfo(float).tiny))
+        return raised[:-1] / raised[1:]
+
+    @property
+    def ratio_order(self) -> int:
+        """The i with the largest s_i / s_{i+1}, at most half of the singular values; 0 when all are rounding."""
+        size = self.singular_values.size
+        if self.singular_values[0] <= self.floor or size < 2:
+            return 0
+        return int(np.argmax(self.ratios[: max(1, min(size - 2, size // 2))])) + 1
+
+    @property
+    def reason(self) -> str:
+        """The decision in words."""
+        n = self.order
+        if self.exact:
+            return f"{n}: singular value {n + 1} is rounding ({self.singular_values[n]:.1e})"
+        if self.exhausted:
+            return f"{n}: every smaller order is rejected and the block rows show no larger one; use more block rows"
+        before = f", order {n - 1} is rejected (p = {self.p_values[n - 1]:.1g})" if n else ""
+        return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
+
+
+def rank_test(
+    statistics: HankelStatistics,
+    instruments: Positions,
+    regressors: Positions,
+    outputs: Positions,
+    *,
+    rows: int,
+    level: float | None = None,
+    largest: int | None = None,
+    scale: Array | None = None,
+) -> RankTest:
+    """Test the ranks of R22.
+
+    Args:
+        statistics: moments of windows of `rows` + reach samples; the reach is the largest lag between windows whose
+            correlation counts. The future block rows suffice: noise windows further apart share no sample.
+        instruments: positions of Z in the first `rows` block rows (`HankelStatistics.at`; 0 is the constant).
+        regressors: positions of Phi there.
+        outputs: positions of Y there.
+        rows: block rows of the instruments, regressors and outputs together.
+        level: probability of rejecting the true order; min(0.01, 10 / j) when not given.
+        largest: largest order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.
+        scale: (y,) size of every row of Y, by which it is divided: several outputs in different units; None for ones.
+
+    Raises:
+        StructureError: windows no longer than `rows`, positions beyond them, a level not between 0 and 1.
+        RankError: too few windows, or instruments that do not reach the regressors.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    reach = statistics.rows - rows
+    if reach < 1:
+        raise StructureError(
+            f"The windows have {statistics.rows} block rows and {rows} are used: take windows that are longer by the "
+            "number of future block rows, so that they tell the correlation between windows."
+        )
+    z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
+    width = 1 + rows * statistics.d
+    if max(z.max(), phi.max(), y.max()) >= width:
+        raise StructureError(f"Instruments, regressors and outputs must lie within the first {rows} block rows.")
+    j = statistics.windows
+    level = min(LEVEL, SPAN / j) if level is None else level
+    if not 0 < level < 1:
+        raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
+    if j <= 1.1 * z.size + y.size:
+        raise RankError(
+            f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a longer "
+            "record, fewer block rows or fewer basis functions."
+        )
+    sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
+    if sizes.shape != (y.size,) or not (sizes > 0).all():
+        raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
+    r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
+    left, values, right = np.linalg.svd(r22)
+    gram_of = shifted_moments(statistics, width, rows)
+    unbiased = j / (j - z.size)  # residuals of a regression on the instruments
+    lags = range(reach + 1)
+    covariance_e = [unbiased * left.T @ (noise.T @ gram_of(lag) @ noise) @ left for lag in lags]
+    covariance_z = [right @ (shocks.T @ gram_of(lag) @ shocks) @ right.T for lag in lags]
+    tails = np.cumsum((values**2)[::-1])[::-1]
+    expected, thresholds, p_values = np.zeros((3, values.size))
+    for n0 in range(values.size):
+        mean, variance = moments_of_sum([e[n0:, n0:] for e in covariance_e], [s[n0:, n0:] for s in covariance_z])
+        expected[n0] = mean / j
+        if mean <= 0 or variance <= 0:
+            p_values[n0] = 1.0 if values[n0] <= floor else 0.0
+            continue
+        g, h = variance / (2 * mean), 2 * mean**2 / variance
+        thresholds[n0] = g / j * chdtri(h, level)
+        p_values[n0] = chdtrc(h, tails[n0] * j / g)
+    return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
+
+
+def _projections(
+    statistics: HankelStatistics,
+    z: NDArray[np.intp],
+    phi: NDArray[np.intp],
+    y: NDArray[np.intp],
+    width: int,
+    sizes: Array,
+) -> tuple[Array, Array, Array, float]:
+    """R22, the windows' weights (width, .) that give e_t and orthonormal z_t, and the floor, per window."""
+    from scipy.linalg import solve_triangular
+
+    rq(statistics, z, phi, y)  # refuses what is singular by name
+    j = statistics.windows
+    own = phi[~np.isin(phi, z)]
+    order = np.concatenate([z, own, y])
+    triangle = statistics.triangle(order) / np.sqrt(j)
+    column = {int(position): c for c, position in enumerate(order)}
+    l21 = triangle[: z.size, [column[int(p)] for p in phi]].T
+    l31 = triangle[: z.size, order.size - y.size :].T
+    basis, r11 = np.linalg.qr(l21.T, mode="complete")
+    q1, q2 = basis[:, : phi.size], basis[:, phi.size :]
+    gain = solve_triangular(r11[: phi.size], (l31 @ q1).T).T
+    r22 = l31 @ q2
+    orthonormal = solve_triangular(triangle[: z.size, : z.size], np.eye(z.size))
+    shocks, noise = np.zeros((width, q2.shape[1])), np.zeros((width, y.size))
+    shocks[z] = orthonormal @ q2
+    noise[y, np.arange(y.size)] = 1
+    noise[phi] -= gain.T
+    noise[z] -= orthonormal @ (r22 @ q2.T).T
+    size = float(np.linalg.norm(triangle[:, order.size - y.size :] / sizes))
+    return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
+
+
+def shifted_moments(statistics: HankelStatistics, width: int, rows: int):
+    """Return the function lag -> mean of s_t s_{t + lag}^T over windows s_t = [1; rows block rows]."""
+
+    def gram_of(lag: int) -> Array:
+        later = np.concatenate([[0], 1 + lag * statistics.d + np.arange(rows * statistics.d)])
+        return statistics.gram[:width][:, later] / statistics.windows
+
+    return gram_of
+
+
+def moments_of_sum(covariance_e: Sequence[Array], covariance_z: Sequence[Array]) -> tuple[float, float]:
+    """Mean and variance of |(1/sqrt j) sum_t e_t z_t^T|^2, which is Gaussian with Omega = sum_tau R_z(tau) x R_e(tau).
+
+    All lags have weight one, which is exact for noise that windows share; where the estimate is not a covariance,
+    Bartlett's weights, which always give one.
+    """
+    reach = len(covariance_e) - 1
+    e = np.array([m.ravel() for m in [*covariance_e, *(m.T for m in covariance_e[1:])]])
+    z = np.array([m.ravel() for m in [*covariance_z, *(m.T for m in covariance_z[1:])]])
+    traces = np.array([np.trace(a) * np.trace(b) for a, b in zip(covariance_e, covariance_z)])
+    products = (e @ e.T) * (z @ z.T)
+    for weights in (np.ones(reach + 1), 1 - np.arange(reach + 1) / (reach + 1)):
+        mean = float(weights @ traces + weights[1:] @ traces[1:])
+        both = np.concatenate([weights, weights[1:]])
+        variance = 2 * float(both @ products @ both)
+        if mean > 0.1 * traces[0] and variance > 0.01 * products[0, 0]:
+            break
+    return mean, variance

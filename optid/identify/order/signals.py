@@ -1,0 +1,108 @@
+"""The statistics from which orders are found: windows of the expanded signals, and their instruments."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import RankError, StructureError
+from optid.identify.order.ranks import RankTest, rank_test
+from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
+
+WANTED, FEWEST = 10, 2
+PER_ROW = 1.5
+"""Block rows on a long record, and at least; windows per row of the longest windows that are wanted."""
+
+
+def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
+    """Return the future block rows: as given, or 10, or more for a large order, or fewer on a short record.
+
+    Raises:
+        StructureError: fewer than 2, or not more than the order asked for per output.
+        RankError: an experiment shorter than three times the block rows, which is named.
+    """
+    if given is not None:
+        if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < FEWEST:
+            raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order, is needed.")
+        alpha = int(given)
+    else:
+        width = expansion.p + 2 * expansion.q + expansion.l
+        count = sum(len(record) for record in records)
+        affordable = int(count / (3 * (len(records) + PER_ROW * width)))
+        alpha = max(FEWEST, min(WANTED if nx is None else max(WANTED, 2 * nx), affordable,
+                                min(len(record) for record in records) // 3))
+    if nx is not None and (alpha - 1) * expansion.l < nx:
+        raise StructureError(
+            f"{alpha} block rows of {expansion.l} outputs show orders up to {(alpha - 1) * expansion.l}, not {nx}: use "
+            f"block_rows={-(-nx // expansion.l) + 1} or more."
+        )
+    for i, record in enumerate(records):
+        if len(record) < 3 * alpha:
+            raise RankError(
+                f"Experiment {i + 1} has {len(record)} samples, fewer than three times the {alpha} block rows: leave "
+                "it out or use fewer block rows."
+            )
+    return alpha
+
+
+def order_test(
+    records: Sequence[Array],
+    expansion: Expansion,
+    alpha: int,
+    *,
+    level: float | None = None,
+    statistics: HankelStatistics | None = None,
+) -> RankTest:
+    """Test the ranks with past and future inputs as instruments, which noise of any colour leaves valid.
+
+    Args:
+        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs; their
+            feedback functions are then instruments too.
+        expansion: the signals.
+        alpha: future block rows; the past has as many, and so has the reach of the serial correlation.
+        level: as in `rank_test`.
+        statistics: of windows of 3 alpha samples, where they exist already.
+    """
+    if statistics is None:
+        statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names, centre="mean")
+    at, both, future = statistics.at, range(2 * alpha), range(alpha, 2 * alpha)
+    z = np.concatenate([[0], at(expansion.eta, both), at(expansion.zeta_simulated, both)])
+    phi = np.concatenate([[0], at(expansion.eta, future), at(expansion.zeta, future[:-1])])
+    y = at(expansion.y, future)
+    spread = None
+    if expansion.l > 1:  # outputs in different units count alike
+        energy = np.diag(statistics.gram)[y] / statistics.windows - (statistics.gram[0, y] / statistics.windows) ** 2
+        each = np.sqrt(np.maximum(energy.reshape(alpha, expansion.l).mean(axis=0), 1e-300))
+        spread = np.tile(each, alpha)
+    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l,
+                     scale=spread)
+
+
+def with_simulated_outputs(
+    records: Sequence[Array], expansion: Expansion, alpha: int
+) -> tuple[list[Array], Expansion]:
+    """Append outputs simulated from the inputs alone: least squares on the functions of the last 2 alpha samples.
+
+    They are free of noise, so that functions of them are valid instruments for functions of measured outputs. The
+    first 2 alpha - 1 samples of an experiment, and those after a missing input, are missing.
+    """
+    rows = 2 * alpha
+    open_loop = expansion.without_feedback()
+    statistics = hankel_statistics(records, rows, open_loop, names=open_loop.names, centre="mean")
+    statistics.check()
+    past = np.concatenate([[0], statistics.at(open_loop.eta)])
+    now = statistics.at(open_loop.y, [rows - 1])
+    theta = np.linalg.lstsq(statistics.gram[np.ix_(past, past)], statistics.gram[np.ix_(past, now)], rcond=1e-12)[0]
+    weights = theta[1:].reshape(rows, open_loop.p, expansion.l)
+    m, centre = expansion.m, statistics.centre
+    extended = []
+    for record in records:
+        eta = open_loop(record)[:, : open_loop.p] - centre[: open_loop.p]
+        count = len(record) - rows + 1
+        simulated = np.full((len(record), expansion.l), np.nan)
+        simulated[rows - 1 :] = theta[0] + centre[open_loop.p :]
+        for i in range(rows):
+            simulated[rows - 1 :] += eta[i : i + count] @ weights[i]
+        extended.append(np.hstack([record[:, : m + expansion.l], simulated]))
+    return extended, expansion.with_simulated()

@@ -1,0 +1,228 @@
+"""One study of the order of a record: states, lags, and a recommendation with its reasons."""
+
+import textwrap
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases import Linear, feedback_bases, fitted_bases
+from optid.bases.basis import Basis
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.identify.order.lags import LagScan, scan_lags
+from optid.identify.order.ranks import RankTest
+from optid.identify.order.signals import block_rows_for, order_test, with_simulated_outputs
+from optid.identify.order.states import StateCriteria, state_criteria
+from optid.statistics.channels import check_channels
+from optid.statistics.expansion import expand
+from optid.statistics.hankel import hankel_statistics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LINES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class OrderStudy:
+    """What `order` found; `print` it.
+
+    Attributes:
+        data: name of the record.
+        block_rows: future block rows.
+        ranks: test of the singular values.
+        states: criteria by number of states, on prediction errors.
+        lags: scan of na, nb, nk, or None when `notes` says why.
+        nx: recommended number of states.
+        na, nb, nk: recommended lags, nb and nk by input; None without a scan.
+        reasons: why.
+        notes: what weakens the result; each was also given as a DataWarning.
+    """
+
+    data: str
+    block_rows: int
+    ranks: RankTest
+    states: StateCriteria
+    lags: LagScan | None
+    nx: int
+    na: int | None
+    nb: tuple[int, ...] | None
+    nk: tuple[int, ...] | None
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Return tables, recommendation and reasons, at most 80 columns wide."""
+        ranks, states = self.ranks, self.states
+        lines = [f"Order of {self.data}" if self.data else "Order"]
+        lines.append(f"  {ranks.windows} windows, {self.block_rows} block rows, level {ranks.level:.2g}")
+        heads = f"{'s(n)':>11}{'s/s next':>10}{'tail':>11}{'threshold':>11}{'p':>9}{'BIC':>11}{'hold-out %':>12}"
+        lines.append(f"  {'n':>3}{heads}")
+        roots = np.sqrt(ranks.statistics), np.sqrt(ranks.thresholds)
+        bic = states.bic - states.bic.min()
+        for n in range(min(max(LINES, self.nx + 3), ranks.singular_values.size)):
+            single = f"{ranks.singular_values[n - 1]:11.4g}" if n else f"{'':11}"
+            ratio = f"{ranks.ratios[n - 1]:10.3g}" if 0 < n <= ranks.ratios.size else f"{'':10}"
+            cost = f"{bic[n]:11.1f}" if n < bic.size else f"{'':11}"
+            fit = f"{states.fit[n]:12.2f}" if n < bic.size and np.isfinite(states.fit[n]) else f"{'':12}"
+            mark = " <" if n == self.nx else ""
+            tail = f"{roots[0][n]:11.4g}{roots[1][n]:11.4g}{ranks.p_values[n]:9.2g}"
+            lines.append(f"  {n:>3}{single}{ratio}{tail}{cost}{fit}{mark}"[:80])
+        if self.lags is not None:
+            lines.append(f"  {'lags by':<10}{'':<34}{'BIC':>12}{'hold-out %':>12}")
+            for name in ("aicc", "bic", "fit"):
+                if name != "fit" or any(np.isfinite(c.fit) for c in self.lags.candidates):
+                    one = self.lags.best(name)
+                    fit = f"{one.fit:12.2f}" if np.isfinite(one.fit) else ""
+                    word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
+                    lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
+        said = f"nx = {self.nx}"
+        if self.na is not None and self.lags is not None:
+            said += f"; {self.lags.best('bic')}"
+        lines.append(f"Recommended: {said}")
+        for reason in (*self.reasons, *(f"note: {note}" for note in self.notes)):
+            lines += textwrap.wrap(reason, 80, initial_indent="  - ", subsequent_indent="    ")
+        return "\n".join(lines)
+
+    def picture(self) -> "Figure":
+        """Draw singular values with thresholds, criteria, and the scan of lags."""
+        from optid.identify.order.picture import draw
+
+        return draw(self)
+
+
+def order(
+    data: Data,
+    *,
+    basis: "Basis | str | Sequence[Basis | str] | None" = None,
+    feedback_basis: Any = None,
+    block_rows: int | None = None,
+    nx: int | None = None,
+    na: int = 8,
+    nb: int = 6,
+    nk: int = 8,
+    holdout: float = 0.3,
+    level: float | None = None,
+) -> OrderStudy:
+    """Find the order of a record without a model of its noise.
+
+    The number of states comes from the singular values of the future outputs on past inputs: the smallest order whose
+    trailing singular values are no larger than noise makes them (`optid.identify.order.ranks`). Criteria on prediction
+    errors, a part held out and a scan of lags stand beside it.
+
+    Args:
+        data: the record; NaN = missing, several experiments of any lengths.
+        basis: functions of the inputs, one basis or one per input; linear when not given.
+        feedback_basis: functions of the outputs that are fed back, one basis or one per output; none when not given.
+        block_rows: future block rows, larger than the order; 10, or fewer on a short record.
+        nx: largest order of interest; sees to it that the block rows can show it.
+        na: largest number of output lags of the scan.
+        nb: largest number of input lags of the scan.
+        nk: largest delay of the scan.
+        holdout: share of every experiment, from its end, on which orders and lags are judged; 0 for none.
+        level: probability of rejecting the true order; min(0.01, 10 / N) when not given.
+
+    Raises:
+        StructureError: arguments that cannot be.
+        DataError: duplicated or constant channels, or no complete sample.
+        RankError: too short a record or experiment, or inputs that do not excite the block rows.
+
+    Warns:
+        DataWarning: no scan of lags or no hold-out is possible; also in `OrderStudy.notes`.
+    """
+    if not 0 <= holdout < 1:
+        raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}.")
+    if nx is not None and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
+        raise StructureError(f"nx={nx!r}: a whole number from 1 is needed.")
+    data = data.raw()
+    records = _records(data)
+    check_channels(records, data.inputs, data.outputs)
+    bases = fitted_bases(data, Linear() if basis is None else basis)
+    expansion = expand(records, bases, feedback_bases(data, feedback_basis), data.inputs, data.outputs)
+    alpha = block_rows_for(records, expansion, block_rows, nx)
+    notes: list[str] = []
+    shown, extended = expansion, records
+    if expansion.q:
+        extended, shown = with_simulated_outputs(records, expansion, alpha)
+    statistics = hankel_statistics(extended, 3 * alpha, shown, names=shown.names, centre="mean")
+    ranks = order_test(extended, shown, alpha, level=level, statistics=statistics)
+    largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
+    train, test = _parts(data, holdout, alpha, notes)
+    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=_centre(
+        statistics.centre, expansion)) if part is not None else None for part in (train, test)]
+    moments = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names,
+                                centre=_centre(statistics.centre, expansion))
+    states = state_criteria(moments, expansion, alpha, max(largest, 1), *parts)
+    lags = _lags(data, train, test, bases, na, nb, nk, notes)
+    if ranks.exhausted:
+        notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
+                     "inputs if the plant is not linear.")
+    for note in notes:
+        warnings.warn(note, DataWarning, stacklevel=2)
+    best = lags.best("bic") if lags is not None else None
+    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], *(
+        (best.na, best.nb, best.nk) if best is not None else (None, None, None)),
+        _reasons(ranks, states, lags), tuple(notes))
+
+
+def _records(data: Data) -> list[Array]:
+    return [np.hstack([e.u, e.y]) for e in data.experiments]
+
+
+def _centre(centre: Array, expansion: Any) -> Array:
+    return centre[: expansion.p + expansion.q + expansion.l]
+
+
+def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
+    if not holdout:
+        return None, None
+    try:
+        train, test = data.split(1 - holdout)
+        for part in (train, test):
+            hankel_statistics(_records(part), 2 * alpha, method="gram").check(1.2)
+    except (DataError, RankError) as error:
+        notes.append(f"Nothing is held out: the record is too short for it. {error}")
+        return None, None
+    return train, test
+
+
+def _lags(
+    data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
+    notes: list[str],
+) -> LagScan | None:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            return scan_lags(data if train is None else train, bases, na=na, nb=nb, nk=nk, test=test)
+    except RankError as error:
+        notes.append(f"No scan of lags. {error}")
+        return None
+
+
+def _reasons(ranks: RankTest, states: StateCriteria, lags: LagScan | None) -> tuple[str, ...]:
+    n = ranks.choice[0]
+    found = [f"singular values: {ranks.reason}" if ranks.order else
+             "no singular value is more than noise: the outputs may not depend on the inputs; nx = 1 is the least"]
+    voices = {"the largest ratio of singular values": ranks.ratio_order}
+    voices |= {{"hold-out": "hold-out", "aic": "AIC", "aicc": "AICc", "bic": "BIC"}[k]: v
+               for k, v in states.best().items()}
+    agree = [name for name, value in voices.items() if value == n]
+    differ = [f"{name} says {value}" for name, value in voices.items() if value != n]
+    if agree:
+        found.append(f"{', '.join(agree)} agree{'s' if len(agree) == 1 else ''}")
+    if differ:
+        found.append("; ".join(differ) + ": criteria on prediction errors also count states of the noise, and hold-out "
+                     "asks what predicts, not what is there")
+    if lags is not None:
+        best, other = lags.best("bic"), lags.best("fit") if any(np.isfinite(c.fit) for c in lags.candidates) else None
+        found.append(f"lags: {best} has the least BIC of {len(lags.candidates)} structures on {lags.rows} rows")
+        if edge := lags.at_the_edge:
+            found.append(f"{' and '.join(edge)} {'is' if len(edge) == 1 else 'are'} the largest compared: look "
+                         "further, or let states carry the dynamics")
+        if other is not None and other != best:
+            found.append(f"{other} predicts the part held out {other.fit - best.fit:.2f} points better")
+    return tuple(found)

@@ -1,0 +1,197 @@
+"""Find isolated wild readings, in a record before it is fitted and by the residuals of a model.
+
+A reading is wild when it leaves the course of its channel by far more than the channel ever moves, and is back a few
+samples later: at most `LONGEST` of them in a row. More in a row are a step, which is a signal. Readings inside the
+scatter of the others are not wild, and neither are those of a heavy tail without a gap. Pulses of one to three samples
+on a noisy channel cannot be distinguished from wild readings; on a channel at rest they count as the signal.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import fdtrc, ndtri
+
+from optid.arrays import Array
+
+LONGEST = 3
+"""Wild readings in a row that still count as isolated."""
+
+WINDOW = 15
+"""Samples of the running median, the course that wild readings leave; more than half of them must be sound."""
+
+SHORT = 10_000
+"""Samples up to which sorting every window takes less time than the import of scipy.ndimage."""
+
+MOST = 0.12
+"""Share of wild readings up to which they are looked for."""
+
+LEAST_SAMPLES = 50
+"""Samples of a channel below which nothing can be said."""
+
+FAR = 6.0
+"""Robust standard deviations of the departures from the course that a wild reading is off at least."""
+
+GAP = 1.2
+"""Ratio at least of the smallest wild departure to the largest sound one, so that levels of a quantiser are no gap."""
+
+STEP = 1.5
+"""A wild departure is larger than a step between sound readings by this factor: a channel may switch to and fro."""
+
+SWITCHING = 0.25
+"""Larger steps, relative to the number of wild runs, from which on the channel switches and nothing is wild."""
+
+GAP_RISK, TAIL_RISK = 2e-3, 1e-4
+"""Probability of as wide a gap, and of as heavy a tail, where the tail goes on as it began."""
+
+FLATTEST = 0.1
+"""Least steepness of a tail: that of a Gaussian one at 3 standard deviations, for signals that are bounded."""
+
+TRIED = 20
+"""Splits into wild and sound readings that are tried, those at the widest gaps."""
+
+TAIL = 0.05
+"""Share of the departures that is the tail of any distribution."""
+
+NORMAL_MEDIAN = 0.6745
+"""Median of the absolute value of a standard normal variable."""
+
+CHANCE = 1e-3
+"""Probability that residuals of Gaussian noise show a wild reading anywhere in the record."""
+
+
+TIE = 1e-9
+"""Where one row alone tells, a reading that is a past output there counts as wild, for its leverage; the output not."""
+
+
+def find_outliers(records: Sequence[Array]) -> list[np.ndarray]:
+    """Return the sample numbers of the isolated wild readings of one channel, one array per experiment.
+
+    The departures from a running median are sorted by size. With k of them split off, the logarithm of the gap there
+    times k is in a tail of Pareto's kind exponential (Renyi 1953), and the sum of the logarithms beyond it a gamma
+    variable, both with the steepness of the tail as scale; Hill's estimate (1975) takes it from the departures below.
+    A gap too wide or a tail too heavy for that parts wild readings from sound ones. Scale and course are medians,
+    which half of the readings may spoil (Hampel 1974).
+
+    Args:
+        records: (N,) samples of every experiment; NaN = missing. What is missing parts no neighbours.
+    """
+    present = [np.flatnonzero(~np.isnan(x)) for x in records]
+    parts = [np.asarray(x, dtype=float)[kept] for x, kept in zip(records, present)]
+    wild = _beyond(np.concatenate([_departures(x) for x in parts]), parts)
+    return [kept[mask] for kept, mask in zip(present, np.split(wild, _edges(parts)))]
+
+
+def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Array) -> list[np.ndarray]:
+    """Return which readings (N, l) of every experiment are wild by the one-step residuals of an ARX model.
+
+    An output read wrong by h leaves h in its own residual and h times the coefficients of A in the following ones; a
+    disturbance of the plant leaves a single one. A reading is wild where the first explains the residuals better than
+    a disturbance at any of these samples does, and chance does not (Fox 1972; Chang, Tiao and Chen 1988). Of
+    neighbours within the lags only the likeliest is returned, so the search is to be repeated without it.
+
+    Args:
+        residuals: (N, l) of every experiment, NaN where a row is not used.
+        past: (na, l, l) coefficients of A: ``past[i - 1, o, p]`` is that of output o, lag i, in equation p.
+        spread: (l,) robust standard deviations of the residuals.
+    """
+    signature = np.concatenate([np.eye(spread.size)[None], past]) / spread  # (na + 1, l outputs, l equations)
+    critical = -ndtri(CHANCE / (2 * max(sum(r.size for r in residuals), 1)))
+    return [_additive(r / spread, signature, critical) for r in residuals]
+
+
+def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
+    from scipy.ndimage import maximum_filter1d
+
+    n, lags = len(r), len(signature)
+    used = ~np.isnan(r[:, 0])
+    padded = np.concatenate([np.where(used[:, None], r, 0.0), np.zeros((lags - 1, r.shape[1]))])
+    weight = np.concatenate([used, np.zeros(lags - 1, dtype=bool)])
+    drawn = sum(padded[i : i + n] @ part.T for i, part in enumerate(signature))
+    power = sum(np.outer(weight[i : i + n], np.sum(part**2, axis=1)) for i, part in enumerate(signature))
+    size = np.abs(drawn) / np.sqrt(np.where(power > 0, power, np.inf))
+    peak = size >= maximum_filter1d(np.max(size, axis=1), 2 * lags - 1)[:, None]
+    rival = np.max(np.abs(padded), axis=1)  # what a disturbance explains
+    later = np.max([rival[i : i + n] * (1 - TIE) for i in range(1, lags)] + [np.zeros(n)], axis=0)
+    return peak & (size > np.maximum(critical, np.maximum(rival[:n] * (1 + TIE), later))[:, None])
+
+
+def _departures(x: Array) -> Array:
+    """Distance of every sample from the running median, which goes on straight at the ends."""
+    if x.size < WINDOW:
+        return np.abs(x - np.median(x)) if x.size else x
+    half = WINDOW // 2
+    course = _running_median(x)
+    for line in (course, course[::-1]):  # views of its two ends
+        slope = (line[2 * half] - line[half]) / half if x.size > 3 * half else 0.0
+        line[:half] = line[half] - slope * np.arange(half, 0, -1)
+    return np.abs(x - course)
+
+
+def _running_median(x: Array) -> Array:
+    """Return the median of `WINDOW` samples about every sample that has as many before and behind; else the sample."""
+    half = WINDOW // 2
+    course = x.copy()
+    if x.size <= SHORT:
+        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
+        course[half:-half] = np.partition(windows, half, axis=1)[:, half]
+    else:
+        from scipy.ndimage import median_filter
+
+        course[half:-half] = median_filter(x, WINDOW)[half:-half]
+    return course
+
+
+def _beyond(d: Array, parts: Sequence[Array]) -> np.ndarray:
+    """Tell which samples of all experiments together are wild."""
+    none = np.zeros(d.size, dtype=bool)
+    if d.size < LEAST_SAMPLES:
+        return none
+    below = min(max(d.size // 12, 20), 1000)  # departures that tell the steepness of the tail
+    count = int(MOST * d.size) + below + 1
+    top = np.sort(np.partition(d, d.size - count)[d.size - count :])[::-1]
+    scale = max(float(np.median(d)) / NORMAL_MEDIAN, float(np.quantile(d, 0.8)) / 1.2816)
+    if scale <= 8 * np.finfo(float).eps * max(float(np.max(np.abs(x), initial=0.0)) for x in parts):
+        return none  # at rest but for pulses: they are the signal
+    for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
+        size = float(top[k - 1]) / STEP
+        found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], _edges(parts)))]
+        steps = sum(int(np.count_nonzero(np.abs(np.diff(x[~mask])) > size)) for x, mask in zip(parts, found))
+        runs = sum(int(np.count_nonzero(np.diff(mask.astype(np.int8), prepend=0) > 0)) for mask in found)
+        if runs and steps <= SWITCHING * runs:
+            return np.concatenate(found)
+    return none
+
+
+def _edges(parts: Sequence[Array]) -> np.ndarray:
+    return np.cumsum([x.size for x in parts])[:-1]
+
+
+def _splits(top: Array, n: int, below: int) -> np.ndarray:
+    """Return how many of the largest of n departures, in robust standard deviations, may be wild, the most first."""
+    logs = np.log(np.maximum(top, NORMAL_MEDIAN))
+    k = np.arange(1, top.size - below)
+    sums = np.concatenate([[0.0], np.cumsum(logs)])
+    near = (sums[k + below] - sums[k]) / below - logs[k + below]
+    whole = (logs[k] - np.log(NORMAL_MEDIAN)) / np.log(0.5 * n / k)  # where the tail has not begun, near is too flat
+    steepness = np.maximum(np.where(k > TAIL * n, np.maximum(near, whole), near), FLATTEST)
+    gap, excess = logs[k - 1] - logs[k], sums[k] - k * logs[k]
+    tries = k * (k + 1.0)  # the inverses of which add up to one
+    wide = (fdtrc(2, 2 * below, k * gap / steepness) < GAP_RISK / tries) & (gap > np.log(GAP))
+    heavy = fdtrc(2 * k, 2 * below, excess / (k * steepness)) < TAIL_RISK / tries
+    likely = k[(wide | heavy) & (top[k - 1] > FAR)]
+    widest = likely[np.argsort(-gap[likely - 1])[:TRIED]]
+    return np.unique(np.concatenate([widest, likely[-1:]]))[::-1]
+
+
+def _isolated(x: Array, mask: np.ndarray, size: float) -> np.ndarray:
+    """Keep the runs of at most `LONGEST` samples whose every sample is off from the sound ones before and behind."""
+    found, sound, at = np.zeros_like(mask), np.flatnonzero(~mask), np.flatnonzero(mask)
+    if not sound.size:
+        return found
+    place = np.searchsorted(sound, at)
+    start = np.where(place > 0, sound[place - 1] + 1, 0)
+    stop = np.where(place < sound.size, sound[np.minimum(place, sound.size - 1)], x.size)
+    before, behind = np.where(start > 0, start - 1, stop), np.where(stop < x.size, stop, start - 1)
+    jumps = [(start, before), (stop - 1, behind), (at, before), (at, behind)]
+    found[at] = (stop - start <= LONGEST) & np.all([np.abs(x[i] - x[j]) > size for i, j in jumps], axis=0)
+    return found

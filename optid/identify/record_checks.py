@@ -1,0 +1,182 @@
+"""Examine a record before solving: what makes the answer meaningless is an error, what weakens it a warning."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.bases.basis import Basis
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning
+from optid.identify.design.rules import Check, check_condition, check_instruments, check_levels, check_lines
+from optid.identify.outliers import find_outliers
+
+LEAST_KEPT = 0.5
+FEW_DIGITS = 8.0  # beside the level of an output
+NAMED = 5  # samples that a finding names
+EXAMINED = "wild readings"  # of the figures of a fit with a robust loss
+BY_RESIDUALS = "readings wild by their residuals"
+BLOCK_ROWS = 10  # of a subspace method that chooses them itself
+
+
+def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
+    """Examine inputs and outputs against the bases that are to be identified from them.
+
+    Args:
+        data: the record.
+        bases: one fitted basis per input.
+        arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are held against the spectral
+            lines of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
+
+    Returns:
+        What weakens the answer, one sentence each; every sentence is also issued as a `DataWarning`.
+
+    Raises:
+        DataError: a constant or missing input, too few levels to determine the basis, or too few spectral lines to
+            determine its coefficients at every lag.
+    """
+    arguments = arguments or {}
+    found: list[str] = []
+    for c, (name, basis) in enumerate(zip(data.inputs, bases)):
+        u = np.concatenate([e.u[:, c] for e in data.experiments])
+        u = u[~np.isnan(u)]
+        found += _levels(name, u, basis)
+        forced = arguments.get("tolerance") is not None
+        found += _lines(name, [e.u[:, c] for e in data.experiments], basis, _lags(arguments, c), forced)
+        found += _range(name, u, basis)
+        found += _outliers("input", name, [e.u[:, c] for e in data.experiments], arguments)
+    for o, name in enumerate(data.outputs):
+        y = np.concatenate([e.y[:, o] for e in data.experiments])
+        y = y[~np.isnan(y)]
+        if y.size == 0:
+            raise DataError(f"output {name!r} has no sample at all; choose another column or drop the output")
+        if np.ptp(y) == 0:
+            raise DataError(f"output {name!r} is constant ({y[0]:g}): there is nothing to explain; check the column")
+        found += _outliers("output", name, [e.y[:, o] for e in data.experiments], arguments)
+        found += _digits(name, y)
+    return _warned(found)
+
+
+def _levels(name: str, u: np.ndarray, basis: Basis) -> list[str]:
+    if u.size == 0:
+        raise DataError(f"input {name!r} has no sample at all; choose another column or drop the input")
+    if np.ptp(u) == 0:
+        raise DataError(f"input {name!r} is constant ({u[0]:g}): nothing can be identified from it; "
+                        "excite the input or drop the channel")
+    return _told(check_levels(name, u, basis))
+
+
+def _lines(name: str, records: Sequence[np.ndarray], basis: Basis, lags: int | None, forced: bool) -> list[str]:
+    if lags is None:
+        return []
+    check = check_lines(name, records, basis, lags)
+    return _told(replace(check, severity="warning") if check.severity == "error" and forced else check)
+
+
+def _told(check: Check) -> list[str]:
+    """Return the sentence of a warning, nothing of what is fine.
+
+    Raises:
+        DataError: of an error.
+    """
+    if check.severity == "error":
+        raise DataError(check.sentence)
+    return [check.sentence] if check.severity == "warning" else []
+
+
+def _warned(found: list[str]) -> list[str]:
+    """Issue every sentence as a warning, too."""
+    for sentence in found:
+        warnings.warn(sentence, DataWarning, stacklevel=5)
+    return found
+
+
+def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
+    """Number of lags at which the functions of input c are regressors, as far as the arguments tell."""
+    if "block_rows" in arguments:
+        nx = arguments.get("nx")
+        chosen = max(BLOCK_ROWS, 2 * nx if isinstance(nx, int) else 0)
+        given = chosen if arguments["block_rows"] is None else arguments["block_rows"]
+    else:
+        given = arguments.get("nb")
+    if isinstance(given, list | tuple):
+        given = given[c] if c < len(given) else None
+    return int(given) if isinstance(given, int | np.integer) and given > 0 else None
+
+
+def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:
+    outside = basis.n_outside(u)
+    if not outside or basis.interval is None:
+        return []
+    low, high = basis.interval
+    return [f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval [{low:g}, {high:g}] of its "
+            f"basis; there the basis is set to {basis.outside!r}"]
+
+
+def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Mapping[str, Any]) -> list[str]:
+    found = find_outliers(records)
+    count = sum(part.size for part in found)
+    if not count:
+        return []
+    loss = str(arguments.get("loss", "")).partition(":")[0]
+    advice = f"mark {'it' if count == 1 else 'them'} as missing (NaN)"
+    if role == "output" and loss in ("huber", "l1"):
+        advice = f"loss={loss!r} leaves out every row that holds one, as output or as past output"
+    elif role == "output" and loss:
+        advice += ", or use loss='huber', which leaves out every row that holds one"
+    else:
+        advice = f"check the record and {advice}"
+    return [f"{_counted(count)} of {role} {name!r} ({list_samples(found)}) "
+            f"{'is' if count == 1 else 'are'} wild, isolated and far off the others: {advice}"]
+
+
+def _counted(count: int) -> str:
+    return "1 reading" if count == 1 else f"{count} readings"
+
+
+def list_samples(found: Sequence[np.ndarray]) -> str:
+    """Name the first samples of every experiment, as in "samples 3, 17, 40 and 5 more"."""
+    places = [f"{k} of experiment {e + 1}" if len(found) > 1 else str(k) for e, part in enumerate(found) for k in part]
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return f"{'sample' if len(places) == 1 else 'samples'} {', '.join(places[:NAMED])}{more}"
+
+
+def examine_residuals(figures: Mapping[str, Any]) -> list[str]:
+    """Say which readings a robust loss has left out because their residuals show that they are wild."""
+    return _warned([f"{key}, {samples}, were left out with every row that holds one"
+                    for key, samples in figures.items() if key.startswith(BY_RESIDUALS)])
+
+
+def _digits(name: str, y: np.ndarray) -> list[str]:
+    """Say how many digits the samples have left beside their level, once these are few."""
+    size, level = float(np.std(y)), abs(float(np.mean(y)))
+    digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
+    if digits >= FEW_DIGITS:
+        return []
+    return [f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal digits of its "
+            "variation: no result is more accurate; record it about its level"]
+
+
+def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:
+    """Say how the compressed problem stands: rows kept and conditioning of the expanded regressor.
+
+    Args:
+        rows: rows used.
+        candidates: rows there would be without missing samples.
+        condition: estimated condition number of the column-scaled expanded regressor.
+    """
+    found = _warned(_told(check_condition(condition)))
+    if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
+        found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
+    return found
+
+
+def examine_instruments(condition: float) -> list[str]:
+    """Say how well the instruments of a subspace method reach its regressors.
+
+    Args:
+        condition: condition number of R11, the regressors projected on the instruments.
+    """
+    return _warned(_told(check_instruments(condition)))

@@ -1,0 +1,109 @@
+"""Compiled loop of the recursive least squares: rows are rotated into a triangular factor, one sample after the other.
+
+Square-root information form (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter V;
+Haykin, Adaptive Filter Theory, QR-decomposition-based recursive least squares). The factor R of [Phi | Y] replaces the
+covariance P = (R^T R)^-1 of the textbook recursion: rotations are orthogonal, so P stays symmetric and positive
+definite however long the run is, and P_0 = infinity is simply R = 0.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+
+FADED = 1e-120
+"""Diagonal entry of R below which a row is not forgotten any further: a direction that is never excited again keeps
+its last estimate instead of ending as zero over zero."""
+
+NOTHING = 1e-250
+"""Entries of R below this are set to zero, before they slow the processor down as subnormal numbers."""
+
+UNDETERMINED = 1e-12
+"""Share of a column, or of a row, outside the span of what came before below which it counts as rounding."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def absorb(
+    root: Array, signals: Array, y: Array, source: NDArray[np.intp], lag: NDArray[np.intp], used: NDArray[np.bool_],
+    weights: Array, forgetting: float, rows: int, innovations: Array, marks: NDArray[np.bool_], traced: Array,
+) -> int:
+    """Rotate the rows of one stretch into the factor.
+
+    Args:
+        root: (n + l, n + l) upper triangular, diagonal >= 0; changed in place.
+        signals: (reach + T, s) what the columns of Phi are made of.
+        y: (reach + T, l) outputs.
+        source: (n - 1,) signal of each column but the last, the constant.
+        lag: (n - 1,) lag of each.
+        used: (T,) marks of the rows that are used.
+        weights: (T,) positive where used.
+        forgetting: factor on all earlier information at every row used.
+        rows: rows used before.
+        innovations: (T, l) prediction errors before each update; entries of rows not used stay as they are.
+        marks: (T,) samples after which the estimate is recorded.
+        traced: (number of marks, n, l) the recorded estimates.
+
+    Returns:
+        Number of rows used so far.
+    """
+    n, l = source.size + 1, y.shape[1]  # noqa: E741 - the field's letter
+    size, reach = n + l, len(y) - len(used)
+    fade = np.sqrt(forgetting)
+    row, recorded = np.empty(size), 0
+    for t in range(used.size):
+        if used[t]:
+            now, scale = reach + t, np.sqrt(weights[t])
+            for j in range(n - 1):
+                row[j] = scale * signals[now - lag[j], source[j]]
+            row[n - 1] = scale
+            for o in range(l):
+                row[n + o] = scale * y[now, o]
+            kept = 1.0  # product of the cosines: (1 + a phi^T P phi)^(-1/2)
+            for i in range(size):
+                if i == n:
+                    for o in range(l):
+                        innovations[t, o] = row[n + o] / (kept * scale) if kept > UNDETERMINED else np.nan
+                factor = fade if root[i, i] > FADED else 1.0
+                old, new = factor * root[i, i], row[i]
+                if new == 0.0:
+                    if factor != 1.0:
+                        for j in range(i, size):
+                            root[i, j] *= factor
+                    continue
+                diagonal = np.sqrt(old * old + new * new)
+                cosine, sine = old / diagonal, new / diagonal
+                root[i, i] = diagonal
+                kept *= cosine
+                for j in range(i + 1, size):
+                    above = factor * root[i, j]
+                    root[i, j] = cosine * above + sine * row[j]
+                    row[j] = cosine * row[j] - sine * above
+            rows += 1
+            if forgetting < 1.0 and rows % 256 == 0:
+                for i in range(size):
+                    for j in range(i, size):
+                        if abs(root[i, j]) < NOTHING:
+                            root[i, j] = 0.0
+        if marks[t]:
+            solve(root, n, traced[recorded])
+            recorded += 1
+    return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(root: Array, n: int, theta: Array) -> None:
+    """Solve R theta = z for the estimate (n, l); NaN while a column depends on those before it."""
+    theta[:] = np.nan
+    for j in range(n):
+        energy = 0.0
+        for i in range(j + 1):
+            energy += root[i, j] ** 2
+        if not root[j, j] > UNDETERMINED * np.sqrt(energy):
+            return
+    for o in range(theta.shape[1]):
+        for i in range(n - 1, -1, -1):
+            total = root[i, n + o]
+            for j in range(i + 1, n):
+                total -= root[i, j] * theta[j, o]
+            theta[i, o] = total / root[i, i]

@@ -1,0 +1,377 @@
+"""Recursive identification of Hammerstein-ARX models, sample by sample (Luo, Algorithm 3.2, indices corrected).
+
+The recursion minimises, after every sample,
+
+    sum_t lambda^(rows used after t) a(t) |y(t) - theta^T phi(t)|^2
+        + lambda^(rows used) (theta - theta_0)^T P_0^-1 (theta - theta_0),
+
+where phi(t) holds y(t-1), .. and eta(u(t - nk)), .. and meets y(t), and the first row is the first one with all its
+lags. It is carried in square-root information form (`optid.identify.recursive.kernel`), which is Algorithm 3.2 in exact
+arithmetic and does not lose symmetry or definiteness in long runs.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.bases import parse
+from optid.bases.basis import Basis
+from optid.data.channels import channel_units, check_distinct, listed, sampling_time
+from optid.data.record import Data
+from optid.data.streams import Stream
+from optid.errors import DataError, RankError, StructureError
+from optid.identify.recursive.intake import as_block, prior_factor, row_weights
+from optid.identify.recursive.splitting import block_grams, leading_pair, theta_matrices
+from optid.identify.recursive.trace import Trace
+from optid.models import HammersteinARX
+from optid.models.layout import Layout
+from optid.models.nonlinearity import Nonlinearity
+from optid.statistics import Statistics
+from optid.statistics.factors import dependent_column
+from optid.statistics.sums import rows_present
+from optid.structures.whitening import invert_triangular
+
+CHUNK = 4096
+"""Samples whose basis functions are evaluated at a time."""
+
+SPLITS = ("whitened", "plain")
+
+
+class RecursiveARX:
+    """A Hammerstein-ARX model that is updated as samples arrive.
+
+    It is a state: `update` changes it. The estimate is over-parametrised, one matrix Theta_c per input; `model` splits
+    off the rank-one factors whenever it is asked. Nothing is forgotten while nothing is learned: a row that touches a
+    missing sample, or has weight zero, leaves the information as it is, while the lags move on.
+
+    Attributes:
+        layout: the columns of phi.
+        forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
+        dt: sampling time.
+        samples: samples seen.
+        candidates: rows there would have been, had no sample been missing.
+        rows: rows used.
+        root: (n + l, n + l) the information, upper triangular R of [Phi | Y]: P = (R^T R)^-1 of its first n columns.
+        past_u: (reach, m) the last inputs, for the lags.
+        past_y: (reach, l) the last outputs.
+        since_restart: samples since `restart`.
+    """
+
+    def __init__(
+        self,
+        *,
+        na: int,
+        nb: int | Sequence[int],
+        basis: Basis | str | Sequence[Basis | str],
+        nk: int | Sequence[int] = 0,
+        inputs: str | Sequence[str] = "u",
+        outputs: str | Sequence[str] = "y",
+        dt: float = 1.0,
+        forgetting: float = 1.0,
+        theta0: ArrayLike = 0.0,
+        P0: ArrayLike = np.inf,
+        input_units: str | Sequence[str] | None = None,
+        output_units: str | Sequence[str] | None = None,
+    ) -> None:
+        """Start from what is known before the first sample.
+
+        Args:
+            na: number of past outputs.
+            nb: number of coefficients of B, one per input or one for all.
+            basis: basis of the nonlinearity, with its interval, one per input or one for all.
+            nk: delay in samples, one per input or one for all.
+            inputs: names of the inputs; their number is the number of inputs.
+            outputs: names of the outputs.
+            dt: sampling time.
+            forgetting: lambda in (0, 1].
+            theta0: prior estimate: a number, (n,) or (n, l) in the order of `layout.names()`.
+            P0: prior covariance over the noise variance: a number, (n,) diagonal or (n, n). Infinity is no prior at
+                all, and then the estimate is that of the batch least squares.
+            input_units: units of the inputs.
+            output_units: units of the outputs.
+
+        Raises:
+            StructureError: impossible orders, a basis without interval, a forgetting factor outside (0, 1], a P0 that
+                is not positive.
+        """
+        names_u, names_y = listed(inputs) or [], listed(outputs) or []
+        m = len(names_u)
+        bases = tuple(parse(b) if isinstance(b, str) else b for b in _each(basis, m))
+        self.layout = Layout(na, _each(nb, m), _each(nk, m), bases, tuple(names_y), tuple(names_u))
+        check_distinct(names_u + names_y)
+        for channel, one in zip(names_u, bases):
+            if one.interval is None and type(one).__name__ != "Linear":
+                raise StructureError(
+                    f"The basis of input {channel!r} has no interval: a recursion does not know the range of the input "
+                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper))."
+                )
+        if not 0 < forgetting <= 1:
+            raise StructureError(f"forgetting={forgetting!r}: a factor above 0 and at most 1, such as 0.995.")
+        self.forgetting = float(forgetting)
+        self.dt = sampling_time(dt)
+        self.input_units = channel_units(input_units, m, "input_units")
+        self.output_units = channel_units(output_units, self.layout.l, "output_units")
+        self.samples = self.candidates = self.rows = 0
+        self.root = prior_factor(theta0, P0, self.layout)
+        self.restart()
+
+    @classmethod
+    def like(cls, data: Data | Stream, **settings: Any) -> "RecursiveARX":
+        """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
+
+        Args:
+            data: the record, in raw units; its samples are not used (see `read`).
+            settings: na, nb, basis and the other arguments of the class.
+
+        Raises:
+            DataError: detrended or scaled data.
+        """
+        _check_raw(data)
+        lo, hi = data.ranges() if isinstance(data, Stream) else _ranges(data)
+        bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
+        return cls(
+            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, lo, hi)], inputs=data.inputs,
+            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings,
+        )
+
+    # -- samples ---------------------------------------------------------------------------------------------------
+
+    def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
+        """Take in the next sample, or the next block of them.
+
+        Args:
+            u: (N, m) inputs, or (N,) for one input; one sample as (m,), or a number for one input. NaN = missing.
+            y: (N, l) outputs, in the same way.
+            weights: a(t) >= 0, one number or (N,); 0 leaves a row out.
+
+        Returns:
+            (N, l) innovations y(t) - theta(t-1)^T phi(t); NaN where the row was not used and where the past did not
+            determine the prediction.
+
+        Raises:
+            DataError: wrong shape, infinite sample, a sample outside a basis with outside="error". The state is then
+                unchanged.
+        """
+        return self._absorb(u, y, weights, 0)[0]
+
+    def trace(self, u: ArrayLike, y: ArrayLike, every: int = 1, weights: ArrayLike = 1.0) -> Trace:
+        """Take in a block as `update` does and record the estimate on the way.
+
+        Args:
+            u: as in `update`.
+            y: as in `update`.
+            every: the estimate is recorded after every so many samples, counted from the first one seen.
+            weights: as in `update`.
+        """
+        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
+            raise StructureError(f"every={every!r}: record after every so many samples, a whole number from 1.")
+        first = self.samples
+        innovations, theta = self._absorb(u, y, weights, int(every))
+        after = np.arange(first + 1, self.samples + 1)
+        return Trace(self.layout, after[after % every == 0], theta, innovations)
+
+    def read(self, data: Data | Stream) -> list[Array]:
+        """Take in a whole record, every experiment with lags of its own; returns the innovations of each.
+
+        Raises:
+            DataError: other channels than the model's, detrended or scaled data; and as `update`.
+        """
+        _check_raw(data)
+        if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
+            raise DataError(
+                f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
+                f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select."
+            )
+        experiments = [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]
+        innovations = []
+        for chunks in experiments:
+            self.restart()
+            innovations.append(np.concatenate([self.update(u, y) for u, y in chunks]))
+        return innovations
+
+    def restart(self) -> None:
+        """Forget the lagged samples, not the estimate: the next sample does not follow the last one."""
+        reach = self.layout.first_row
+        self.past_u, self.past_y = np.full((reach, self.layout.m), np.nan), np.full((reach, self.layout.l), np.nan)
+        self.since_restart = 0
+
+    def _absorb(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike, every: int) -> tuple[Array, Array]:
+        from optid.identify.recursive import kernel as recursion_kernel
+
+        layout, reach = self.layout, self.layout.first_row
+        u, y = as_block(u, layout.inputs, "u", self.samples), as_block(y, layout.outputs, "y", self.samples)
+        if len(u) != len(y):
+            raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
+        self._check_inside(u)
+        weights = row_weights(weights, len(u))
+        source, lag = _columns(layout)
+        innovations = np.full(y.shape, np.nan)
+        marks = np.zeros(len(u), bool)
+        if every:
+            marks[(np.arange(self.samples, self.samples + len(u)) + 1) % every == 0] = True
+        traced, recorded = np.empty((int(marks.sum()), layout.n_columns, layout.l)), 0
+        for start in range(0, len(u), CHUNK):
+            part = slice(start, start + CHUNK)
+            past_u, past_y = np.concatenate([self.past_u, u[part]]), np.concatenate([self.past_y, y[part]])
+            count, marked = len(past_y) - reach, int(marks[part].sum())
+            used = rows_present(past_u, past_y, layout) & (weights[part] > 0)
+            signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
+            self.rows = recursion_kernel.absorb(
+                self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
+                innovations[part], marks[part], traced[recorded : recorded + marked],
+            )
+            recorded += marked
+            complete = np.arange(self.since_restart, self.since_restart + count) >= reach
+            self.candidates += int(np.count_nonzero(complete & (weights[part] > 0)))
+            self.samples += count
+            self.since_restart += count
+            self.past_u, self.past_y = past_u[count:], past_y[count:]
+        return innovations, traced
+
+    def _check_inside(self, u: Array) -> None:
+        for channel, basis, x in zip(self.layout.inputs, self.layout.bases, u.T):
+            if basis.outside == "error" and basis.n_outside(x):
+                k = next(k for k in range(len(x)) if basis.n_outside(x[k : k + 1]))
+                raise DataError(
+                    f"input {channel!r}, sample {self.samples + k}: {x[k]:g} is outside the interval {basis.interval} "
+                    "of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
+                )
+
+    # -- what is known now -------------------------------------------------------------------------------------------
+
+    @property
+    def statistics(self) -> Statistics:
+        """Everything the rows say, the prior included, as the batch statistics of the same layout."""
+        root = self.root.copy()
+        return Statistics(self.layout, root.T @ root, self.rows, self.candidates, root)
+
+    @property
+    def theta(self) -> Array:
+        """The estimate (n, l), in the order of `layout.names()`.
+
+        Raises:
+            RankError: the rows so far do not determine it; the message names the column.
+        """
+        from scipy.linalg import solve_triangular
+
+        return solve_triangular(self._determined(), self.root[: self.layout.n_columns, self.layout.n_columns :])
+
+    @property
+    def P(self) -> Array:
+        """The matrix P (n, n) of Algorithm 3.2; times the noise variance, the covariance of the estimate.
+
+        Raises:
+            RankError: as `theta`.
+        """
+        inverse = invert_triangular(self._determined(), lower=False)
+        return inverse @ inverse.T
+
+    def _determined(self) -> Array:
+        """Return the factor R (n, n) of the information, or refuse when it is singular."""
+        n = self.layout.n_columns
+        column = dependent_column(self.root, n, "qr")
+        if column is not None:
+            raise RankError(
+                f"The {self.rows} rows so far do not determine the coefficient of {self.layout.names()[column]}. Wait "
+                "for samples that excite it, use fewer lags or basis functions, or give a finite P0."
+            )
+        return self.root[:n, :n]
+
+    @property
+    def matrices(self) -> tuple[Array, ...]:
+        """Theta_c (P_c, nb_c l) of every input, lags inner, outputs outer.
+
+        The ratio of its second to its first singular value tells how far the record is from a Hammerstein system.
+
+        Raises:
+            RankError: as `theta`.
+        """
+        return theta_matrices(self.theta, self.layout)
+
+    def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinARX:
+        """Split off the rank-one factors of the present estimate.
+
+        Args:
+            split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or
+                "plain" (SVD of Theta, as in the dissertation).
+            gauge: "norm", "gain" or "b0", as in `HammersteinARX.regauge`.
+
+        Raises:
+            RankError: as `theta`.
+            StructureError: unknown split or gauge.
+        """
+        if split not in SPLITS:
+            raise StructureError(f"split={split!r}: use one of {', '.join(map(repr, SPLITS))}.")
+        layout, theta = self.layout, self.theta
+        grams = block_grams(self.root, layout) if split == "whitened" else [None] * layout.m
+        pairs = [leading_pair(matrix, gram, b, layout.l) for matrix, gram, b in zip(self.matrices, grams, layout.nb)]
+        a = theta[: layout.na * layout.l].reshape(layout.na, layout.l, layout.l).transpose(0, 2, 1)
+        return HammersteinARX(
+            a=a[:, 0, 0] if layout.l == 1 else a,
+            b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
+            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
+            nk=layout.nk, offset=theta[layout.offset], dt=self.dt, inputs=layout.inputs, outputs=layout.outputs,
+            input_units=self.input_units, output_units=self.output_units,
+        ).regauge(gauge)
+
+    def __repr__(self) -> str:
+        return (
+            f"RecursiveARX: {', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}, na {self.layout.na}, "
+            f"nb {self.layout.nb}, nk {self.layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
+            f"{self.samples} samples"
+        )
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> Path:
+        """Write the whole state to an npz file, from which `load` continues bit for bit.
+
+        The file appears complete or not at all.
+        """
+        from optid.identify.recursive.file import save
+
+        return save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "RecursiveARX":
+        """Restore a state.
+
+        Args:
+            path: file written by `save`.
+            functions: the functions of UserFunctions bases by name, which a file does not hold.
+
+        Raises:
+            ModelFileError: truncated, of another version, or not a state of a recursion.
+        """
+        from optid.identify.recursive.file import load
+
+        return load(path, functions)
+
+
+def _each(value: Any, m: int) -> tuple[Any, ...]:
+    """One entry per input; a list is taken as it is, and `Layout` refuses a wrong length."""
+    return tuple(value) if isinstance(value, list | tuple) else (value,) * m
+
+
+def _check_raw(data: Data | Stream) -> None:
+    if not data.transform.is_identity:
+        raise DataError("The data were detrended or scaled; a recursion works in raw units: use data.raw().")
+
+
+def _ranges(data: Data) -> tuple[list[float], list[float]]:
+    return [c.low for c in data.channels[: data.m]], [c.high for c in data.channels[: data.m]]
+
+
+def _columns(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Return which signal, [-y | eta_1 | eta_2 ..], and which lag every column of phi but the last takes."""
+    start = layout.l
+    source, lag = [np.tile(np.arange(start), layout.na)], [np.repeat(np.arange(layout.na) + 1, start)]
+    for lags, basis in zip(layout.lags, layout.bases):
+        source.append(np.tile(start + np.arange(basis.size), len(lags)))
+        lag.append(np.repeat(np.array(lags), basis.size))
+        start += basis.size
+    return np.concatenate(source).astype(np.intp), np.concatenate(lag).astype(np.intp)

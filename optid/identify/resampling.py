@@ -1,0 +1,170 @@
+"""Intervals from refits: the residual bootstrap of an ARX model.
+
+The outputs are simulated again from the fitted model with its own residuals drawn with replacement, and every record so
+made is fitted with the same formulation, penalties and constraints (Efron and Tibshirani, An Introduction to the
+Bootstrap, 1993, chapters 8 and 13). It needs no linearisation and no least squares, so it also serves robust losses
+and curved constraints, at the price of as many fits.
+"""
+
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.data.streams import Stream
+from optid.data.stretches import interpolated
+from optid.errors import DataError, DataWarning, StructureError
+from optid.identify.uncertainty import Quantity, Uncertainty, aligned
+from optid.models import simulation
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+    from optid.models import HammersteinARX
+
+Kind = Literal["percentile", "basic"]
+
+FAILED = 0.1
+"""Share of refits without a point above which the user is told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refits:
+    """Intervals from the scatter of refits.
+
+    Attributes:
+        reference: the fitted model.
+        models: the refitted models, in its gauge and with its signs.
+        kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
+    """
+
+    reference: "HammersteinARX"
+    models: tuple["HammersteinARX", ...] = field(repr=False)
+    kind: Kind
+
+    @property
+    def meaning(self) -> str:
+        """What the intervals are, in words."""
+        return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
+
+    def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
+        """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
+        value = np.ravel(np.asarray(quantity(self.reference), dtype=float))
+        deviations = np.array([np.ravel(np.asarray(quantity(model), dtype=float)) - value for model in self.models])
+        low, high = np.quantile(deviations, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+        error = np.std(deviations, axis=0, ddof=1)
+        return (error, low, high) if self.kind == "percentile" else (error, -high, -low)
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """The outcome of a residual bootstrap; both intervals offer what `optid.identify.uncertainty.Uncertainty` offers.
+
+    Attributes:
+        percentile: quantiles of the refits.
+        basic: the same reflected at the estimate, which undoes a bias instead of doubling it.
+        models: the refitted models.
+        failed: refits that gave no point.
+    """
+
+    percentile: Uncertainty
+    basic: Uncertainty
+    models: tuple["HammersteinARX", ...] = field(repr=False)
+    failed: int
+
+
+def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, solver: str = "auto") -> Bootstrap:
+    """Refit to records simulated with resampled residuals.
+
+    Rows of residuals are drawn together for all outputs, centred and inflated by the degrees of freedom. The first
+    samples of every experiment and the pattern of missing samples are those of the record; where an input is missing
+    the simulation interpolates it, and the rows it touches stay out of the refits.
+
+    Args:
+        fit: a fit to a record in memory.
+        runs: number of refits, at least 40.
+        seed: seed of the draws.
+        level: probability that an interval contains the truth, in (0, 1).
+        solver: back end of the refits.
+
+    Raises:
+        StructureError: a fit to a stream, too few runs, an impossible level.
+        DataError: the fitted model is so unstable that its simulation leaves the range of numbers.
+
+    Warns:
+        DataWarning: more than a tenth of the refits gave no point.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    from optid.identify.fitting import fit as refit
+
+    if isinstance(fit.data, Stream):
+        raise StructureError("a stream cannot be simulated again; read the record, or use fit.uncertainty")
+    if fit.model is None:
+        raise StructureError(f"this fit has no model to resample: {fit.solution.reason or fit.solution.status}")
+    if fit.model.kind != "HammersteinARX":
+        raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
+    if runs < 40 or not 0 < level < 1:
+        raise StructureError(f"runs={runs}, level={level}: at least 40 runs and a level between 0 and 1 are needed")
+    models, failed = [], 0
+    steps = track(_records(fit, runs, seed), description="bootstrap", total=runs, transient=True,
+                  console=Console(stderr=True), disable=not sys.stderr.isatty())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # they speak of the record and were given at the fit
+        for record in steps:
+            again = refit(record, fit.formulation, solver=solver, prove=False, raises=False, **fit.arguments)
+            if again.model is None:
+                failed += 1
+            else:
+                models.append(aligned(again.model, fit.model))
+    if failed > FAILED * runs:
+        warnings.warn(f"{failed} of {runs} refits gave no point: the intervals rest on the others", DataWarning,
+                      stacklevel=2)
+    if len(models) < 2:
+        raise StructureError(f"{failed} of {runs} refits gave no point: there is no scatter to report")
+    refits = tuple(models)
+    percentile, basic = (Uncertainty(fit, float(level), Refits(fit.model, refits, kind))
+                         for kind in ("percentile", "basic"))
+    return Bootstrap(percentile, basic, refits, failed)
+
+
+def _records(fit: "Fit", runs: int, seed: int) -> Iterator[Data]:
+    """Yield the resampled records, in the units of the record fitted."""
+    data: Data = fit.data  # type: ignore[assignment]
+    model = fit.program.recover(fit.solution.values)
+    residuals = _residuals(model, data)
+    rng = np.random.default_rng(seed)
+    for _ in range(runs):
+        outputs = iter([_simulated(model, e.u, e.y, residuals[rng.integers(len(residuals), size=len(e.y))])
+                        for e in data.experiments])
+        yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
+
+
+def _residuals(model: "HammersteinARX", data: Data) -> Array:
+    """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
+    rows = np.vstack([e.y - simulation.predict_record(model, e.u, e.y) for e in data.experiments])
+    rows = rows[~np.isnan(rows).any(axis=1)]
+    l = model.l  # noqa: E741
+    parameters = model.na * l * l + l + sum(f.mu.size + b.size - 1 for f, b in zip(model.nonlinearities, model.b))
+    return (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - parameters / l, 1.0))
+
+
+def _simulated(model: "HammersteinARX", u: Array, y: Array, errors: Array) -> Array:
+    """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
+    n = model.memory
+    u, start = interpolated(u), interpolated(y)[:n]
+    right = simulation.driven(model, u[n:]) + errors[n:]
+    state = simulation.following_state(model, u[:n], start)
+    count = min(n, len(right))
+    right[:count] += state[:count]
+    outputs = np.vstack([start, simulation.filtered(model, right)])
+    if not np.isfinite(outputs).all():
+        raise DataError("the simulation of the fitted model leaves the range of numbers, so it cannot be resampled; "
+                        "identify it with a stability constraint")
+    outputs[np.isnan(y)] = np.nan
+    return outputs

@@ -1,0 +1,131 @@
+"""Choose the weight of a penalty: along a path, or by hold-out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optid.data.record import Data
+from optid.errors import StructureError
+from optid.identify.fitting import Fit, fit, resolve
+
+PENALTIES = ("ridge", "curvature", "weight")
+GRID = 13
+SPAN = 1e6
+
+
+@dataclass(frozen=True)
+class Path:
+    """Fits along a grid of penalty weights.
+
+    Attributes:
+        penalty: name of the argument that was varied.
+        weights: (k,) the grid, increasing.
+        fits: one per weight.
+        scores: (k,) mean one-step fit in % on the hold-out part; NaN where there was none.
+    """
+
+    penalty: str
+    weights: np.ndarray
+    fits: tuple[Fit, ...]
+    scores: np.ndarray
+
+    @property
+    def best(self) -> int:
+        """Index of the largest weight whose score is within 0.02 points of the best: the simplest of equals."""
+        close = np.flatnonzero(self.scores >= np.nanmax(self.scores) - 0.02)
+        return int(close[-1])
+
+    def __str__(self) -> str:
+        lines = [f"{self.penalty:>12}   objective   hold-out one-step fit (%)   singular values 2/1"]
+        for i, (weight, one, score) in enumerate(zip(self.weights, self.fits, self.scores)):
+            mark = " <" if np.isfinite(score) and i == self.best else ""
+            lines.append(f"{weight:12.4g}   {one.solution.objective:9.4g}   {score:25.3f}   {_second(one):19.2e}{mark}")
+        return "\n".join(lines)
+
+
+def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float] | None = None,
+         holdout: float = 0.3, **arguments: Any) -> Path:
+    """Fit along a grid of weights of one penalty.
+
+    A penalty that is a parameter of the programme (the nuclear norm) is solved again from the solution before, without
+    compressing or compiling anything twice.
+
+    Args:
+        data: the record.
+        formulation: name of the formulation.
+        penalty: "ridge", "curvature" or "weight" (of the nuclear norm).
+        weights: grid; default 13 values over six decades below the energy of the record.
+        holdout: share of every experiment, from its end, that is kept for the score; 0 means no score.
+        arguments: as for `optid.fit`.
+
+    Raises:
+        StructureError: unknown penalty or an impossible share.
+    """
+    if penalty not in PENALTIES:
+        raise StructureError(f"penalty is one of {', '.join(PENALTIES)}; got {penalty!r}")
+    if not 0 <= holdout < 1:
+        raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}")
+    train, test = data.split(1 - holdout) if holdout else (data, None)
+    grid = default_weights(train) if weights is None else np.sort(np.asarray(weights, dtype=float))
+    fits, scores = [], []
+    for weight in grid:
+        if fits and penalty in fits[-1].program.parameters:
+            one = resolve(fits[-1], {penalty: float(weight)}, solver=arguments.get("solver", "auto"))
+        else:
+            one = fit(train, formulation, **{**arguments, penalty: float(weight)})
+        fits.append(one)
+        scores.append(_score(one, test))
+    return Path(penalty, grid, tuple(fits), np.array(scores))
+
+
+def fit_by_holdout(data: Data, formulation: str, *, penalty: str, weights: Sequence[float] | None = None,
+                   holdout: float = 0.3, **arguments: Any) -> Fit:
+    """Choose the weight of a penalty by hold-out and fit the whole record with it.
+
+    The chosen weight is in ``fit.arguments[penalty]``; the findings name it with its score.
+
+    Args:
+        data: the record.
+        formulation: name of the formulation.
+        penalty: as in `path`.
+        weights: as in `path`.
+        holdout: as in `path`, above 0.
+        arguments: as for `optid.fit`.
+    """
+    if not holdout > 0:
+        raise StructureError("hold-out needs a share above 0")
+    found = path(data, formulation, penalty=penalty, weights=weights, holdout=holdout, **arguments)
+    weight = float(found.weights[found.best])
+    final = fit(data, formulation, **{**arguments, penalty: weight})
+    sentence = (f"{penalty} = {weight:.4g} chosen by hold-out ({100 * holdout:.0f} % of the record): one-step fit "
+                f"{found.scores[found.best]:.2f} % there")
+    return replace(final, findings=(*final.findings, sentence))
+
+
+def default_weights(data: Data) -> np.ndarray:
+    """Return 13 weights over six decades, the largest a hundredth of the energy of the outputs about their mean."""
+    energy = sum(float(np.nansum((e.y - np.nanmean(e.y, axis=0)) ** 2)) for e in data.experiments)
+    return 0.01 * energy * np.logspace(-np.log10(SPAN), 0, GRID)
+
+
+def _score(one: Fit, test: Data | None) -> float:
+    if test is None:
+        return float("nan")
+    from optid.identify.validation import fit_percent
+
+    raw = test.raw()
+    predicted = one.model.predict(raw)
+    several = predicted if isinstance(predicted, list | tuple) else [predicted]
+    return float(np.nanmean(fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(several))))
+
+
+def _second(one: Fit) -> float:
+    """Largest ratio of the second to the first singular value over the channels."""
+    ratios = [0.0]
+    for theta in one.program.compressed.matrices(one.solution.values):
+        values = np.linalg.svd(theta, compute_uv=False)
+        if values.size > 1 and values[0] > 0:
+            ratios.append(float(values[1] / values[0]))
+    return max(ratios)

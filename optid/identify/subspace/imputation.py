@@ -1,0 +1,104 @@
+"""Missing outputs estimated by a model, for projections whose windows must be complete.
+
+With outputs missing here and there, few windows of a block Hankel matrix are complete. A first model, of linearly
+interpolated outputs, predicts the missing outputs one step ahead; the next model is that of the record so completed,
+and so on until the estimates stay (the expectation step of Dempster, Laird and Rubin 1977 with the steady predictor).
+A completed record is a trajectory of the innovation form whose innovations are zero where outputs are missing: the
+true model is a fixed point.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.data.stretches import interpolated, runs_of
+from optid.errors import DataError, RankError
+from optid.identify.subspace.methods import BEYOND
+from optid.models.hammerstein_ss import HammersteinSS
+
+ROUNDS = 12
+"""Models at most."""
+
+SETTLED = 1e-3
+"""Change of the estimates (root mean square, in standard deviations of their outputs) below which no model follows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Imputation:
+    """A record whose missing outputs are estimated.
+
+    Attributes:
+        records: (N, m + l) arrays [u | y], one per experiment; an output that could not be predicted is NaN.
+        missing: number of missing outputs.
+        samples: number of outputs, present or missing.
+        rounds: number of models.
+        change: last change of the estimates, in standard deviations of their outputs.
+    """
+
+    records: list[Array]
+    missing: int
+    samples: int
+    rounds: int
+    change: float
+
+    def __str__(self) -> str:
+        """Say what was estimated and how."""
+        return (f"{self.missing} of {self.samples} estimated for the projections by {self.rounds} preliminary models, "
+                f"the first from interpolated outputs (last change {self.change:.1e} standard deviations)")
+
+
+def count_windows(records: Sequence[Array], rows: int) -> tuple[int, int]:
+    """Return the number of windows of so many samples in which nothing is missing, and of all windows."""
+    complete = whole = 0
+    for record in records:
+        whole += max(len(record) - rows + 1, 0)
+        lengths = np.diff(runs_of(~np.isnan(record).any(axis=1)), axis=1)
+        complete += int(np.sum(np.maximum(lengths - rows + 1, 0)))
+    return complete, whole
+
+
+def _predicted(model: HammersteinSS, data: Data, filled: Sequence[Array]) -> list[Array]:
+    """Return the predictions (N, l); those from the estimates so far where a feedback of predictions runs away."""
+    try:
+        found = model.predict(data)
+    except DataError:
+        try:
+            found = model.predict(Data([e.u for e in data.experiments], list(filled), data.dt, list(data.inputs),
+                                       list(data.outputs)))
+        except DataError as error:
+            raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {error}") from error
+    return list(found) if isinstance(found, tuple) else [found]
+
+
+def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Imputation:
+    """Estimate the missing outputs of a record.
+
+    Args:
+        data: the record.
+        estimate: returns the model, with its gain K, of records (N, m + l) whose outputs are complete.
+
+    Raises:
+        RankError: an output with fewer than two samples present, or as `estimate`.
+    """
+    data = data.without_transform()
+    outputs = [e.y for e in data.experiments]
+    lost = [np.isnan(y) for y in outputs]
+    stacked = np.vstack(outputs)
+    if np.any(np.sum(~np.isnan(stacked), axis=0) < 2):
+        raise RankError("an output has fewer than two samples: leave it out")
+    spread, low, high = np.nanstd(stacked, axis=0), np.nanmin(stacked, axis=0), np.nanmax(stacked, axis=0)
+    low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
+    filled, count, change, rounds = [interpolated(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
+    while rounds < ROUNDS and change > SETTLED:
+        rounds += 1
+        model = estimate([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)])
+        predicted = [np.clip(p, low, high) for p in _predicted(model, data, filled)]
+        new = [np.where(gone, p, y) for gone, p, y in zip(lost, predicted, outputs)]
+        moved = np.vstack([a - b for a, b in zip(new, filled)]) / spread
+        change = float(np.sqrt(np.nansum(moved**2) / count))
+        filled = new
+    return Imputation([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)], count, stacked.size, rounds,
+                      change)

@@ -1,0 +1,265 @@
+"""The (A, C) step of the subspace methods: instruments, projection, preliminary models, simulated feedback."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.errors import DataWarning, StructureError
+from optid.identify.subspace.realisation import Range, estimate_range
+from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
+from optid.statistics.rq import RQ, rq
+
+INSTRUMENTS = ("past", "inputs", "inputs+past", "simulated", "simulated+past")
+GRID = 2001
+"""Points at which the feedback functions are tabulated for simulated instruments, which need not be exact."""
+
+CHUNK = 8192
+"""Samples expanded at a time."""
+
+BEYOND = 0.2
+"""Simulated outputs are clipped to the range of the record, wider by this share of it on either side."""
+
+KEPT = 0.5
+"""Share of the windows left by missing samples below which the user is told."""
+
+PER_ROW = 2.0
+"""Windows per row of the Hankel matrix that are wanted; block rows are chosen so that a record has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """What the projection step leaves.
+
+    Attributes:
+        statistics: moments of the windows of 2 block_rows samples.
+        blocks: the RQ decomposition.
+        range: its weighted singular value decomposition.
+        instruments: word of the instruments.
+        scale: (l,) standard deviations of the outputs, by which the rows of r22 were divided.
+    """
+
+    statistics: HankelStatistics
+    blocks: RQ
+    range: Range
+    instruments: str
+    scale: Array
+
+    @property
+    def block_rows(self) -> int:
+        """Number of block rows of the future."""
+        return self.statistics.rows // 2
+
+    def gamma(self, n: int) -> Array:
+        """Return Gamma (block_rows l, n) in balanced coordinates in which the states have about unit size."""
+        return self.range.gamma(n) / self.statistics.windows**0.25
+
+    def weighted(self, weighting: str, l: int) -> "Projection":  # noqa: E741
+        """Return the same decomposition in another weighting, as in `estimate_range`, of l outputs."""
+        return replace(self, range=estimate_range(self.blocks, l, weighting, self.scale))
+
+
+def positions(
+    statistics: HankelStatistics, expansion: Expansion, instruments: str, offset: bool, alpha: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
+
+    The last block row of the feedback functions never reaches the future outputs and is left out.
+
+    Args:
+        statistics: moments of windows of 2 alpha samples or more.
+        expansion: the signals.
+        instruments: "past" (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs),
+            "inputs+past", "simulated" (past and future inputs and functions of simulated outputs), "simulated+past".
+        offset: whether a constant is among instruments and regressors.
+        alpha: block rows of the past and of the future.
+    """
+    at = statistics.at
+    past, future, both = range(alpha), range(alpha, 2 * alpha), range(2 * alpha)
+    one = np.zeros(int(offset), dtype=np.intp)
+    phi = np.concatenate([one, at(expansion.eta, future), at(expansion.zeta, future[:-1])])
+    z = [one]
+    if instruments == "past":
+        z.append(at(expansion.eta, past))
+    else:
+        z.append(at(expansion.eta, both))
+    if instruments.startswith("simulated"):
+        z.append(at(expansion.zeta_simulated, both))
+    if instruments.endswith("past"):
+        z += [at(expansion.zeta, past), at(expansion.y, past)]
+    return np.concatenate(z), phi, at(expansion.y, future)
+
+
+def project(
+    records: Sequence[Array],
+    expansion: Expansion,
+    block_rows: int,
+    *,
+    instruments: str,
+    offset: bool = True,
+    form: str = "projection",
+    tolerance: float | None = None,
+    weighting: str = "moesp",
+) -> Projection:
+    """Take the statistics and decompose.
+
+    Args:
+        records: raw channels [u | y] or [u | y | simulated y] per experiment.
+        expansion: the signals.
+        block_rows: of the future; the past has as many.
+        instruments: as in `positions`.
+        offset: whether the system has a constant.
+        form: "projection" or "correlation".
+        tolerance: of the pseudo-inverse; None asks for regular regressors.
+        weighting: as in `estimate_range`.
+
+    Raises:
+        StructureError: unknown words.
+        RankError: records that are too short, or do not excite the regressors.
+    """
+    if instruments not in INSTRUMENTS:
+        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
+    statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
+    statistics.check()
+    if statistics.windows < KEPT * statistics.candidates:
+        warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "
+                      f"{2 * block_rows} samples: fewer block rows keep more.", DataWarning, stacklevel=2)
+    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
+    blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
+    scale = _spread(statistics, expansion, offset)
+    return Projection(statistics, blocks, estimate_range(blocks, expansion.l, weighting, scale), instruments, scale)
+
+
+def tested_order(
+    records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool
+) -> tuple[int, str]:
+    """Return the order whose trailing singular values are noise by their own distribution, and the reason in words.
+
+    Arguments as in `project`.
+
+    Raises:
+        RankError: records shorter than three times the block rows, or regressors that the instruments do not reach.
+    """
+    from optid.identify.order import rank_test
+
+    statistics = hankel_statistics(records, 3 * block_rows, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
+    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
+    return rank_test(statistics, z, phi, y, rows=2 * block_rows, largest=(block_rows - 1) * expansion.l).choice
+
+
+def _spread(statistics: HankelStatistics, expansion: Expansion, offset: bool) -> Array:
+    """Standard deviation of every output (root mean square without an offset); one output is left as it is."""
+    if expansion.l == 1:
+        return np.ones(1)
+    rows = [statistics.at([o]) for o in expansion.y]
+    energy = np.array([np.mean(np.diag(statistics.gram)[at]) for at in rows]) / statistics.windows
+    if offset:
+        energy -= np.array([np.mean(statistics.gram[0, at]) for at in rows]) ** 2 / statistics.windows**2
+    return np.sqrt(np.maximum(energy, 1e-300))
+
+
+def default_block_rows(records: Sequence[Array], expansion: Expansion, nx: int | None) -> int:
+    """Return block rows that a record can carry: 10, or twice the order, or fewer on a short record.
+
+    Args:
+        records: raw channels, one per experiment.
+        expansion: the signals.
+        nx: the order, or None where it is to be found.
+    """
+    wanted = 10 if nx is None else max(10, 2 * nx)
+    width = expansion.p + 2 * expansion.q + expansion.l
+    count = sum(len(record) for record in records)
+    affordable = int(count / (2 * (len(records) + PER_ROW * width)))  # windows = count - experiments (2 alpha - 1)
+    shortest = min(len(record) for record in records) // 2
+    return max(2 if nx is None else nx + 1, min(wanted, affordable, shortest))
+
+
+def check_order(nx: int, block_rows: int, outputs: int) -> None:
+    """Refuse an order that the block rows cannot carry.
+
+    Raises:
+        StructureError: with the largest order possible.
+    """
+    if block_rows <= nx:
+        raise StructureError(f"{block_rows} block rows for order {nx}: more block rows than states are needed; use "
+                             f"block_rows={nx + 1} or more, or nx={block_rows - 1} or less.")
+    if nx > (block_rows - 1) * outputs:
+        raise StructureError(f"order {nx} with {block_rows} block rows and {outputs} outputs: at most "
+                             f"{(block_rows - 1) * outputs}.")
+
+
+def signal_rank(projection: Projection) -> int:
+    """Return how many singular values are more than rounding, noise included."""
+    values = projection.range.values
+    return int(np.sum(values > 10 * len(projection.statistics.gram) * np.finfo(float).eps * values[0]))
+
+
+def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:
+    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output.
+
+    Args:
+        projection: with simulated feedback functions among its signals.
+        expansion: the signals.
+    """
+    statistics, shares, start = projection.statistics, [], 0
+    simulated = np.concatenate([[0], statistics.at(expansion.zeta_simulated, [0])])
+    for family in expansion.feedback:
+        own = statistics.at(expansion.zeta[start : start + family.size], [0])
+        triangle = statistics.triangle(np.concatenate([simulated, own]))
+        part, whole = triangle[1 : simulated.size, simulated.size :], triangle[1:, simulated.size :]
+        shares.append((float(np.sum(part**2) / np.sum(whole**2)), expansion.output_names[family.output]))
+        start += family.size
+    return min(shares)
+
+
+def simulate_clipped(
+    records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array, ez: Array, d: Array
+) -> list[Array]:
+    """Simulate the outputs from the inputs alone, as instruments: noise free, clipped to the range of the record.
+
+    The functions of a missing input count as zero.
+
+    Args:
+        records: raw channels [u | y], one per experiment.
+        expansion: the signals; its feedback functions may be empty.
+        a: (n, n).
+        c: (l, n).
+        bu: (n, p).
+        du: (l, p).
+        ez: (n, q).
+        d: (l,) offset.
+
+    Returns:
+        (N, l) per experiment.
+    """
+    from optid.statistics.subspace_kernels import clipped_run
+
+    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
+    low = np.nanmin([np.nanmin(record[:, m : m + l], axis=0) for record in records], axis=0)
+    high = np.nanmax([np.nanmax(record[:, m : m + l], axis=0) for record in records], axis=0)
+    low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
+    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
+    start = 0
+    for family in expansion.feedback:
+        e = ez[:, start : start + family.size]
+        grid = np.linspace(low[family.output], high[family.output], GRID)
+        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
+        start += family.size
+    simulated = []
+    open_loop = expansion.without_feedback()
+    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
+    for record in records:
+        out, x = np.empty((len(record), l)), np.zeros(n)
+        for first in range(0, len(record), CHUNK):
+            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
+            eta = np.where(np.isnan(eta), 0.0, eta)
+            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
+                        out[first : first + CHUNK])
+        simulated.append(out)
+    return simulated

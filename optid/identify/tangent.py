@@ -1,0 +1,230 @@
+"""The least-squares problem behind a fit, linearised at its solution in the tangent space of its constraints.
+
+A rank-one matrix ``mu bᵀ`` has one scale too many; the gauge of the programme fixes it. The tangent space is what the
+gauge and the user's equalities leave free, in coordinates where the information is the identity. Whatever does not
+depend on the gauge, such as ``mu bᵀ`` or a prediction, then has a covariance that does not depend on it either.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.psd import PSD
+from cvxpy.constraints.second_order import SOC
+from cvxpy.constraints.zero import Equality, Zero
+from cvxpy.expressions.expression import Expression
+
+from optid.arrays import Array
+from optid.errors import RankError, StructureError
+from optid.identify.intervals import LocalEstimate
+from optid.program.gradients import jacobians
+from optid.program.program import Program
+
+NO_EFFECT = 1e-10
+"""Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
+
+MEANINGS = {
+    "gaussian": "confidence intervals of least squares, Student's quantile",
+    "projected": "confidence intervals under inequalities: hull of projected posterior and basic bootstrap",
+    "penalised": "intervals of the posterior whose prior is the penalty: they cover on average over f, not pointwise",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """A fit as a local linear regression.
+
+    Attributes:
+        names: variables of the programme, in the order of x.
+        shapes: their shapes.
+        x: (n_x,) solution, every variable flattened column by column.
+        directions: (n_x, n) dx/dv, v the whitened tangent coordinates.
+        local: the estimate in these coordinates.
+        noise: (l, l) covariance of the equation error e, in units of the data fitted.
+        dof: degrees of freedom per output of that estimate.
+        parameters: effective number of parameters.
+        meaning: what the intervals are, one of `MEANINGS`.
+    """
+
+    names: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
+    x: Array
+    directions: Array
+    local: LocalEstimate = field(repr=False)
+    noise: Array
+    dof: float
+    parameters: float
+    meaning: str
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Name the parts of x."""
+        return unpacked(self.names, self.shapes, x)
+
+
+def linearise(fit: Any, draws: int, seed: int) -> Tangent:
+    """Linearise a fit.
+
+    Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
+    (sandwich form). The noise estimate comes from the minimum without the inequalities, so that active ones do not
+    bias it.
+
+    Args:
+        fit: a fit whose programme carries its compressed least-squares problem.
+        draws: random draws for intervals under inequalities.
+        seed: their seed.
+
+    Raises:
+        StructureError: a fit that is no least squares (robust loss, nuclear norm), or an active constraint that has no
+            linearisation.
+        RankError: a parameter without effect on the predictions, such as the numerator of an input whose f is zero.
+    """
+    program, compressed, found = fit.program, fit.program.compressed, fit.solution.values
+    _refuse(fit)
+    names = tuple(name for name in program.variables if name not in program.derived)
+    shapes = tuple(program.variables[name].shape for name in names)
+    x = np.concatenate([np.ravel(found[name], order="F") for name in names])
+    program.assign(found)
+    equalities, inequalities, slack = _constraint_rows(program, names)
+
+    lift, lifted = _differences(lambda x: compressed.lifted(unpacked(names, shapes, x)), x)
+    coefficients, regression = _differences(lambda x: compressed.regression(unpacked(names, shapes, x)).ravel(), x)
+    problem, statistics = compressed.problem, compressed.statistics
+    effect = problem.root @ lift
+    free, triangle, basis = _whitened(effect, equalities, names, shapes)
+    directions = free @ np.linalg.inv(triangle)
+    pull = basis.T @ (problem.root @ lifted - problem.target)
+    centre = -pull if len(slack) else np.zeros_like(pull)
+
+    n, l = statistics.layout.n_columns, len(statistics.layout.outputs)  # noqa: E741
+    root = statistics.root
+    sensitivity = np.einsum("ij,jok->oik", root[:n, :n], (coefficients @ directions).reshape(n, l, -1))
+    parameters = float(np.sum(sensitivity**2))
+    dof = statistics.rows - parameters / l
+    if not dof > 0:
+        raise RankError(f"{statistics.rows} rows for {parameters:.0f} parameters: none are left to estimate the noise")
+    theta = (regression + coefficients @ (directions @ centre)).reshape(n, l)
+    residual = root @ np.vstack([theta, -np.eye(l)])
+    noise = residual.T @ residual / dof
+
+    covariance = np.einsum("oij,op,pik->jk", sensitivity, noise, sensitivity)
+    penalised = parameters < len(centre) * (1 - 1e-9)
+    if penalised:
+        prior = np.eye(len(centre)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
+        covariance = covariance + float(np.trace(noise)) / l * prior
+    # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
+    scatter = _square_root(covariance) @ basis.T
+    local = LocalEstimate(centre, scatter, dof, inequalities @ directions, slack, draws, seed)
+    meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
+    return Tangent(names, shapes, x, directions, local, program.unit * noise, dof, parameters, MEANINGS[meaning])
+
+
+def unpacked(names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], x: Array) -> dict[str, Array]:
+    """Split a flat vector into named arrays, each filled column by column."""
+    edges = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+    return {name: part.reshape(shape, order="F") for name, shape, part in zip(names, shapes, np.split(x, edges))}
+
+
+def _refuse(fit: Any) -> None:
+    if not fit.solution.has_point:
+        raise StructureError("the fit has no point, so there is nothing to put intervals around")
+    if not all(hasattr(fit.program.compressed, part) for part in ("problem", "statistics", "regression", "lifted")):
+        raise StructureError(f"{fit.formulation!r} is no compressed least-squares problem; use optid.bootstrap")
+    loss = str(fit.arguments.get("loss", "squares"))
+    if loss != "squares":
+        raise StructureError(f"loss {loss!r} is not least squares, so that its standard errors do not follow from the "
+                             "statistics; use optid.bootstrap")
+    weight = fit.program.parameters.get("weight")
+    if weight is not None and np.any(np.asarray(weight.value) > 0):
+        raise StructureError("the nuclear norm shrinks Theta by an amount that no interval accounts for; refit with "
+                             "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
+
+
+def _differences(function: Any, x: Array) -> tuple[Array, Array]:
+    """Jacobian and value of a function that is affine in each entry of x alone, so that differences are exact."""
+    base = function(x)
+    jacobian = np.empty((base.size, x.size))
+    steps = np.maximum(np.abs(x), 1e-3 * max(float(np.max(np.abs(x))), 1e-300))
+    for j, step in enumerate(steps):
+        moved = x.copy()
+        moved[j] += step
+        jacobian[:, j] = (function(moved) - base) / (moved[j] - x[j])
+    return jacobian, base
+
+
+def _whitened(effect: Array, equalities: Array, names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...]
+              ) -> tuple[Array, Array, Array]:
+    """Return (free directions, R, Q) with effect @ free = Q R, after scaling every unknown by its effect."""
+    sizes = np.linalg.norm(effect, axis=0)
+    for name, part in unpacked(names, shapes, sizes).items():
+        if np.any(part <= NO_EFFECT * np.max(sizes)):
+            raise RankError(f"{name!r} has an entry without any effect on the predictions: its error is unbounded. "
+                            "Leave the channel out, or fix the entry by a constraint")
+    scale = 1.0 / sizes
+    rows = equalities * scale
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    _, values, vectors = np.linalg.svd(rows / np.where(lengths > 0, lengths, 1.0))
+    rank = int(np.count_nonzero(values > 1e-9 * max(float(values[0]) if values.size else 0.0, 1e-300)))
+    free = scale[:, None] * vectors[rank:].T
+    basis, triangle = np.linalg.qr(effect @ free)
+    diagonal = np.abs(np.diag(triangle))
+    if diagonal.size and np.min(diagonal) <= NO_EFFECT * np.max(diagonal):
+        raise RankError("a combination of the parameters has no effect on the predictions: its error is unbounded. "
+                        "Use fewer basis functions or lags, or fix it by a constraint")
+    return free, triangle, basis
+
+
+def _constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at the point."""
+    size = sum(program.variables[name].size for name in names)
+    equal: list[Array] = [np.zeros((0, size))]
+    above: list[Array] = [np.zeros((0, size))]
+    slack = [np.zeros(0)]
+    derived = {id(program.variables[name]) for name in program.derived}
+    for name, group in program.constraints.items():
+        for member in group:
+            if any(id(v) in derived for v in member.variables()):
+                continue
+            if isinstance(member, Equality | Zero):
+                equal.append(_gradient(program, names, name, member.args[0] if len(member.args) == 1 else member.expr))
+                continue
+            expression, sign = _one_sided(name, member)
+            if expression is not None:
+                above.append(sign * _gradient(program, names, name, expression))
+                slack.append(np.maximum(sign * np.ravel(np.asarray(expression.value), order="F"), 0.0))
+    return np.vstack(equal), np.vstack(above), np.concatenate(slack)
+
+
+def _one_sided(name: str, member: Constraint) -> tuple[Expression | None, float]:
+    """Return (expression, sign) with sign * expression >= 0; None for a matrix or cone constraint far from active."""
+    if isinstance(member, Inequality | NonPos):
+        return member.expr, -1.0
+    if isinstance(member, NonNeg):
+        return member.args[0], 1.0
+    if isinstance(member, PSD):
+        values = np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))
+        if values[0] > 1e-3 * np.max(np.abs(values)):
+            return None, 0.0
+    if isinstance(member, SOC):
+        head, tail = np.atleast_1d(member.args[0].value), np.atleast_1d(member.args[1].value)
+        if np.all(head - np.linalg.norm(tail, axis=0) > 1e-3 * np.abs(head)):
+            return None, 0.0
+    raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
+                         "use optid.bootstrap for intervals")
+
+
+def _gradient(program: Program, names: tuple[str, ...], name: str, expression: Expression) -> Array:
+    slopes = jacobians(expression)
+    if slopes is None:
+        raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap instead")
+    by_id = {variable.id: slope for variable, slope in slopes.items()}
+    variables = [program.variables[key] for key in names]
+    return np.hstack([by_id[v.id].toarray() if v.id in by_id else np.zeros((expression.size, v.size))
+                      for v in variables])
+
+
+def _square_root(matrix: Array) -> Array:
+    """Return the symmetric square root, which is unique."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T

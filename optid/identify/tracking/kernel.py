@@ -1,0 +1,186 @@
+"""Compiled loop of the subspace trackers, one sample after the other.
+
+PAST (Yang 1995) is a recursive least squares of x on y = W^T x. Its r x r information matrix is carried as a triangular
+factor, R^T R = forgetting-weighted sum of y y^T, so that it stays positive definite however long the run is;
+the gain g = (R^T R)^-1 y is that of the textbook recursion. OPAST (Abed-Meraim, Chkeif and Hua 2000) then multiplies
+W + e g^T by the inverse square root of its Gram matrix I + |e|^2 g g^T, which keeps W orthonormal.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+
+FADED = 1e-120
+"""Diagonal entry of R below which nothing is forgotten any further, so that silence does not end as zero over zero."""
+
+WEAK = 1e-8
+"""Pivot of the Gram matrix of the rows of W that are present, relative to its diagonal, below which they do not
+determine the coordinates of a sample."""
+
+RENEWED = 1024
+"""Samples after which the columns of an orthonormal W are orthonormalised again, against the creep of rounding."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def track(
+    basis: Array, root: Array, sums: Array, counts: NDArray[np.int64], x: Array, forgetting: float, orthonormal: bool,
+    residuals: Array, coordinates: Array,
+) -> None:
+    """Follow the subspace through one stretch of samples; state arrays change in place.
+
+    Args:
+        basis: (n, r) W.
+        root: (r, r) upper triangular factor R, diagonal >= 0.
+        sums: (2,) weighted count of samples used, and weighted sum of |e|^2 by entries present, scaled to n entries.
+        counts: (3,) samples seen, used, and passed over because their entries do not determine the coordinates.
+        x: (T, n) samples; NaN = missing.
+        forgetting: in (0, 1].
+        orthonormal: whether W is kept orthonormal (OPAST).
+        residuals: (T,) out: |x - W y| over the entries present, before the update; NaN where not used.
+        coordinates: (T, r) out: y; NaN where not used.
+    """
+    n, r = basis.shape
+    fade = np.sqrt(forgetting)
+    y, row, g, e = np.empty(r), np.empty(r), np.empty(r), np.empty(n)
+    gram = np.empty((r, r))
+    for t in range(len(x)):
+        counts[0] += 1
+        residuals[t] = np.nan
+        for j in range(r):
+            coordinates[t, j] = np.nan
+        present = 0
+        for i in range(n):
+            if not np.isnan(x[t, i]):
+                present += 1
+        if present == 0:
+            counts[2] += 1
+            continue
+        for j in range(r):
+            y[j] = 0.0
+            for i in range(n):
+                if not np.isnan(x[t, i]):
+                    y[j] += basis[i, j] * x[t, i]
+        if present < n:
+            if present < r or not _solved(basis, x[t], gram, y):
+                counts[2] += 1
+                continue
+        energy = 0.0
+        for i in range(n):
+            e[i] = 0.0
+            if not np.isnan(x[t, i]):
+                e[i] = x[t, i]
+                for j in range(r):
+                    e[i] -= basis[i, j] * y[j]
+                energy += e[i] * e[i]
+        residuals[t] = np.sqrt(energy)
+        for j in range(r):
+            coordinates[t, j] = y[j]
+            row[j] = y[j]
+        counts[1] += 1
+        sums[0] = forgetting * sums[0] + 1.0
+        share = (present - r) / (n - r) if n > r else 1.0
+        sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else sums[1] / max(sums[0] - 1.0, 1.0))
+        for i in range(r):
+            old = (fade if root[i, i] > FADED else 1.0) * root[i, i]
+            diagonal = np.sqrt(old * old + row[i] * row[i])
+            factor = old / root[i, i] if root[i, i] > 0.0 else 1.0
+            if diagonal == 0.0:
+                continue
+            cosine, sine = old / diagonal, row[i] / diagonal
+            root[i, i] = diagonal
+            for j in range(i + 1, r):
+                above = factor * root[i, j]
+                root[i, j] = cosine * above + sine * row[j]
+                row[j] = cosine * row[j] - sine * above
+        _gain(root, y, g)
+        size = 0.0
+        for j in range(r):
+            size += g[j] * g[j]
+        if orthonormal:
+            stretch = np.sqrt(1.0 + energy * size)
+            tau = -energy / (stretch * (1.0 + stretch))
+            scale = 1.0 + tau * size
+            for i in range(n):
+                inside = 0.0
+                for j in range(r):
+                    inside += basis[i, j] * g[j]
+                step = tau * inside + scale * e[i]
+                for j in range(r):
+                    basis[i, j] += step * g[j]
+            if counts[1] % RENEWED == 0:
+                _orthonormalise(basis)
+        else:
+            for i in range(n):
+                for j in range(r):
+                    basis[i, j] += e[i] * g[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gain(root: Array, y: Array, g: Array) -> None:
+    """Solve R^T R g = y."""
+    r = len(y)
+    for i in range(r):
+        total = y[i]
+        for j in range(i):
+            total -= root[j, i] * g[j]
+        g[i] = total / root[i, i] if root[i, i] > 0.0 else 0.0
+    for i in range(r - 1, -1, -1):
+        total = g[i]
+        for j in range(i + 1, r):
+            total -= root[i, j] * g[j]
+        g[i] = total / root[i, i] if root[i, i] > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solved(basis: Array, x: Array, gram: Array, y: Array) -> bool:
+    """Replace y = W_p^T x_p by the least-squares coordinates (W_p^T W_p)^-1 y of the rows p present, if they exist."""
+    n, r = basis.shape
+    for a in range(r):
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(n):
+                if not np.isnan(x[i]):
+                    total += basis[i, a] * basis[i, b]
+            gram[a, b] = total
+    for a in range(r):  # Cholesky, lower
+        whole = gram[a, a]
+        for b in range(a + 1):
+            total = gram[a, b]
+            for c in range(b):
+                total -= gram[a, c] * gram[b, c]
+            if a == b:
+                if not total > WEAK * max(whole, WEAK):
+                    return False
+                gram[a, a] = np.sqrt(total)
+            else:
+                gram[a, b] = total / gram[b, b]
+    for a in range(r):
+        for c in range(a):
+            y[a] -= gram[a, c] * y[c]
+        y[a] /= gram[a, a]
+    for a in range(r - 1, -1, -1):
+        for c in range(a + 1, r):
+            y[a] -= gram[c, a] * y[c]
+        y[a] /= gram[a, a]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _orthonormalise(basis: Array) -> None:
+    """Gram-Schmidt on columns that are nearly orthonormal."""
+    n, r = basis.shape
+    for j in range(r):
+        for k in range(j):
+            inner = 0.0
+            for i in range(n):
+                inner += basis[i, k] * basis[i, j]
+            for i in range(n):
+                basis[i, j] -= inner * basis[i, k]
+        length = 0.0
+        for i in range(n):
+            length += basis[i, j] * basis[i, j]
+        length = np.sqrt(length)
+        for i in range(n):
+            basis[i, j] /= length

@@ -1,0 +1,177 @@
+"""PAST and OPAST: a subspace that follows a stream of vectors.
+
+Sources: B. Yang, Projection approximation subspace tracking, IEEE Trans. Signal Processing 43 (1995); K. Abed-Meraim,
+A. Chkeif and Y. Hua, Fast orthonormal PAST algorithm, IEEE Signal Processing Letters 7 (2000).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.errors import DataError, StructureError
+from optid.identify.tracking.geometry import as_basis, check_dimension, orthonormal, principal_angles
+
+METHODS = ("past", "opast")
+MISSING = ("fill", "skip", "refuse")
+
+
+class SubspaceTracker:
+    """The dominant r-dimensional subspace of a stream of zero-mean vectors; `update` changes it.
+
+    A sample with missing entries is used through its least-squares coordinates on the rows of W that are present: the
+    missing entries are those the subspace says, and teach nothing. Where the entries do not determine the
+    coordinates the sample is passed over and counted.
+
+    Attributes:
+        n: dimension of the vectors.
+        r: dimension of the subspace.
+        method: "past", nearly orthonormal, or "opast", orthonormal at every sample.
+        forgetting: in (0, 1]; remembers about 1 / (1 - forgetting) samples.
+        missing: "fill" as above, "skip" leaves incomplete samples out, "refuse" raises by name.
+        names: of the coordinates.
+        W: (n, r) the basis as the recursion carries it.
+        root: (r, r) triangular factor of the weighted sum of y y^T, y = W^T x.
+        sums: (2,) weighted count of samples and weighted sum of residual energy.
+        counts: (3,) samples seen, used, passed over.
+    """
+
+    def __init__(
+        self, n: int, r: int, *, method: Literal["past", "opast"] = "opast", forgetting: float = 0.995,
+        start: ArrayLike | None = None, information: float = 1.0, missing: Literal["fill", "skip", "refuse"] = "fill",
+        names: Sequence[str] | None = None,
+    ) -> None:
+        """Begin a run.
+
+        Args:
+            n: dimension of the vectors.
+            r: dimension of the subspace, below n.
+            method: "past" or "opast".
+            forgetting: factor on earlier samples, in (0, 1].
+            start: (n, r) a first guess, orthonormalised; the first r coordinates when not given.
+            information: weight of the guess, in energy of y: the inverse of P(0) in the textbook form.
+            missing: what to do with incomplete samples.
+            names: one name per coordinate; x1, x2, ... when not given.
+
+        Raises:
+            StructureError: arguments out of range.
+            RankError: a guess with dependent columns.
+        """
+        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 2:
+            raise StructureError(f"n={n!r}: a whole number from 2 is needed.")
+        check_dimension(r, int(n) - 1)
+        if method not in METHODS or missing not in MISSING:
+            raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
+                                 f"{', '.join(MISSING)}.")
+        if not 0 < forgetting <= 1:
+            raise StructureError(f"forgetting={forgetting!r}: a number above 0, at most 1, is needed.")
+        if not (np.isfinite(information) and information > 0):
+            raise StructureError(f"information={information!r}: a positive number is needed.")
+        self.n, self.r, self.method, self.forgetting, self.missing = int(n), int(r), method, float(forgetting), missing
+        self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
+        if len(self.names) != self.n:
+            raise StructureError(f"{len(self.names)} names for {self.n} coordinates.")
+        guess = np.eye(self.n)[:, : self.r] if start is None else orthonormal(as_basis(start, self.n, "start"), "start")
+        if guess.shape[1] != self.r:
+            raise StructureError(f"start has {guess.shape[1]} columns for a subspace of dimension {self.r}.")
+        self.W = np.ascontiguousarray(guess)
+        self.root = np.sqrt(information) * np.eye(self.r)
+        self.sums, self.counts = np.zeros(2), np.zeros(3, dtype=np.int64)
+
+    def update(self, x: ArrayLike) -> Array:
+        """Follow a block (N, n) or one sample (n,).
+
+        Returns:
+            (N,) distance of every sample from the subspace before it was used; NaN where it was not.
+
+        Raises:
+            DataError: another shape, an infinite entry, or a missing one where missing="refuse", by name and sample.
+        """
+        from optid.identify.tracking.kernel import track
+
+        block = np.asarray(x, dtype=float)
+        block = block[None] if block.ndim == 1 else block
+        if block.ndim != 2 or block.shape[1] != self.n:
+            raise DataError(f"x has shape {np.shape(x)}: a block (N, {self.n}) or a sample ({self.n},) is needed.")
+        if not np.isfinite(block.sum()):
+            block = self._screened(block)
+        residuals, coordinates = np.empty(len(block)), np.empty((len(block), self.r))
+        track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block), self.forgetting,
+              self.method == "opast", residuals, coordinates)
+        return residuals
+
+    def _screened(self, block: Array) -> Array:
+        """Refuse what is infinite, or missing where that is not allowed."""
+        bad = np.isinf(block) | (np.isnan(block) if self.missing == "refuse" else False)
+        if bad.any():
+            k, i = (int(v[0]) for v in np.nonzero(bad))
+            word = "missing" if np.isnan(block[k, i]) else "infinite"
+            raise DataError(f"{self.names[i]} is {word} at sample {int(self.counts[0]) + k}: "
+                            + ("use missing='fill' or 'skip'." if word == "missing" else "NaN marks a missing entry."))
+        if self.missing == "skip":
+            block = np.where(np.isnan(block).any(axis=1, keepdims=True), np.nan, block)
+        return block
+
+    @property
+    def basis(self) -> Array:
+        """Orthonormal basis (n, r) of the tracked subspace."""
+        return orthonormal(self.W, "W")
+
+    @property
+    def projector(self) -> Array:
+        """Orthogonal projector (n, n) on the tracked subspace."""
+        basis = self.basis
+        return basis @ basis.T
+
+    @property
+    def energies(self) -> Array:
+        """Weighted mean energies along the principal axes inside the subspace, descending, (r,); NaN at the start."""
+        if self.sums[0] == 0:
+            return np.full(self.r, np.nan)
+        return np.linalg.svd(self.root, compute_uv=False) ** 2 / self.sums[0]
+
+    @property
+    def floor(self) -> float:
+        """Weighted mean energy per dimension outside the subspace, the size of the noise; NaN at the start."""
+        return float(self.sums[1] / self.sums[0] / (self.n - self.r)) if self.sums[0] else float("nan")
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that hold signal, at most r, by description length (Wax and Kailath 1985).
+
+        The n - r eigenvalues that are not tracked count as equal to `floor`, which makes the criterion generous.
+        """
+        memory, values = float(self.sums[0]), np.concatenate([self.energies, np.full(self.n - self.r, self.floor)])
+        if not memory or not values[0] > 0:
+            return 0
+        values = np.maximum(values, 1e-15 * values[0])
+        lengths = []
+        for k in range(self.r + 1):
+            rest = values[k:]
+            spread = np.log(rest.mean()) - np.log(rest).mean()
+            lengths.append(memory * rest.size * spread + 0.5 * k * (2 * self.n - k) * np.log(max(memory, 2.0)))
+        return int(np.argmin(lengths))
+
+    def angles(self, nominal: ArrayLike) -> Array:
+        """Return the principal angles to a nominal subspace (n, s), ascending, in radians."""
+        return principal_angles(self.W, as_basis(nominal, self.n, "nominal"))
+
+    def save(self, path: str | Path) -> Path:
+        """Write the state; `load_tracker` restores it bit for bit."""
+        from optid.identify.tracking.file import save
+
+        return save(self, path)
+
+    def __str__(self) -> str:
+        seen, used, passed = (int(c) for c in self.counts)
+        head = (f"{self.method.upper()}, {self.r} of {self.n} dimensions ({', '.join(self.names)}), forgetting "
+                f"{self.forgetting:g}")
+        if len(head) > 80:
+            head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
+        lost = f", {passed} passed over" if passed else ""
+        energies = " ".join(f"{v:.4g}" for v in self.energies[:8])
+        return f"{head}\n{seen} samples, {used} used{lost}\nenergies {energies}; noise {self.floor:.4g}; " \
+               f"directions with signal {self.rank}"

@@ -1,0 +1,123 @@
+"""Several models on one record, each predictor over the samples that all of them predict."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataWarning, StructureError
+from optid.identify.validation.checks import Validation, validate
+from optid.identify.validation.horizons import HorizonCurve, fit_by_horizon
+from optid.identify.validation.measures import fit_percent
+from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, simulated
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What `compare_models` found; `print` it, or write a page with `optid.show.report.write_comparison`.
+
+    Attributes:
+        names: one per model.
+        models: the models.
+        data: the record, in raw units.
+        horizon: samples ahead of the prediction besides one.
+        fits: {predictor: (models, l) fits in %}, over the samples that all models predict; NaN where a model has no
+            such prediction.
+        validations: one per model, each over the samples it predicts itself.
+        curves: fit against the horizon, one per model.
+        simulated: simulated outputs (N, l) per experiment, one tuple per model, empty where there is no simulation.
+    """
+
+    names: tuple[str, ...]
+    models: tuple[Any, ...] = field(repr=False)
+    data: Data = field(repr=False)
+    horizon: int
+    fits: dict[str, Array]
+    validations: tuple[Validation, ...] = field(repr=False)
+    curves: tuple[HorizonCurve, ...] = field(repr=False)
+    simulated: tuple[tuple[Array, ...], ...] = field(repr=False)
+
+    def best(self, predictor: str = SIMULATION) -> str:
+        """Return the name of the model with the largest mean fit over the outputs.
+
+        Args:
+            predictor: a key of `fits`.
+
+        Raises:
+            StructureError: no model has that predictor.
+        """
+        means = np.nanmean(self.fits[predictor], axis=1) if predictor in self.fits else np.array([np.nan])
+        if np.isnan(means).all():
+            raise StructureError(f"no model has the prediction {predictor!r}; there are {', '.join(self.fits)}")
+        return self.names[int(np.nanargmax(means))]
+
+    def __str__(self) -> str:
+        """Return the table, 80 columns wide."""
+        from optid.show.comparing import describe_comparison
+
+        return describe_comparison(self)
+
+
+def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizon: int = 1, x0: Any = "fit"
+                   ) -> Comparison:
+    """Compare several models on one record, preferably one that none of them was estimated from.
+
+    Args:
+        models: {name: model}, or models, which are then named by what they are.
+        data: the record.
+        horizon: samples ahead of one more prediction.
+        x0: initial state of the simulations, as the models take it.
+
+    Raises:
+        StructureError: no model, or a horizon that is not a whole number from 1.
+        DataError: the record has other channels or another sampling time than a model.
+    """
+    named = dict(models) if isinstance(models, Mapping) else _named(models)
+    if not named:
+        raise StructureError("there is no model to compare")
+    raw = data.raw()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes of the validations
+        validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
+        curves = tuple(fit_by_horizon(model, raw) for model in named.values())
+        outputs = {
+            ONE_STEP: [[e.y - r for e, r in zip(raw.experiments, checked.residuals)] for checked in validations]
+        }
+        if horizon > 1:
+            outputs[f"{horizon} steps"] = [one_step(model, raw, horizon) for model in named.values()]
+        free = [list(checked.simulated) or [np.full(e.y.shape, np.nan) for e in raw.experiments]
+                for checked in validations]
+        if any(checked.measured_feedback for checked in validations):
+            outputs[MEASURED] = [
+                simulated(model, raw, MEASURED, x0) if checked.measured_feedback else arrays
+                for model, checked, arrays in zip(named.values(), validations, free)
+            ]
+        outputs[SIMULATION] = free
+    fits = {word: found for word, several in outputs.items() if not np.isnan(found := _fits(raw, several)).all()}
+    return Comparison(tuple(named), tuple(named.values()), raw, horizon, fits, validations, curves,
+                      tuple(checked.simulated for checked in validations))
+
+
+def _named(models: Sequence[Any]) -> dict[str, Any]:
+    """Name models by their titles and orders, and number those that are still alike."""
+    words = []
+    for model in models:
+        orders = ", ".join(f"{key} {' '.join(map(str, np.ravel(value)))}" for key, value in model.orders.items())
+        words.append(f"{model.title} ({orders})" if orders else model.title)
+    return {
+        word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
+        for i, (word, model) in enumerate(zip(words, models))
+    }
+
+
+def _fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
+    """Fits (models, l) over the samples that all models with any prediction predict."""
+    y = np.vstack([e.y for e in data.experiments])
+    stacked = [np.vstack(list(arrays)) for arrays in several]
+    lost = [np.isnan(yhat) for yhat in stacked if not np.isnan(yhat).all()]
+    y = np.where(np.any(lost, axis=0), np.nan, y) if lost else y
+    return np.array([fit_percent(y, yhat) for yhat in stacked])

@@ -1,0 +1,139 @@
+"""Residual tests: whiteness, and independence of the inputs (Ljung, System Identification, section 16.6)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+
+LEVEL = 0.01
+QUANTILE_99 = 2.5758293035489004
+"""Two-sided 99 % quantile of the standard normal distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlations of the residuals of one output with their own past or with an input.
+
+    Attributes:
+        output: name of the output.
+        input: name of the input, or of the other output; None for the autocorrelation.
+        lags: (L,) lags; positive ones correlate the residual with the past.
+        values: (L,) correlation coefficients, from the pairs of samples that are present.
+        band: (L,) half width of the 99 % band of an ideal model.
+        p_value: of the hypothesis that all correlations from lag 1 (auto) or 0 (cross) on are zero; NaN where a signal
+            is constant. On the record that the model was estimated from the test is optimistic.
+    """
+
+    output: str
+    input: str | None
+    lags: NDArray[np.int64]
+    values: Array
+    band: Array
+    p_value: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the hypothesis is kept at the 1 % level."""
+        return not self.p_value < LEVEL
+
+    @property
+    def outside(self) -> int:
+        """Number of lags outside the band; lag 0 of an autocorrelation does not count."""
+        counts = np.abs(self.values) > self.band
+        return int(np.sum(counts[self.lags != 0] if self.input is None else counts))
+
+
+def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25) -> Correlation:
+    """Test the residuals (N,) of each experiment for whiteness by Ljung and Box's statistic; NaN = missing."""
+    from scipy.special import chdtrc
+
+    parts = _standardised(residuals)
+    values, counts = _products(parts, parts, range(lags + 1))
+    statistic = float(np.sum(counts[1:] * values[1:] ** 2) * (1 + 2 / max(counts[0], 1)))
+    return Correlation(output, None, np.arange(lags + 1), values, _band(counts), float(chdtrc(lags, statistic)))
+
+
+def cross_correlation(
+    residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
+) -> Correlation:
+    """Test whether the residuals depend on the input at lags 0 .. lags; negative lags show feedback.
+
+    The statistic takes the autocorrelation of the input into account.
+
+    Args:
+        residuals: (N,) per experiment, NaN = missing.
+        inputs: (N,) per experiment, NaN = missing.
+        output: name of the output.
+        channel: name of the input.
+        lags: largest lag.
+    """
+    from scipy.linalg import toeplitz
+    from scipy.special import chdtrc
+
+    e, u = _standardised(residuals), _standardised(inputs)
+    around = np.arange(-lags, lags + 1)
+    values, counts = _products(e, u, around)
+    own, _ = _products(u, u, range(lags + 1))
+    causal = around >= 0
+    p_value = float("nan")
+    if np.isfinite(values).all() and np.isfinite(own).all():
+        scale, axes = np.linalg.eigh(toeplitz(own))
+        # a slowly varying input excites few directions only: the others carry no evidence
+        informed = scale > 1e-3 * scale[-1]
+        score = axes.T[informed] @ (np.sqrt(counts[causal]) * values[causal])
+        p_value = float(chdtrc(int(informed.sum()), float(np.sum(score**2 / scale[informed]))))
+    return Correlation(output, channel, around, values, _band(counts), p_value)
+
+
+def between_outputs(
+    residuals: Sequence[Array], others: Sequence[Array], output: str, other: str, lags: int = 25
+) -> Correlation:
+    """Test whether the residual of an output depends on the past of the residual of another one, at lags 1 .. lags.
+
+    Samples of the same instant may be correlated: the noises of two outputs often are. Both residuals are taken to be
+    white, which their own tests decide.
+
+    Args:
+        residuals: (N,) per experiment, NaN = missing.
+        others: (N,) per experiment, of the other output.
+        output: name of the output.
+        other: name of the other output.
+        lags: largest lag.
+    """
+    from scipy.special import chdtrc
+
+    values, counts = _products(_standardised(residuals), _standardised(others), range(1, lags + 1))
+    statistic = float(np.sum(counts * values**2))
+    return Correlation(output, other, np.arange(1, lags + 1), values, _band(counts), float(chdtrc(lags, statistic)))
+
+
+def _band(counts: Array) -> Array:
+    return QUANTILE_99 / np.sqrt(np.where(counts > 0, counts, np.nan))
+
+
+def _standardised(signals: Sequence[Array]) -> list[Array]:
+    """Subtract the mean and divide by the standard deviation over all experiments."""
+    every = np.concatenate([np.asarray(s, dtype=float) for s in signals])
+    every = every[~np.isnan(every)]
+    mean, size = (every.mean(), every.std()) if every.size else (np.nan, np.nan)
+    return [(s - mean) / (size if size > 1e-14 * abs(mean) else np.nan) for s in signals]
+
+
+def _products(first: list[Array], second: list[Array], lags: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
+    """Mean of first(k) second(k - lag) over the pairs present, and their number."""
+    sums, counts = np.zeros(len(lags)), np.zeros(len(lags))
+    for a, b in zip(first, second):
+        here_a, here_b = ~np.isnan(a), ~np.isnan(b)
+        a, b = np.where(here_a, a, 0.0), np.where(here_b, b, 0.0)
+        marks_a, marks_b = here_a.astype(float), here_b.astype(float)
+        for i, lag in enumerate(lags):
+            now = slice(max(lag, 0), len(a) + min(lag, 0))
+            past = slice(max(-lag, 0), len(b) + min(-lag, 0))
+            if now.stop > now.start:
+                sums[i] += a[now] @ b[past]
+                counts[i] += marks_a[now] @ marks_b[past]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sums / counts, counts

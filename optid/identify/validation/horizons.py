@@ -1,0 +1,68 @@
+"""The fit of a model against how far ahead it predicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError
+from optid.identify.validation.measures import fit_percent
+from optid.identify.validation.predictions import one_step, simulated
+from optid.models.coefficients import checked_horizon
+
+HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
+"""Samples ahead at which the fit is evaluated, as far as the record reaches."""
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonCurve:
+    """Fits of the predictions so many samples ahead; `print` it.
+
+    Attributes:
+        outputs: names of the outputs.
+        horizons: (h,) samples ahead.
+        fits: (h, l) in %, all over the same samples: those that the longest horizon predicts.
+        simulation: (l,) fit of the simulation over these samples, the limit of the curve; NaN where there is none.
+    """
+
+    outputs: tuple[str, ...]
+    horizons: tuple[int, ...]
+    fits: Array
+    simulation: Array
+
+    def __str__(self) -> str:
+        from optid.show.checks import horizon_table
+        from optid.show.printing import set_table
+
+        return "\n".join(set_table(horizon_table(self)))
+
+
+def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None) -> HorizonCurve:
+    """Predict 1, 2, ... samples ahead and compare each with the record.
+
+    Args:
+        model: the model.
+        data: the record.
+        horizons: samples ahead; by default up to 100, a quarter of the longest experiment at most.
+
+    Raises:
+        DataError: other channels or another sampling time than the model's, or nothing that can be predicted.
+        StructureError: a horizon that is not a whole number from 1.
+    """
+    raw = data.raw()
+    longest = max(e.n_samples for e in raw.experiments)
+    chosen = [h for h in HORIZONS if h <= max(1, longest // 4)] if horizons is None else list(horizons)
+    ahead = [np.vstack(one_step(model, raw, checked_horizon(h))) for h in chosen]
+    y = np.vstack([e.y for e in raw.experiments])
+    predicted = ~np.any([np.isnan(yhat) for yhat in ahead], axis=0)
+    y = np.where(predicted, y, np.nan)
+    if np.isnan(y).all():
+        raise DataError(f"no sample can be predicted {max(chosen)} samples ahead; use shorter horizons")
+    try:
+        free = fit_percent(y, np.vstack(simulated(model, raw)))
+    except DataError:
+        free = np.full(raw.l, np.nan)
+    return HorizonCurve(raw.outputs, tuple(chosen), np.array([fit_percent(y, yhat) for yhat in ahead]), free)

@@ -1,0 +1,345 @@
+"""Does a record look Hammerstein? Then samples at different lags never multiply, and every lag sees the same f.
+
+A Hammerstein system with additive output noise of any colour obeys
+
+    y(k) = c + sum_c sum_i h_c(i) f_c(u_c(k - i)) + v(k).
+
+Two consequences are tested, and neither needs an order or a noise model: (1) functions of single input samples explain
+all of y that the input explains, so that products of samples at different lags and functions of a filtered input, the
+mark of a Wiener system, save nothing; (2) the matrix of coefficients, lags times functions, has rank one.
+
+Lags are compressed by a few filters (`lag_filters`). An autoregression fitted to the residuals makes the noise white,
+and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of any
+colour. All columns exist chunk by chunk only.
+Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher-order correlations as structure tests
+(Billings and Voon 1986); rank one (Bai 1998).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import RankError
+from optid.identify.validation.structure_design import Design
+
+if TYPE_CHECKING:
+    from optid.structures.rank_one import RankOne
+
+SIGNIFICANT = 1e-3
+NOTICEABLE = 0.015
+"""Share of the residual variance that another structure must save before a record is said not to look Hammerstein."""
+
+NOISE_ORDER, KEPT = 12, 0.4
+"""Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
+
+DISTINCT = 1e-4
+"""Smallest eigenvalue of the correlations of alternatives that counts as a direction of its own."""
+
+SAMPLES = 30_000
+"""The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
+
+DIGITS = 1e-8
+"""A residual below this share of the standard deviation of the output is rounding."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """The structure test of a record.
+
+    Attributes:
+        ratios: second over first singular value of lags times functions by input, the largest over the outputs.
+        p_value: of the hypothesis that the record is Hammerstein, all tests together (Bonferroni); 1 when nothing is
+            to be tested.
+        saving: share of the residual variance that the more telling alternative saves.
+        products: by output, p value of the test that samples at different lags do not multiply.
+        rank: by output, p value of the test that all lags see the same nonlinearity.
+    """
+
+    ratios: dict[str, float]
+    p_value: float
+    saving: float
+    products: dict[str, float]
+    rank: dict[str, float]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the record looks Hammerstein; a difference must be significant and noticeable to count."""
+        return not (self.p_value < SIGNIFICANT and self.saving > NOTICEABLE)
+
+    @property
+    def finding(self) -> str:
+        """What the tests say, in words."""
+        if self.passed:
+            return "looks Hammerstein"
+        if min(self.products.values()) <= min(self.rank.values()):
+            return "does not look Hammerstein: inputs at different lags act together, as in a Wiener system"
+        return "does not look Hammerstein: different lags see different nonlinearities"
+
+
+@dataclass(frozen=True)
+class FTest:
+    """An F test.
+
+    Attributes:
+        p_value: of the hypothesis; 1 when nothing is to be tested.
+        saving: share of the residual variance saved by giving it up, degrees of freedom discounted.
+    """
+
+    p_value: float = 1.0
+    saving: float = 0.0
+
+    @classmethod
+    def of(cls, more: float, extra: int, rest: float, spare: int) -> "FTest":
+        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom."""
+        from scipy.special import fdtrc
+
+        if extra <= 0 or rest <= 0:
+            return cls()
+        free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
+        return cls(float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted))
+
+
+def structure_test(data: Data) -> Structure:
+    """Test whether a record comes from static nonlinearities of the inputs followed by linear dynamics.
+
+    The inputs must not depend on the noise: in closed loop the test says nothing. Of a long record, the first 30,000
+    samples are read, spread over the experiments in proportion.
+
+    Args:
+        data: the record; NaN = missing, several experiments as they are.
+
+    Raises:
+        RankError: the record does not determine the free model, because it is short or its inputs have few levels or
+            frequencies.
+    """
+    if data.n_samples > 1.1 * SAMPLES:
+        data = data.split(SAMPLES / data.n_samples)[0]
+    design = Design.of(data)
+    tests: list[FTest] = []
+    ratios = dict.fromkeys(data.inputs, 0.0)
+    products, rank = {}, {}
+    for o, name in enumerate(data.outputs):
+        of_products, of_rank, found = _test_output(design, o)
+        tests += [of_products, of_rank]
+        products[name], rank[name] = of_products.p_value, of_rank.p_value
+        ratios = {channel: max(ratio, one) for (channel, ratio), one in zip(ratios.items(), found)}
+    # what is significant but too small to notice must not hide what is both
+    telling = min(tests, key=lambda test: (test.p_value if test.saving > NOTICEABLE else 1.0, test.p_value))
+    return Structure(ratios, min(1.0, len(tests) * telling.p_value), telling.saving, products, rank)
+
+
+def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
+    """Test products and rank on one output; also second over first singular value by input."""
+    from optid.structures.bilinear import minimise
+    from optid.structures.rank_one import matrices
+
+    additive, linear = _least_squares(design, o)
+    problem = _rank_one(additive, design.blocks, 1)
+    free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
+    # the residuals of the hypothesis: the free model would explain part of a slow noise and hide its colour
+    hypothesis = minimise(problem, count=3).point
+    responses = _responses(design, [np.asarray(np.linalg.svd(theta)[2][:2], dtype=float) for theta in free], linear)
+    bs = [np.asarray(b, dtype=float) for b in hypothesis.bs]
+    lines = [design.filters @ b for b in bs]
+    residuals, mean, spread = _residuals(design, o, np.asarray(hypothesis.lift(), dtype=float), responses)
+    pooled = np.concatenate(residuals)
+    y = np.concatenate([e.y[:, o] for e in design.data.experiments])
+    if np.nanstd(pooled) <= DIGITS * np.nanstd(y):
+        return FTest(), FTest(), [0.0] * design.data.m
+    noise = _autoregression(residuals)
+    past = noise.size - 1
+    gram, sizes, rows = np.zeros((0, 0)), [0], 0
+    for u, output, valid in design.stretches(o, past):
+        carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
+        blocks = [design.additive(u), design.finer(u, lines), _alternatives(carriers), output[:, None]]
+        sizes = [block.shape[1] for block in blocks]
+        columns = np.hstack(blocks)
+        complete = np.convolve(~valid, np.ones(past + 1))[past : valid.size] < 0.5
+        white = np.sum([a * columns[past - i : len(columns) - i] for i, a in enumerate(noise)], axis=0)[complete]
+        gram = white.T @ white + (gram if rows else 0.0)
+        rows += len(white)
+    edges = np.cumsum([0, *sizes])
+    if rows < 1.5 * edges[-1]:
+        raise RankError(f"{rows} complete rows for {edges[-1]} columns of the structure test: use a longer record.")
+    of_products = _products_test(gram, int(edges[2]), rows)
+    keep = np.concatenate([np.arange(edges[2]), [edges[-1] - 1]])
+    of_rank, ratios = _rank_test(gram[np.ix_(keep, keep)], bs, design.blocks, rows)
+    return of_products, of_rank, ratios
+
+
+def _least_squares(design: Design, o: int) -> tuple[Array, Array]:
+    """Gram matrix of the additive regression, and coefficients of the linear one."""
+    size = 2 + sum(p * j for p, j in design.blocks)
+    additive, linear = np.zeros((size, size)), np.zeros((2 + design.data.m * design.filters.shape[1],) * 2)
+    rows = 0
+    for u, output, valid in design.stretches(o):
+        for gram, columns in ((additive, design.additive(u)), (linear, design.linear(u))):
+            used = np.column_stack([columns, output])[valid]
+            gram += used.T @ used
+        rows += int(valid.sum())
+    if rows < 2 * size:
+        raise RankError(f"{rows} complete rows for {size} columns of the structure test: use a longer record.")
+    return additive, _solved(linear)
+
+
+def _solved(gram: Array) -> Array:
+    scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-300))
+    return np.linalg.lstsq(gram[:-1, :-1] / np.outer(scale, scale), gram[:-1, -1] / scale, rcond=1e-12)[0] / scale
+
+
+def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
+    """Impulse responses (L, q, m) along which alternatives are looked for.
+
+    The best linear approximation; per input the two leading filters of lags times functions, which also see what is
+    even, and the input itself at its strongest lag and at the next. Of several inputs one of each, since pairs of
+    inputs make products enough.
+    """
+    m, size = design.data.m, len(design.filters)
+    responses = [design.filters @ linear[1:].reshape(m, -1).T]
+    for c, coefficients in enumerate(leading):
+        lines = design.filters @ coefficients.T
+        strongest = int(np.argmax(np.abs(lines[:, 0])))
+        pulses = np.eye(size)[:, [lag for lag in (strongest, strongest + 1) if lag < size]]
+        each = 2 if m == 1 else 1
+        for line in np.hstack([lines[:, :each], pulses[:, :each]]).T:
+            responses.append(np.zeros((size, m)))
+            responses[-1][:, c] = line
+    return np.stack(responses, axis=1)
+
+
+def _residuals(design: Design, o: int, additive: Array, responses: Array) -> tuple[list[Array], Array, Array]:
+    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs."""
+    residuals: list[Array] = []
+    sums, count = np.zeros((2, responses.shape[1])), 0
+    for i in range(len(design.u)):
+        parts = [np.zeros(0)]
+        for u, output, valid in design.stretches(o, among=[i]):
+            parts.append(np.where(valid, output - design.additive(u) @ additive, np.nan))
+            carriers = design.filtered(u, responses)
+            sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
+            count += len(carriers)
+        residuals.append(np.concatenate(parts))
+    mean = sums[0] / count
+    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300))
+
+
+def _alternatives(carriers: Array) -> Array:
+    """Products of two of all and of three of the first three carriers, and further functions of the first two."""
+    first, second = np.triu_indices(carriers.shape[1])
+    leading = carriers[:, :3]
+    n = leading.shape[1]
+    triples = [(i, j, k) for i in range(n) for j in range(i, n) for k in range(j, n)]
+    cubes = np.column_stack([leading[:, i] * leading[:, j] * leading[:, k] for i, j, k in triples])
+    x = leading[:, 0]
+    return np.column_stack([carriers[:, first] * carriers[:, second], cubes, x**4, x**5, np.abs(leading[:, :2])])
+
+
+def _autoregression(residuals: list[Array]) -> Array:
+    """Fit an autoregression [1, a1, ...] with its order by Akaike's criterion; NaN = missing."""
+    from scipy.linalg import solve_toeplitz
+
+    total = sum(int(np.sum(~np.isnan(r))) for r in residuals)
+    complete = total / sum(len(r) for r in residuals)
+    most = min(NOISE_ORDER, total // 50, max(len(r) for r in residuals) - 1)
+    while most > 1 and complete ** (most + 1) < KEPT:  # a row is lost with any of its samples
+        most -= 1
+    covariance = np.zeros(most + 1)
+    for lag in range(most + 1):
+        products = np.concatenate([r[lag:] * r[: max(len(r) - lag, 0)] for r in residuals])
+        covariance[lag] = np.nanmean(products) * (1 - lag / total) if not np.isnan(products).all() else 0.0
+    best, least = np.ones(1), total * np.log(covariance[0])
+    for order in range(1, most + 1):
+        a = np.concatenate([[1.0], -solve_toeplitz(covariance[:order], covariance[1 : order + 1])])
+        variance = float(a @ covariance[: order + 1])
+        if variance <= 0:
+            break
+        if (criterion := total * np.log(variance) + 2 * order) < least:
+            best, least = a, criterion
+    return best
+
+
+def _products_test(gram: Array, n: int, rows: int) -> FTest:
+    """Test whether columns n ... of the Gram matrix [additive | alternatives | y] save anything."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    scaled = gram / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(scaled[:n, :n])
+    sound = values > 1e-10
+    half = (vectors[:, sound] / np.sqrt(values[sound])).T @ scaled[:n, n:]
+    left = scaled[n:, n:] - half.T @ half
+    size = np.sqrt(np.maximum(np.diag(left)[:-1], 1e-300))
+    new = size > 1e-3  # what is left of an alternative of norm one
+    correlations = (left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)]
+    values, vectors = np.linalg.eigh(correlations)
+    distinct = values > DISTINCT
+    along = (vectors[:, distinct] / np.sqrt(values[distinct])).T @ (left[:-1, -1] / size)[new]
+    more = float(along @ along)
+    extra = int(distinct.sum())
+    return FTest.of(more, extra, float(left[-1, -1]) - more, rows - int(sound.sum()) - extra)
+
+
+def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> "RankOne":
+    """Write least squares with the Gram matrix [linear | blocks | y] as a rank-one problem."""
+    from optid.statistics.factors import dependent_column, root_of_gram
+    from optid.structures.rank_one import RankOne
+
+    n = len(gram) - 1
+    root = root_of_gram(gram, n)
+    if dependent_column(root, n, "gram") is not None:
+        raise RankError(
+            "Filters of functions of the inputs depend on each other: the inputs have too few levels or frequencies."
+        )
+    return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
+
+
+def _rank_test(
+    gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
+) -> tuple[FTest, list[float]]:
+    """Test rank one of every block of the Gram matrix [1 | blocks | fine | y]; also second over first singular values.
+
+    The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
+    for a second nonlinearity.
+    """
+    from optid.structures.bilinear import minimise
+    from optid.structures.rank_one import matrices
+
+    size = 1 + sum(p * j for p, j in blocks)
+    finer = _finer_directions(gram, leading, blocks)
+    change = np.zeros((len(gram), finer.shape[1] + size + 1))
+    linear = 1 + finer.shape[1]
+    change[0, 0] = change[-1, -1] = 1.0
+    change[:, 1:linear] = finer
+    change[1:size, linear:-1] = np.eye(size - 1)
+    gram = change.T @ gram @ change
+    problem = _rank_one(gram, blocks, linear)
+    rest = problem.remainder
+    free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
+    singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
+    ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
+    extra = sum((p - 1) * (j - 1) for p, j in blocks)
+    if not extra:
+        return FTest(), ratios
+    return FTest.of(minimise(problem, count=3).value - rest, extra, rest, rows - len(problem.target)), ratios
+
+
+def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:
+    """Combinations (columns of `gram`) of the fine functions that the blocks' functions, so filtered, do not give."""
+    size = 1 + sum(p * j for p, j in blocks)
+    fine = np.zeros((len(gram), len(gram) - 1 - size))
+    fine[size:-1] = np.eye(fine.shape[1])
+    coarse, start = np.zeros((len(gram), 1 + sum(p for p, _ in blocks))), 1
+    coarse[0, 0] = 1.0
+    column = 1
+    for (p, j), coefficients in zip(blocks, leading):
+        coarse[start : start + p * j, column : column + p] = np.kron(coefficients[:, None], np.eye(p))
+        start, column = start + p * j, column + p
+    norm = np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
+    fine = fine / norm
+    inner = coarse.T @ gram @ coarse
+    fine = fine - coarse @ (np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ (coarse.T @ gram @ fine))
+    left = fine.T @ gram @ fine
+    values, vectors = np.linalg.eigh((left + left.T) / 2)
+    return fine @ vectors[:, values > DISTINCT]

@@ -1,0 +1,129 @@
+"""Which sample stands in which column of the regression y = Phi theta + e."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases.basis import Basis
+from optid.errors import StructureError
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns of Phi: -y_o(k-i), i = 1..na, o inner; then per input and per lag eta(u_c(k - nk_c - j)); then 1.
+
+    The coefficients of input c are vec(Theta_c), Theta_c (P_c, nb_c), column by column.
+
+    Attributes:
+        na: number of output lags.
+        nb: number of input lags, one per input.
+        nk: delay in samples, one per input.
+        bases: one basis per input, with its interval.
+        outputs: names of the l outputs.
+        inputs: names of the m inputs.
+
+    Raises:
+        StructureError: a negative order, or lists that do not have one entry per input.
+    """
+
+    na: int
+    nb: tuple[int, ...]
+    nk: tuple[int, ...]
+    bases: tuple[Basis, ...]
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not self.inputs or not self.outputs:
+            raise StructureError("A model needs at least one input and one output.")
+        for name, entries in (("nb", self.nb), ("nk", self.nk), ("basis", self.bases)):
+            if len(entries) != self.m:
+                raise StructureError(
+                    f"{name} has {len(entries)} entries for {self.m} inputs ({', '.join(self.inputs)}): give one each."
+                )
+        for name, value, smallest in [("na", self.na, 0)] + [
+            (f"{order} of input {channel!r}", value, smallest)
+            for order, values, smallest in (("nb", self.nb, 1), ("nk", self.nk, 0))
+            for channel, value in zip(self.inputs, values)
+        ]:
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
+                raise StructureError(f"{name} must be an integer >= {smallest}; got {value!r}.")
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @cached_property
+    def n_columns(self) -> int:
+        """Number of columns of Phi."""
+        return self.na * self.l + sum(b * basis.size for b, basis in zip(self.nb, self.bases)) + 1
+
+    @property
+    def offset(self) -> int:
+        """Column of the constant."""
+        return self.n_columns - 1
+
+    @cached_property
+    def first_row(self) -> int:
+        """First sample with a complete row: the largest lag."""
+        return max(self.na, *(delay + b - 1 for b, delay in zip(self.nb, self.nk)))
+
+    @property
+    def lags(self) -> tuple[range, ...]:
+        """Lags of every input."""
+        return tuple(range(delay, delay + b) for b, delay in zip(self.nb, self.nk))
+
+    def block(self, c: int) -> slice:
+        """Return the columns of input c, whose coefficients are vec(Theta_c)."""
+        sizes = [b * basis.size for b, basis in zip(self.nb, self.bases)]
+        start = self.na * self.l + sum(sizes[:c])
+        return slice(start, start + sizes[c])
+
+    def names(self) -> list[str]:
+        """Name every column of Phi, e.g. -y(k-1), triangular3(u(k-2)), 1."""
+        names = [f"-{output}(k-{i})" for i in range(1, self.na + 1) for output in self.outputs]
+        for channel, lags, basis in zip(self.inputs, self.lags, self.bases):
+            family = type(basis).__name__.lower()
+            for lag in lags:
+                sample = f"{channel}(k-{lag})" if lag else f"{channel}(k)"
+                names += [f"{family}{j}({sample})" for j in range(1, basis.size + 1)]
+        return [*names, "1"]
+
+    @cached_property
+    def group_lags(self) -> tuple[range, ...]:
+        """Lags of the outputs (0 is the target), then of every input."""
+        return (range(self.na + 1), *self.lags)
+
+    @cached_property
+    def complete_columns(self) -> tuple[np.ndarray, ...]:
+        """Columns (lags, signals) of a complete row [y lags | complete families | 1 | y] that each group takes."""
+        outs, start = self.l, self.na * self.l
+        groups = []
+        for b, basis in zip(self.nb, self.bases):
+            count = b * basis.full_size
+            groups.append(np.arange(start, start + count, dtype=np.int32).reshape(b, basis.full_size))
+            start += count
+        past = np.arange(self.na * outs, dtype=np.int32).reshape(self.na, outs)
+        return (np.vstack([np.arange(start + 1, start + 1 + outs, dtype=np.int32), past]), *groups)
+
+    @cached_property
+    def n_complete(self) -> int:
+        """Length of a complete row."""
+        return self.na * self.l + sum(b * basis.full_size for b, basis in zip(self.nb, self.bases)) + 1 + self.l
+
+    def contrasted(self, complete: Array) -> Array:
+        """Turn complete rows (K, n_complete) into rows of [Phi | Y], (K, n_columns + l)."""
+        past, count = self.na * self.l, len(complete)
+        parts = [-complete[:, :past]]
+        for columns, basis in zip(self.complete_columns[1:], self.bases):
+            family = complete[:, columns[0, 0] : columns[-1, -1] + 1].reshape(count, *columns.shape)
+            parts.append((family @ basis.contrast).reshape(count, -1))
+        return np.concatenate([*parts, complete[:, -1 - self.l :]], axis=1)

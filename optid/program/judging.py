@@ -1,0 +1,291 @@
+"""Our own residuals at a solver's point: a solver's status is a claim, these numbers decide."""
+
+from collections.abc import Mapping
+
+import cvxpy as cp
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.psd import PSD
+from cvxpy.constraints.second_order import SOC
+from cvxpy.constraints.zero import Equality, Zero
+
+from optid.program.gradients import flat_value, jacobians
+from optid.program.program import Program, RankOneForm, Values
+from optid.program.solution import Residuals
+
+ZERO = 1e-9  # a variable without a start that is smaller than this has no size of its own to measure by
+
+
+def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
+    """Measure a point: objective, violation, stationarity and complementarity.
+
+    Args:
+        program: the programme.
+        values: {variable: array}; derived variables are recomputed from the others first.
+        duals: {constraint: flat multipliers}; names may be missing.
+
+    Returns:
+        The recomputed objective and the residuals. Stationarity is ``nan`` where multipliers are missing or the
+        objective has a kink at the point.
+    """
+    program.assign(values)
+    violation, worst = measure_violation(program)
+    form = program.rank_one or program.least_squares
+    if form is not None and not program.user_constraints:
+        objective, stationarity = _rank_one_residuals(program, form)
+        return objective, Residuals(violation, worst, stationarity, 0.0)
+    objective = float(np.asarray(program.objective.expr.value))
+    stationarity, complementarity = _first_order(program, duals, objective)
+    return objective, Residuals(violation, worst, stationarity, complementarity)
+
+
+def _rank_one_residuals(program: Program, form: RankOneForm) -> tuple[float, float]:
+    """Objective and stationarity of an unconstrained rank-one programme from its compressed numbers.
+
+    The gauge has multiplier zero, because moving the scale between mu and b does not change the objective.
+    """
+    problem = form.problem
+    flat = {name: flat_value(variable) for name, variable in program.variables.items()}
+    pairs = [(flat[mu], flat[b]) for mu, b in form.blocks]
+    z = np.concatenate([*(flat[name] for name in form.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
+    r = problem.root @ z - problem.target
+    value = float(r @ r) + problem.remainder
+    pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
+    parts, position = [], 0
+    for name in form.linear:
+        span = slice(position, position + flat[name].size)
+        parts.append((name, pull[span], effort[span]))
+        position = span.stop
+    for (mu_name, b_name), (mu, b) in zip(form.blocks, pairs):
+        span = slice(position, position + mu.size * b.size)
+        block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
+        parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
+        position = span.stop
+    yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
+    for name, gradient, terms in parts:
+        worst = max(worst, _relative(np.abs(gradient), terms, yardstick, _size(program.variables[name], usual)))
+    return value, worst
+
+
+def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
+    """Largest entry of a variable or of its start; one where there is no start and nothing but rounding."""
+    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
+    if variable.id in usual:
+        return max(size, usual[variable.id])
+    return size if size > ZERO else 1.0
+
+
+def _relative(gradient: np.ndarray, terms: np.ndarray, yardstick: float, size: float) -> float:
+    """Largest component of a gradient relative to its terms plus the objective's size per size of the variable."""
+    floor = yardstick / size + terms
+    return float(np.max(gradient / np.where(floor > 0, floor, 1.0), initial=0.0))
+
+
+def value_size(program: Program, objective: float) -> float:
+    """Yardstick of errors in the objective: its magnitude, or a hundredth of the zero model's where it vanishes."""
+    return max(abs(objective), 1e-2 * program.scale)
+
+
+def measure_violation(program: Program) -> tuple[float, str]:
+    """Return the largest relative violation over all constraints at the assigned point, and its name.
+
+    Bounds that variables carry as attributes count as well, under the name of the variable.
+    """
+    worst, name, usual = 0.0, "", program.usual_sizes()
+    for key, group in program.constraints.items():
+        if key in program.derived:
+            continue  # recomputed, hence exact
+        for member in group:
+            with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
+                amount = float(np.max(np.asarray(member.violation()), initial=0.0))
+            amount = amount / term_size(member, usual) if amount else 0.0
+            if not amount <= worst:  # also true for nan
+                worst, name = amount, key
+    for key, variable in program.variables.items():
+        value, amount, size = np.asarray(variable.value, dtype=float), 0.0, _size(variable, usual)
+        if has_bounds(variable):
+            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+            amount = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
+            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in (lower, upper))])
+        elif variable.attributes["PSD"] or variable.attributes["NSD"]:
+            sign = 1.0 if variable.attributes["PSD"] else -1.0
+            amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
+        amount /= size
+        if not amount <= worst:
+            worst, name = amount, key
+    return (worst if np.isfinite(worst) else float("inf")), name
+
+
+def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
+    """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
+
+    Every variable counts with its largest entry, so that the measure does not depend on units.
+
+    Args:
+        member: the constraint.
+        usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
+    """
+    expressions = [member.expr] if isinstance(member, Equality | Zero | Inequality | NonPos) else member.args
+    sizes = [_terms(expression, usual or {}) for expression in expressions]
+    largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
+    return max([size for size in sizes if size is not None], default=largest) or largest or 1.0
+
+
+def _terms(expression: cp.Expression, usual: Mapping[int, float]) -> float | None:
+    """Largest sum of the magnitudes of the terms of an entry; None where CVXPY knows no gradient."""
+    slopes = jacobians(expression)
+    if slopes is None:
+        return None
+    total, inner = np.zeros(expression.size), -flat_value(expression)
+    for variable, slope in slopes.items():
+        size = max(float(np.max(np.abs(flat_value(variable)), initial=0.0)), usual.get(variable.id, 0.0))
+        total += abs(slope).sum(axis=1) * size
+        inner += slope @ flat_value(variable)
+    return float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine expression
+
+
+def has_bounds(variable: cp.Variable) -> bool:
+    """Whether the variable carries bounds as attributes (nonneg, bounds, ...)."""
+    return any(variable.attributes[key] not in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds"))
+
+
+def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
+    """Return (expression, weights) pairs whose inner products are the constraint's part of the Lagrangian.
+
+    Args:
+        member: a CVXPY constraint.
+        dual: its multipliers, flat, in the order of its dual variables.
+
+    Returns:
+        The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
+        or None for a cone whose multipliers are not used here.
+    """
+    if isinstance(member, Equality | Zero):
+        return [(member.expr, dual)]
+    if isinstance(member, Inequality | NonPos):
+        return [(member.expr, np.maximum(dual, 0.0))]
+    if isinstance(member, NonNeg):
+        return [(member.args[0], -np.maximum(dual, 0.0))]
+    if isinstance(member, PSD):
+        square = np.reshape(dual, member.args[0].shape, order="F")
+        values, vectors = np.linalg.eigh((square + square.T) / 2)
+        return [(member.args[0], -np.ravel((vectors * np.maximum(values, 0.0)) @ vectors.T, order="F"))]
+    if isinstance(member, SOC) and member.args[0].size == 1:
+        level, rest = float(dual[0]), dual[1:]
+        length = float(np.linalg.norm(rest))
+        if length > level:  # projection on the second-order cone
+            factor = max(0.0, (level + length) / 2)
+            level, rest = factor, factor * rest / max(length, np.finfo(float).tiny)
+        return [(member.args[0], -np.array([level])), (member.args[1], -rest)]
+    return None
+
+
+class Lagrangian:
+    """Objective plus constraints weighed by their multipliers: gradient at the assigned point and what it is a sum of.
+
+    Attributes:
+        variables: of the programme.
+        total: {id of a variable: gradient (size,)}.
+        terms: {id of a variable: sum of the magnitudes of its terms}.
+        value: sum of the products of multipliers and constraints.
+        complementarity: sum of their magnitudes, over inequalities and cones.
+        known: whether every part had a gradient.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self.variables = list(program.variables.values())
+        self.usual = program.usual_sizes()
+        self.total = {v.id: np.zeros(v.size) for v in self.variables}
+        self.terms = {v.id: np.zeros(v.size) for v in self.variables}
+        self.value, self.complementarity, self.known = 0.0, 0.0, True
+
+    @classmethod
+    def of(cls, program: Program, duals: Values) -> "Lagrangian":
+        """Add up the constraints that have multipliers, these projected on the dual cones."""
+        found = cls(program)
+        for name, multipliers in duals.items():
+            position = 0
+            for member in program.constraints[name]:
+                length = sum(d.size for d in member.dual_variables)
+                terms = multiplier_terms(member, multipliers[position : position + length])
+                position += length
+                if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
+                    found.known = False
+                    return found
+                products = [flat_value(expression) * weights for expression, weights in terms]
+                found.value += float(sum(map(np.sum, products)))
+                if not isinstance(member, Equality | Zero):
+                    whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
+                    found.complementarity += abs(float(sum(map(np.sum, products)))) if whole else float(
+                        np.sum(np.abs(products[0])))
+        return found
+
+    def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
+        """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
+        if not _smooth(expression):
+            return False
+        slopes = jacobians(expression)
+        for variable, slope in (slopes or {}).items():
+            if variable.id in self.total:
+                self.total[variable.id] += slope.T @ weights
+                self.terms[variable.id] += abs(slope).T @ np.abs(weights)
+        return slopes is not None
+
+    def residual(self, yardstick: float) -> float:
+        """Return the largest component relative to its terms plus the objective's size per size of the variable."""
+        worst = 0.0
+        for variable in self.variables:
+            part = self.free_part(variable)
+            if part is None:
+                return float("nan")
+            worst = max(worst, _relative(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
+        return worst
+
+    def free_part(self, variable: cp.Variable) -> np.ndarray | None:
+        """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
+        flags = variable.attributes
+        if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
+            return None
+        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
+        if flags["symmetric"]:
+            gradient = (gradient + gradient.T) / 2
+        if has_bounds(variable):
+            lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
+            value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
+            held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
+            gradient = np.where(held, 0.0, gradient)
+        return np.abs(np.ravel(gradient, order="F"))
+
+
+def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
+    unknown = float("nan"), float("nan")
+    yardstick = max(abs(objective), program.scale)
+    if any(name not in duals for name in program.constraints):
+        return unknown
+    try:
+        lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
+        if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
+            return unknown
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return unknown
+    return lagrangian.residual(yardstick), float(lagrangian.complementarity / value_size(program, objective))
+
+
+_KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
+          "sum_largest", "lambda_sum_largest", "pos", "neg"}
+
+
+def _smooth(expression: cp.Expression) -> bool:
+    if expression.is_affine():
+        return True
+    return not ({type(atom).__name__ for atom in _atoms(expression)} & _KINKS)
+
+
+def _atoms(expression: cp.Expression) -> list[cp.Expression]:
+    stack, found = [expression], []
+    while stack:
+        node = stack.pop()
+        found.append(node)
+        stack.extend(getattr(node, "args", []))
+    return found

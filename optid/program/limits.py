@@ -1,0 +1,120 @@
+"""What the bound of a user's constraint is: which rows move with it, how fast, and what a small step of it is."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.nonpos import Inequality, NonPos
+from cvxpy.constraints.zero import Equality, Zero
+
+from optid.program.gradients import flat_value, row_sizes
+
+EQUALITIES = Equality | Zero
+INEQUALITIES = Inequality | NonPos
+
+
+@dataclass(frozen=True, eq=False)
+class Limit:
+    """One CVXPY constraint of a user with its bound.
+
+    The rows read ``row <= shift * t`` (``row = shift * t``) once the bound has moved by t.
+
+    Attributes:
+        member: the constraint as the user wrote it.
+        shift: by how much every row moves per unit of the bound: a number or an expression; for a cone an array,
+            flat, or a number where that is not known.
+        bound: name of the bound; rows of one name move together. None: every row has a bound of its own.
+        band: (rows, entries) for an equality that stands for ``|rows @ x| <= t`` with t = 0: the rows.
+        span: (independent rows, entries) the equalities that the constraint poses in their place.
+        step: returns what 1 % is in units of the bound, at the assigned point; None takes the size of its terms.
+        words: what the step is 1 % of.
+        sizes: what the rows, flat, were divided by in the programme.
+    """
+
+    member: Constraint
+    shift: Any = 1.0
+    bound: str | None = ""
+    band: np.ndarray | None = None
+    span: np.ndarray | None = None
+    step: Callable[[], float] | None = None
+    words: str = ""
+    sizes: np.ndarray = field(default_factory=lambda: np.ones(1))
+
+    @classmethod
+    def of(cls, member: Constraint) -> "Limit":
+        """Read the bound of a constraint off its sides: a number is one bound, an array one for every row."""
+        sides = [side for side in member.args if side.is_constant()]
+        shared = isinstance(member, EQUALITIES | INEQUALITIES) and any(side.size == 1 for side in sides)
+        return cls(member, bound="" if shared else None)
+
+    def posed(self, usual: Mapping[int, float]) -> tuple[Constraint, "Limit"]:
+        """Divide the rows by their size, so that no solver sees the units in which the constraint was written."""
+        if not isinstance(self.member, EQUALITIES | INEQUALITIES):
+            return self.member, self
+        sizes = row_sizes(self.member.expr, usual)
+        scaled = times(1 / sizes, self.member.expr)
+        posed = scaled == 0 if isinstance(self.member, EQUALITIES) else scaled <= 0
+        return posed, replace(self, sizes=sizes)
+
+    def substituted(self, swap: dict[int, Any]) -> "Limit":
+        """Return the same with variables replaced, as by `Program.freeze`."""
+        shift = self.shift.tree_copy(swap) if isinstance(self.shift, cp.Expression) else self.shift
+        return replace(self, member=self.member.tree_copy(swap), shift=shift)
+
+    def speeds(self) -> np.ndarray:
+        """Return the shift of every row at the assigned point, flat."""
+        shift = flat_value(self.shift) if isinstance(self.shift, cp.Expression) else np.atleast_1d(self.shift)
+        return np.broadcast_to(shift, (self.member.size,))
+
+
+def times(factors: np.ndarray, expression: cp.Expression) -> cp.Expression:
+    """Multiply an expression, column by column, by flat factors."""
+    if factors.size == 1:
+        return expression if factors.item() == 1.0 else factors.item() * expression
+    return cp.multiply(np.reshape(factors, expression.shape, order="F"), expression)
+
+
+def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
+    """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
+
+    Args:
+        limits: of the members of the constraint.
+        steps: what a small step of each is: bounds are compared by what such a step gains.
+        multipliers: of their rows as they are posed, flat over the members, per unit of the objective.
+    """
+    position, totals = 0, {}
+    for number, limit in enumerate(limits):
+        length = sum(dual.size for dual in limit.member.dual_variables)
+        part = multipliers[position : position + length]
+        position += length
+        if not isinstance(limit.member, EQUALITIES | INEQUALITIES):
+            known = isinstance(limit.shift, np.ndarray)
+            totals[number] = float(part @ limit.shift if known else np.max(np.abs(part), initial=0.0)), number
+            continue
+        part = part / limit.sizes
+        if limit.band is not None and limit.span is not None:
+            totals[number] = _band_slope(part, limit.band, limit.span), number
+        elif limit.bound is None:
+            totals[number] = float(np.max(np.abs(part * limit.speeds()), initial=0.0)), number
+        else:
+            before = totals.get(limit.bound, (0.0, number))[0]
+            totals[limit.bound] = before + float(part @ limit.speeds()), number
+    value, number = max(totals.values(), key=lambda one: abs(one[0]) * steps[one[1]])
+    return abs(value), number
+
+
+def _band_slope(multipliers: np.ndarray, band: np.ndarray, span: np.ndarray) -> float:
+    """Gain per unit of t where ``span @ x = 0`` is replaced by ``|band @ x| <= t``, over the columns of x."""
+    from scipy.optimize import linprog
+
+    columns, weights = multipliers.reshape(-1, len(span)), band @ np.linalg.pinv(span)
+    if len(band) == len(span):
+        return float(np.sum(np.abs(np.linalg.solve(weights.T, columns.T))))
+    total, rows = 0.0, np.vstack([weights, -weights])
+    for column in columns:  # the most that the multipliers gain over all x inside the band, in coordinates span @ x
+        found = linprog(-column, A_ub=rows, b_ub=np.ones(len(rows)), bounds=(None, None))
+        total += -float(found.fun) if found.status == 0 else np.nan
+    return total

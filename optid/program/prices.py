@@ -1,0 +1,116 @@
+"""What every constraint costs: activity, slack, multiplier, and the multiplier in points of fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.psd import PSD
+from cvxpy.constraints.second_order import SOC
+
+from optid.program.judging import term_size
+from optid.program.limits import EQUALITIES, INEQUALITIES, Limit, slope_of
+from optid.program.program import Program
+from optid.program.solution import Solution
+
+ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below which it counts as active
+
+
+@dataclass(frozen=True)
+class Price:
+    """One user constraint at the solution.
+
+    Multiplier and price are derivatives by the bound that the user wrote: the number in the constraint, in its units.
+    Rows that share a bound move together; of several bounds the most expensive one counts. For conditions without a
+    number (monotone, odd, ...) the bound is the zero in their rows: how far, in units of f, each of them may be missed.
+
+    Attributes:
+        name: the user's name.
+        active: how many of its rows hold with equality.
+        rows: how many rows it has.
+        slack: smallest slack over the rows in units of the constraint (0 for equalities).
+        multiplier: change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers.
+        fit_points: points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the
+            constraint belongs to a step with an objective of its own.
+        step: what 1 % is in units of the bound: of the range of f where the bound is about f, else of the size of what
+            it bounds.
+        words: what the step is 1 % of, in words.
+    """
+
+    name: str
+    active: int
+    rows: int
+    slack: float
+    multiplier: float
+    fit_points: float
+    step: float = float("nan")
+    words: str = ""
+
+    @property
+    def binding(self) -> bool:
+        """Whether at least one row is active."""
+        return self.active > 0
+
+    @property
+    def points_per_step(self) -> float:
+        """Points of one-step fit gained per step of the bound: the price that is printed."""
+        return self.fit_points * self.step
+
+
+def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]:
+    """Return the price of every user constraint; empty without a point.
+
+    ``fit = 100 (1 - sqrt(F / S))`` with S the energy of the outputs about their means, so that a multiplier
+    lambda = -dF/d(bound) is worth ``50 lambda / sqrt(F S)`` points.
+    """
+    if not solution.has_point:
+        return ()
+    program.assign(solution.values)
+    unit = program.unit
+    energy = unit * float(np.sum(getattr(program.compressed, "energy", solution.scale / unit)))
+    worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
+    found, usual = [], program.usual_sizes()
+    for name, group in program.user_constraints.items():
+        limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
+        active = rows = 0
+        slack = np.inf
+        for limit in limits:
+            gaps = _slacks(limit.member)
+            rows += gaps.size
+            active += int(np.count_nonzero(gaps <= ACTIVE * term_size(limit.member, usual)))
+            slack = min(slack, float(np.min(gaps, initial=np.inf)))
+        dual = solution.duals.get(name)
+        steps = [0.01 * term_size(limit.member, usual) if limit.step is None else limit.step() for limit in limits]
+        slope, chosen = slope_of(limits, steps, dual) if dual is not None else (np.nan, 0)
+        found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, steps[chosen],
+                           limits[chosen].words or "the size of what it bounds"))
+    return tuple(found)
+
+
+def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:
+    """Return the prices of the constraints that stood in earlier steps of a procedure only.
+
+    Their multipliers are in units of the objective of their own step, so they have no price in points of fit.
+
+    Args:
+        steps: programme and solution of every constraint, by its name.
+        last: the last programme, whose constraints are left out.
+    """
+    found = []
+    for name, (program, solution) in steps.items():
+        if name not in last.user_constraints:
+            found += [replace(p, fit_points=np.nan) for p in price_constraints(program, solution) if p.name == name]
+    return tuple(found)
+
+
+def _slacks(member: Constraint) -> np.ndarray:
+    """Distance of every row from its bound; zero for equalities."""
+    if isinstance(member, EQUALITIES):
+        return np.zeros(member.size)
+    if isinstance(member, INEQUALITIES):
+        return -np.ravel(member.expr.value)
+    if isinstance(member, PSD):
+        return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
+    if isinstance(member, SOC):
+        return np.atleast_1d(member.args[0].value) - np.linalg.norm(np.atleast_1d(member.args[1].value))
+    return np.ravel(member.args[0].value)

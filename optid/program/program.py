@@ -1,0 +1,390 @@
+"""A programme: the identification problem written once, in CVXPY, with everything in it named."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from cvxpy.constraints.constraint import Constraint
+
+from optid.errors import StructureError, nearest
+from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
+from optid.program.solution import Bound
+from optid.program.view import Values, View
+
+
+def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
+    """Bring what a constraint builder returned into the form {name: (limit, ...)}.
+
+    Args:
+        built: a CVXPY constraint or a `Limit`, a list of them, or a dictionary of either.
+        default: name used where the builder gave none.
+
+    Raises:
+        StructureError: when something in it is not a CVXPY constraint.
+    """
+    if isinstance(built, Mapping):
+        groups = {str(name): item for name, item in built.items()}
+    elif isinstance(built, list | tuple):
+        groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
+    else:
+        groups = {default: built}
+    result: dict[str, tuple[Limit, ...]] = {}
+    for name, item in groups.items():
+        members = tuple(item) if isinstance(item, list | tuple) else (item,)
+        for member in members:
+            if not isinstance(member, Constraint | Limit):
+                raise StructureError(
+                    f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1"
+                )
+        result[name] = tuple(one if isinstance(one, Limit) else Limit.of(one) for one in members)
+    return result
+
+
+@dataclass(frozen=True)
+class RankOneForm:
+    """The least-squares structure behind a bilinear programme, for methods that exploit it.
+
+    ``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
+
+    Attributes:
+        problem: the numbers (`optid.structures.rank_one.RankOne`).
+        linear: names of the linear variables in the order of z (each flattened column by column).
+        blocks: (mu name, b name) of every rank-one block.
+        gauge: "norm", "gain" or "b0".
+    """
+
+    problem: Any
+    linear: tuple[str, ...]
+    blocks: tuple[tuple[str, str], ...]
+    gauge: str = "norm"
+
+
+@dataclass(frozen=True)
+class NuclearForm:
+    """The structured nuclear-norm problem behind a convex programme, for methods that exploit it.
+
+    ``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²``; its variables are ``yhat`` = v and, with a predictor, ``T`` = theta;
+    the constraint ``structure`` ties the matrix whose nuclear norm is taken to them.
+
+    Attributes:
+        problem: the numbers (`optid.structures.nuclear_norm.NuclearProblem`).
+        weight: name of the parameter that holds the weight.
+    """
+
+    problem: Any
+    weight: str = "weight"
+
+
+@dataclass(frozen=True)
+class GroupForm:
+    """The group-sparse least-squares structure behind a convex programme, for methods that exploit it.
+
+    ``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
+
+    Attributes:
+        problem: the numbers (`optid.structures.group_sparse.GroupProblem`).
+        blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
+        penalty: name of the parameter that holds lambda.
+        residual: name of the variable of the residual, and of the constraint that defines it.
+    """
+
+    problem: Any
+    blocks: Mapping[str, tuple[int, ...]]
+    penalty: str = "lambda"
+    residual: str = "residual"
+
+    def flat(self, values: Values) -> np.ndarray:
+        """Return a from named values."""
+        return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
+
+    def shaped(self, a: np.ndarray) -> dict[str, np.ndarray]:
+        """Return named values from a, the residual included."""
+        cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
+        parts = {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
+        return {**parts, self.residual: self.problem.target - self.problem.design @ a}
+
+
+@dataclass(frozen=True)
+class Program:
+    """One optimisation problem with named parts, independent of who solves it.
+
+    Attributes:
+        name: name of the formulation.
+        objective: CVXPY objective, in units of the data (residuals as variables, see ``constraints``).
+        constraints: {name: constraints}; the names in ``structural`` belong to the formulation, the others to the user.
+        variables: {name: CVXPY variable}.
+        start: {name: array}: a point to start from; never zero for a bilinear programme, where zero is a saddle.
+        recover: values -> model.
+        view: the expressions constraints may speak about.
+        structural: names of constraints that belong to the formulation.
+        parameters: {name: CVXPY parameter} that may change between solves without recompiling.
+        derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
+            variables; they are recomputed at every point before it is judged.
+        rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
+        nuclear: nuclear-norm structure for the ADMM, or None.
+        group: group-sparse structure for the block descent, or None.
+        least_squares: a `RankOneForm` without products, where the objective without the user's constraints is such a
+            sum of squares and the structural constraints only fix directions that do not change it; it is judged from
+            these numbers then.
+        certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
+        scale: objective of the zero model, the yardstick of gaps.
+        note: why there can be no proof, where that is known beforehand.
+        compressed: the compressed data the programme was built from, for uncertainty and figures; its class belongs
+            to the formulation.
+        unit: what one unit of the objective is in units of the record; solutions report their values in the latter.
+        limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
+    """
+
+    name: str
+    objective: cp.Minimize
+    constraints: Mapping[str, tuple[Constraint, ...]]
+    variables: Mapping[str, cp.Variable]
+    start: Values
+    recover: Callable[[Values], Any]
+    view: View
+    structural: frozenset[str] = frozenset()
+    parameters: Mapping[str, cp.Parameter] = field(default_factory=dict)
+    derived: Mapping[str, cp.Expression] = field(default_factory=dict)
+    rank_one: RankOneForm | None = None
+    nuclear: NuclearForm | None = None
+    group: GroupForm | None = None
+    least_squares: RankOneForm | None = None
+    certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
+    scale: float = 1.0
+    note: str = ""
+    compressed: Any = field(default=None, repr=False)
+    unit: float = 1.0
+    limits: Mapping[str, tuple[Limit, ...]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def problem(self) -> cp.Problem:
+        """The CVXPY problem; compiled once and re-used when parameters change."""
+        return cp.Problem(self.objective, [c for group in self.constraints.values() for c in group])
+
+    @cached_property
+    def kind(self) -> str:
+        """The class of the programme: "LP", "QP", "SOCP", "SDP", "conic" or "NLP".
+
+        Raises:
+            StructureError: naming the part that is neither convex nor smooth.
+        """
+        if self.problem.is_dcp():
+            return _convex_class(self.problem)
+        for name, part in self._parts():
+            if not getattr(part, "is_dnlp", bool)():  # cones have no such method
+                raise StructureError(
+                    f"{name} of {self.name!r} is neither convex nor a smooth expression that an NLP solver accepts: "
+                    f"{part}")
+        return "NLP"
+
+    @property
+    def user_constraints(self) -> dict[str, tuple[Constraint, ...]]:
+        """The constraints that are not part of the formulation itself."""
+        return {name: group for name, group in self.constraints.items() if name not in self.structural}
+
+    def nonconvex_parts(self) -> list[str]:
+        """Names of the parts that break convexity."""
+        return [name for name, part in self._parts() if not part.is_dcp()]
+
+    def _parts(self) -> Iterable[tuple[str, Any]]:
+        yield "the objective", self.objective
+        for name, group in self.constraints.items():
+            for member in group:
+                yield f"constraint {name!r}", member
+
+    def subject_to(self, *builders: Any, convex: bool | None = None) -> "Program":
+        """Return the programme with further constraints.
+
+        Args:
+            builders: callables of the `View` (such as those of ``formulations.constraints`` or a lambda that returns a
+                dictionary of CVXPY constraints), or such dictionaries.
+            convex: True refuses constraints that are not convex; default: True when the programme is convex.
+
+        Raises:
+            StructureError: unknown variable, name used twice, or a nonconvex constraint in a convex formulation.
+        """
+        demand = self.problem.is_dcp() if convex is None else convex
+        known = set(self.variables.values())
+        constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
+        usual: dict[int, float] | None = None
+        for position, builder in enumerate(builders):
+            default = getattr(builder, "name", None) or f"constraint {position + 1}"
+            built = builder(self.view) if callable(builder) else builder
+            for name, group in named(built, default).items():
+                if name in constraints:
+                    raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
+                for member in (limit.member for limit in group):
+                    foreign = set(member.variables()) - known
+                    own = {v for v in foreign if self.view.owns(v)}
+                    for variable in sorted(own, key=lambda v: v.id):
+                        _name_new(variables, variable)
+                    known |= own
+                    if foreign := foreign - own:
+                        raise StructureError(
+                            f"constraint {name!r} uses {', '.join(sorted(v.name() for v in foreign))}, "
+                            f"which is not a variable of {self.name!r} ({', '.join(self.variables)})"
+                        )
+                    if demand and not member.is_dcp():
+                        raise StructureError(
+                            f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
+                            "State it in the named variables of the relaxation or use an exact formulation."
+                        )
+                if self.view.units is not None:
+                    usual = usual if usual is not None else self.usual_sizes()
+                    constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
+                else:
+                    constraints[name], limits[name] = tuple(limit.member for limit in group), group
+        return replace(self, constraints=constraints, variables=variables, limits=limits)
+
+    def usual_sizes(self) -> dict[int, float]:
+        """Return the largest entry of every variable at the start, by id; variables that vanish there are left out."""
+        sizes = {self.variables[name].id: float(np.max(np.abs(value), initial=0.0))
+                 for name, value in self.start.items() if name in self.variables}
+        return {key: size for key, size in sizes.items() if size > 0}
+
+    def freeze(self, **values: Any) -> "Program":
+        """Return the programme with some variables held at values, as parameters that may be changed later.
+
+        Freezing ``b`` (or ``mu``) of a bilinear programme leaves a convex one. Structural constraints in which
+        nothing is left to choose are dropped.
+
+        Args:
+            values: variable name (brackets allowed through ``**{"mu[u1]": value}``) -> array of its shape.
+
+        Raises:
+            StructureError: unknown name or wrong shape.
+        """
+        swap: dict[int, Any] = {}
+        parameters = dict(self.parameters)
+        for name, value in values.items():
+            if name not in self.variables:
+                raise StructureError(f"cannot freeze {name!r}. {nearest(name, self.variables)}")
+            variable = self.variables[name]
+            array = np.asarray(value, dtype=float)
+            if array.shape != variable.shape:
+                raise StructureError(f"{name!r} has shape {variable.shape}, the value given has {array.shape}")
+            parameters[name] = swap[id(variable)] = cp.Parameter(variable.shape, name=name, value=array)
+        constraints = {}
+        for name, group in self.constraints.items():
+            kept = tuple(c.tree_copy(swap) for c in group)
+            if name in self.structural and not any(c.variables() for c in kept):
+                continue
+            constraints[name] = kept
+        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, kind=self.view.kind,
+                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
+                    reference=self.view.reference, outputs=self.view.outputs, units=self.view.units)
+        limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}
+        left = {name: v for name, v in self.variables.items() if name not in values}
+        held = {name: parameters[name] for name in values}
+
+        def recover(found: Values) -> Any:
+            return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
+
+        return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
+                       parameters=parameters, view=view, recover=recover, limits=limits,
+                       rank_one=None, nuclear=None, group=None, least_squares=None, certify=None,
+                       derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
+                       start={name: v for name, v in self.start.items() if name in left})
+
+    def soften(self, name: str, weight: float) -> "Program":
+        """Return the programme with one constraint turned into a quadratic penalty on its violation.
+
+        Args:
+            name: a user's constraint (equality or inequality).
+            weight: penalty per squared unit of violation.
+
+        Raises:
+            StructureError: unknown name, or a constraint that is neither an equality nor an inequality.
+        """
+        if name not in self.user_constraints:
+            raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
+        penalty: Any = 0.0
+        said = [limit.member for limit in self.limits.get(name, ())] or self.constraints[name]
+        for member in said:
+            if isinstance(member, EQUALITIES):
+                penalty = penalty + cp.sum_squares(member.expr)
+            elif isinstance(member, INEQUALITIES):
+                penalty = penalty + cp.sum_squares(cp.pos(member.expr))
+            else:
+                raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
+                                     "only equalities and inequalities can be softened")
+        rest = {key: group for key, group in self.constraints.items() if key != name}
+        objective = cp.Minimize(self.objective.expr + weight / self.unit * penalty)
+        return replace(self, objective=objective, constraints=rest,
+                       rank_one=None, nuclear=None, least_squares=None, certify=None,
+                       note=f"constraint {name!r} is a penalty here")
+
+    def without(self, *names: str) -> "Program":
+        """Return the programme without the named constraints."""
+        return replace(self, constraints={k: g for k, g in self.constraints.items() if k not in names})
+
+    def assign(self, values: Values) -> None:
+        """Write values into the CVXPY variables and recompute the derived ones."""
+        for name, value in values.items():
+            variable = self.variables[name]
+            array = np.asarray(value, dtype=float).reshape(variable.shape, order="F")
+            if variable.attributes["sparsity"] or variable.attributes["diag"]:
+                variable.value = array
+            else:  # a point just outside the variable's own bounds is to be judged, not refused
+                variable.save_value(array)
+        for name, expression in self.derived.items():
+            self.variables[name].value = np.asarray(expression.value)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """Return a copy of what the CVXPY variables hold, without variables that hold nothing."""
+        return {name: np.array(v.value, dtype=float) for name, v in self.variables.items() if v.value is not None}
+
+    def duals(self) -> dict[str, np.ndarray]:
+        """Return the multipliers the constraints hold: {name: flat array over the members of the group}.
+
+        Names whose constraints hold no multiplier are absent.
+        """
+        found = {}
+        for name, group in self.constraints.items():
+            parts = [d.value for member in group for d in member.dual_variables]
+            if parts and all(part is not None for part in parts):
+                found[name] = np.concatenate([np.ravel(np.asarray(part, dtype=float), order="F") for part in parts])
+        return found
+
+    def clear_duals(self) -> None:
+        """Forget the multipliers of an earlier solve, so that they cannot be mistaken for new ones."""
+        for group in self.constraints.values():
+            for member in group:
+                for dual in member.dual_variables:
+                    dual.value = None
+
+    @property
+    def size(self) -> int:
+        """Number of scalar unknowns."""
+        return sum(v.size for v in self.variables.values())
+
+
+def _name_new(variables: dict[str, cp.Variable], variable: cp.Variable) -> None:
+    name, count = variable.name(), 2
+    while name in variables:
+        name, count = f"{variable.name()} {count}", count + 1
+    variables[name] = variable
+
+
+_MATRIX_ATOMS = {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac", "matrix_frac", "tr_inv"}
+_EXPONENTIAL_ATOMS = {"exp", "log", "log1p", "log_sum_exp", "logistic", "entr", "kl_div", "rel_entr", "xexp", "log_det",
+                      "Power", "GeoMean", "Pnorm"}  # the last three are power cones; their approximations are not
+
+
+def _convex_class(problem: cp.Problem) -> str:
+    if problem.is_lp():
+        return "LP"
+    if problem.is_qp():
+        return "QP"
+    atoms = {atom.__name__ for atom in problem.atoms()}  # CVXPY lists the types
+    cones = {type(c).__name__ for c in problem.constraints}
+    if cones & {"ExpCone", "PowCone3D", "PowConeND"} or atoms & _EXPONENTIAL_ATOMS:
+        return "conic"
+    if cones & {"PSD"} or atoms & _MATRIX_ATOMS or any(
+        v.attributes["PSD"] or v.attributes["NSD"] for v in problem.variables()
+    ):
+        return "SDP"
+    return "SOCP"

@@ -1,5 +1,0 @@
-"""Recursive identification: Algorithm 3.2, its state, traces and files."""
-
-from optid.recursion.recursive_arx import RecursiveARX
-
-__all__ = ["RecursiveARX"]

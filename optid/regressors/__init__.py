@@ -1,5 +1,0 @@
-"""Lagged regressors that are never formed: layout, sufficient statistics, residuals."""
-
-from optid.regressors.statistics import Layout, Statistics, accumulate, collect, factorise, residuals
-
-__all__ = ["Layout", "Statistics", "accumulate", "collect", "factorise", "residuals"]

@@ -1,0 +1,73 @@
+"""What a validation found, as rows: errors, tests, and the fit against the horizon."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.show.wording import Table, number, percent
+
+if TYPE_CHECKING:
+    from optid.identify.validation import HorizonCurve, Validation
+
+
+def validation_tables(checked: "Validation") -> list[Table]:
+    """Errors of prediction and simulation, by experiment where there are several, and the tests."""
+    errors = [
+        (
+            f"{name}, {word}",
+            f"{q.fit:.2f}",
+            f"{q.vaf:.2f}",
+            number(q.rmse, 4),
+            number(q.e_n, 4),
+            number(q.snr, 4),
+            number(q.snr_amplitude, 3),
+            str(q.samples),
+        )
+        for name in checked.one_step
+        for word, table in checked.predictors.items()
+        for q in (table[name],)
+    ]
+    tables = [Table("Errors", ("prediction", "fit %", "VAF %", "RMSE", "E_N", "SNR", "root SNR", "samples"), errors)]
+    if checked.experiments:
+        rows = [
+            (f"{name}, experiment {k + 1}", *(percent(by[name][k].fit) for by in checked.experiments.values()))
+            for name in checked.one_step
+            for k in range(len(next(iter(checked.experiments.values()))[name]))
+        ]
+        tables.append(Table("Fit by experiment", ("output", *checked.experiments), rows))
+    return [*tables, _test_table(checked)]
+
+
+def _test_table(checked: "Validation") -> Table:
+    tests = [(f"{t.output}: {_verdict(t)}", t) for t in checked.tests]
+    rows = [(text, "yes" if t.passed else "no", number(t.p_value, 2), _outside(t)) for text, t in tests]
+    structure, note = checked.structure, ""
+    if structure is not None:
+        verdict = "looks Hammerstein" if structure.passed else "does not look Hammerstein"
+        rows.append((f"structure: {verdict}", "yes" if structure.passed else "no", number(structure.p_value, 2), "-"))
+        ratios = ", ".join(f"{name} {ratio:.3g}" for name, ratio in structure.ratios.items())
+        saved = 100 * max(structure.saving, 0)
+        note = f"Another structure saves {saved:.2g} % of the residual variance; second over first singular value of "
+        note += f"lags by functions: {ratios}."
+    return Table("Tests", ("residual of", "passed", "p value", "lags outside 99 %"), rows, note)
+
+
+def _verdict(test: Any) -> str:
+    """Say in words what a residual test found."""
+    if np.isnan(test.p_value):
+        return "nothing to test (constant, or rounding)"
+    if test.input is None:
+        return "white" if test.passed else "not white"
+    return f"independent of {test.input}" if test.passed else f"depends on {test.input}"
+
+
+def _outside(test: Any) -> str:
+    return "-" if np.isnan(test.p_value) else f"{test.outside} of {test.lags.size - (test.input is None)}"
+
+
+def horizon_table(curve: "HorizonCurve") -> Table:
+    """Fit of every output against the samples ahead; the simulation is the limit."""
+    rows = [(str(h), *(f"{fit:.2f}" for fit in fits)) for h, fits in zip(curve.horizons, curve.fits)]
+    if not np.isnan(curve.simulation).all():
+        rows.append(("simulation", *(percent(fit).removesuffix(" %") for fit in curve.simulation)))
+    return Table("Fit in % against the prediction horizon", ("samples ahead", *curve.outputs), rows)

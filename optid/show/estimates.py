@@ -1,0 +1,119 @@
+"""What was estimated, as rows: coefficients and nonlinearities with their errors."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.bases.splines import Triangular
+from optid.errors import OptidError
+from optid.models.functions import static_functions
+from optid.show.wording import Table, number
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+    from optid.identify.uncertainty import Uncertainty
+
+MOST_NODES, EVEN = 20, 11
+"""A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
+
+MOST_ROWS, ABREAST = 12, 3
+"""More coefficients than the first, without errors to show, stand in so many columns beside each other."""
+
+
+def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
+    """Return the uncertainty of a fit, or None and the reason why there is none."""
+    try:
+        return fit.uncertainty, ""
+    except OptidError as error:
+        return None, str(error)
+
+
+def parameter_table(fit: "Fit") -> Table:
+    """Coefficients of A, B and the offset with standard errors and 95 % intervals where there are some."""
+    known, reason = uncertainty(fit)
+    if known is None:
+        rows = [(name, number(value)) for name, value in fit.model.coefficients()]
+        note = f"No standard errors: {reason.rstrip('.')}."
+        if len(rows) <= MOST_ROWS:
+            return Table("Parameters", ("parameter", "estimate"), rows, note)
+        return Table("Parameters", ("parameter", "estimate") * ABREAST, _abreast(rows), note)
+    rows = [_interval_row(name, *row) for name, *row in known.table()]
+    return Table("Parameters", ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows)
+
+
+def nonlinearity_tables(fit: "Fit") -> list[Table]:
+    """Values of every nonlinearity at a few points, with their pointwise bands where there are some."""
+    found = []
+    known, _ = uncertainty(fit)
+    for function in static_functions(fit.model):
+        if function.is_linear:
+            continue
+        f = function.nonlinearity
+        points = _points(f.basis)
+        label = f"{function.name} ({function.unit})" if function.unit else function.name
+        if known is None or function.fed_back:
+            rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
+        else:
+            band = known.band(function.channel, points)
+            numeric = zip(points, band.value, band.error, band.lower, band.upper)
+            size = float(np.max(np.abs(band.value)))
+            rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
+            head = ("std. error", "95 % low", "95 % high")
+        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
+        found.append(Table(f"{what} {function.word}, basis {_basis(f.basis)}", (label, function.word, *head), rows))
+    return found
+
+
+def coefficient_table(fit: "Fit") -> Table | None:
+    """Coefficients mu of the bases; None where every channel is linear."""
+    known, _ = uncertainty(fit)
+    functions, rows = static_functions(fit.model), []
+    for function in functions:
+        if function.is_linear:
+            continue
+        letter = "nu" if function.fed_back else "mu"
+        where = "" if function.word in "fg" else function.word if function.word[1] != "_" else function.name
+        for j, value in enumerate(function.nonlinearity.mu):
+            label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
+            if known is None or function.fed_back:
+                rows.append((label, number(value)))
+            else:
+                interval = known.mu[function.channel]
+                rows.append(_interval_row(label, value, interval.error[j], interval.lower[j], interval.upper[j]))
+    head = () if known is None else ("std. error", "95 % low", "95 % high")
+    return Table("Coefficients of the basis", ("coefficient", "estimate", *head), rows) if rows else None
+
+
+def _interval_row(
+    name: str, value: float, error: float, lower: float, upper: float, size: float = 0.0
+) -> tuple[str, ...]:
+    """Write an estimate to the second digit of its standard error, as one reads it in a paper.
+
+    Errors far below `size` are roundoff: the gauge or the basis fixes the value.
+    """
+    size = max(size, abs(value))
+    if not error > 1e-9 * size:
+        return name, number(value if abs(value) > 1e-9 * size else 0.0), "fixed", "-", "-"
+    decimals = 1 - int(np.floor(np.log10(error)))
+    if decimals > 7 or max(abs(value), abs(lower), abs(upper)) >= 1e7:
+        return name, f"{value:.4e}", f"{error:.1e}", f"{lower:.4e}", f"{upper:.4e}"
+    return name, *(f"{x:.{max(decimals, 0)}f}" for x in (value, error, lower, upper))
+
+
+def _points(basis: Any) -> np.ndarray:
+    """Points at which f is listed: the nodes of a piecewise linear f when they are few, an even grid otherwise."""
+    return basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
+
+
+def _basis(basis: Any) -> str:
+    """Write a basis with its size and interval."""
+    low, high = basis.interval
+    return f"{type(basis).__name__.lower()} with {basis.size} functions on [{low:.4g}, {high:.4g}]"
+
+
+def _abreast(rows: list[tuple[str, str]]) -> list[tuple[str, ...]]:
+    """Set many short rows in `ABREAST` columns, read downwards."""
+    height = -(-len(rows) // ABREAST)
+    blank = [("", "")] * (height * ABREAST - len(rows))
+    columns = [(rows + blank)[c * height : (c + 1) * height] for c in range(ABREAST)]
+    return [tuple(cell for pair in line for cell in pair) for line in zip(*columns)]

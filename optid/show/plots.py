@@ -1,0 +1,360 @@
+"""Figures of a fit. Every function returns a matplotlib `Figure` and leaves the user's settings as they are.
+
+Long records are thinned to the extremes of every bin, so that figures stay small and no peak is lost.
+"""
+
+import warnings
+from collections.abc import Sequence
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning
+from optid.identify.validation import Validation, validate
+from optid.identify.validation.predictions import one_step, simulated
+from optid.models.functions import has_feedback, static_functions
+from optid.models.responses import response_pairs, step_length
+from optid.show import panels, summary
+from optid.show.estimates import uncertainty
+from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+
+MOST_EXPERIMENTS = 3
+"""Experiments drawn side by side; the title says how many there are."""
+
+RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "product cuts": "product cuts"}
+"""The ladder of proofs of a rank-one programme, cheapest first."""
+
+THRESHOLD = 1e-8
+"""Relative gap that counts as a proof."""
+
+@styled
+def overview(fit: "Fit", test: Data | None = None) -> Figure:
+    """Draw the whole result on one page: fit over time, nonlinearities, residual tests, poles, frequency response.
+
+    Args:
+        fit: the fit.
+        test: record to show the fit on; the estimation record when not given.
+
+    Raises:
+        DataError: the fit was made from a stream and no test record is given.
+    """
+    record, model, functions = _record(fit, test), fit.model, static_functions(fit.model)
+    long = _needs_closeup(record, 5)
+    rows_of_f = [2.9 * -(-len(functions) // 3)] if len(functions) > 1 else []
+    heights = [(4.2 if long else 2.9) * record.l, *rows_of_f, 3.0, 2.5]
+    figure = Figure(figsize=(10.0, sum(heights)), layout="constrained")
+    rows = cast(Any, figure.subfigures(len(heights), 1, height_ratios=heights))
+    _time_panels(rows[0], fit, record, "test record" if test is not None else "estimation record", closeup=long)
+    if rows_of_f:
+        _nonlinearity_panels(rows[1], fit)
+        _dynamics_panels(rows[2], fit)
+    else:
+        left, right = rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
+        _nonlinearity_panels(left, fit)
+        _dynamics_panels(right, fit)
+    _residual_panels(rows[-1], _checked(fit, record), record, outputs=1, inputs=min(model.m, 2))
+    return figure
+
+
+@styled
+def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
+    """Draw measured, simulated and one-step predicted outputs; long records with a close-up.
+
+    Args:
+        fit: the fit.
+        data: the record; the estimation record when not given.
+
+    Raises:
+        DataError: the fit was made from a stream and no record is given.
+    """
+    record = _record(fit, data)
+    long = _needs_closeup(record, 2)
+    figure = Figure(figsize=(9.0, (4.6 if long else 3.0) * record.l), layout="constrained")
+    _time_panels(figure, fit, record, "test record" if data is not None else "estimation record", closeup=long)
+    return figure
+
+
+@styled
+def nonlinearity(fit: "Fit") -> Figure:
+    """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie."""
+    count = len(static_functions(fit.model))
+    figure = Figure(figsize=(9.0 if count > 1 else 6.4, 3.4 * -(-count // 3)), layout="constrained")
+    _nonlinearity_panels(figure, fit)
+    return figure
+
+
+@styled
+def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | None = None) -> Figure:
+    """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
+
+    Args:
+        fit: the fit.
+        data: the record; the estimation record when not given.
+        checked: what `optid.validate` found on it, where that is known.
+
+    Raises:
+        DataError: the fit was made from a stream and no record is given.
+    """
+    record = _record(fit, data)
+    figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
+    _residual_panels(figure, checked or _checked(fit, record), record, outputs=record.l, inputs=record.m)
+    return figure
+
+
+@styled
+def poles_and_response(fit: "Fit") -> Figure:
+    """Draw poles, frequency response (with 95 % bands) and step response of the linear part."""
+    figure = Figure(figsize=(10.0, 3.3), layout="constrained")
+    _dynamics_panels(figure, fit, step=True)
+    return figure
+
+
+@styled
+def noise(fit: "Fit") -> Figure:
+    """Draw the spectral density of the noise at every output, in dB of its squared unit.
+
+    Raises:
+        StructureError: the model has no noise covariances.
+    """
+    from optid.identify.noise import noise_spectrum
+
+    model = fit.model
+    w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
+    size = np.sqrt(np.abs(np.einsum("foo->fo", noise_spectrum(model, w))))
+    figure = Figure(figsize=(6.4, 3.0), layout="constrained")
+    ax = figure.subplots()
+    panels.draw_response(ax, w, size, [None] * model.l, [plain(name) for name in model.outputs])
+    ax.set_title("Spectrum of the noise")
+    ax.set_ylabel("power per unit of bandwidth (dB)")
+    return figure
+
+
+@styled
+def certificate(fit: "Fit") -> Figure:
+    """Draw how far the proof of global optimality went: the ladder of proofs and the gap that is left."""
+    bound = fit.solution.bound
+    ladder = fit.program.rank_one is not None and bound is not None and bound.method in RUNGS
+    figure = Figure(figsize=(9.0, 2.7 if ladder else 1.9), layout="constrained")
+    axes = figure.subplots(2 if ladder else 1, 1, height_ratios=[1, 1.35] if ladder else None, squeeze=False)[:, 0]
+    if ladder and bound is not None:
+        methods = list(RUNGS)
+        rungs = ["local solution", *(RUNGS[m] for m in methods if m != "product cuts" or bound.method == m)]
+        reached = rungs.index(RUNGS[bound.method])
+        panels.draw_ladder(axes[0], rungs, reached, fit.solution.proof)
+    gap = fit.solution.gap
+    threshold = max(THRESHOLD, 1.01 * gap) if fit.solution.proof else THRESHOLD
+    panels.draw_gap(axes[-1], gap, threshold)
+    reason = bound.reason if bound is not None and bound.reason else "no bound"
+    axes[0].set_title(plain("\n".join(wrap(reason[0].upper() + reason[1:], 95))))
+    return figure
+
+
+@styled
+def singular_values(fit: "Fit") -> Figure:
+    """Draw the singular values of Theta of every input, before the rank is forced to one.
+
+    One that stands out speaks for the Hammerstein structure.
+
+    Raises:
+        DataError: the formulation has no matrix Theta.
+    """
+    found = theta_singular_values(fit)
+    if not found:
+        raise DataError(f"formulation {fit.formulation!r} has no matrix Theta with more than one row and column")
+    figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
+    for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
+        panels.draw_singular_values(ax, values, plain(f"Singular values of Theta, {name}"))
+    return figure
+
+
+@styled
+def spectra(fit: "Fit") -> Figure:
+    """Draw the singular values that a procedure of several steps measured, from which it read the order.
+
+    Raises:
+        DataError: the formulation has none.
+    """
+    found = summary.spectra(fit)
+    if not found:
+        raise DataError(f"formulation {fit.formulation!r} reports no singular values")
+    figure = Figure(figsize=(min(9.0, 4.4 * len(found) + 1.0), 2.9), layout="constrained")
+    order = fit.model.orders.get("nx", 0)
+    for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
+        panels.draw_singular_values(ax, values, plain(name[:1].upper() + name[1:]), order or 1)
+    return figure
+
+
+def theta_singular_values(fit: "Fit") -> dict[str, Array]:
+    """Return the singular values of Theta by input: of the relaxed programme, or of least squares without the rank.
+
+    Inputs whose Theta is a vector are left out.
+    """
+    compressed, found = fit.program.compressed, {}
+    heights = fit.program.view.units
+    if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
+        return found
+    if fit.program.view.kind == "exact":
+        z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
+        thetas = []
+        for rows, columns in compressed.problem.blocks:
+            thetas.append(z[position : position + rows * columns].reshape(rows, columns, order="F"))
+            position += rows * columns
+    else:
+        thetas = compressed.matrices(fit.solution.values)
+    unit = 1.0 if heights is None else heights.y_scale[0]  # of Theta in the units of the record
+    for name, theta in zip(fit.model.inputs, thetas):
+        if min(theta.shape) > 1:
+            found[name] = unit * np.linalg.svd(theta, compute_uv=False)
+    return found
+
+
+def _record(fit: "Fit", data: Data | None) -> Data:
+    record = fit.data if data is None else data
+    if not isinstance(record, Data):
+        raise DataError("the fit was made from a stream; give the record to draw, e.g. optid.plots.overview(fit, test)")
+    return record.raw()
+
+
+def _longest(record: Data) -> int:
+    return max(e.n_samples for e in record.experiments)
+
+
+def _needs_closeup(record: Data, factor: int) -> bool:
+    """Whether a record is one long experiment, in which single samples cannot be told apart."""
+    return record.n_experiments == 1 and record.n_samples > factor * CLOSEUP
+
+
+def _shown_simulation(fit: "Fit", record: Data) -> list[Array] | None:
+    """Simulated outputs, or None where an input is missing or the model runs away."""
+    if not (fit.model.is_stable or has_feedback(fit.model)):
+        return None
+    try:
+        return simulated(fit.model, record)
+    except DataError:
+        return None
+
+
+def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: bool = False) -> None:
+    """Fill a figure with one row per output (two with close-ups), one column per experiment."""
+    shown = record.experiments[:MOST_EXPERIMENTS]
+    heights = [1.25, 1.0] * record.l if closeup else [1.0] * record.l
+    axes = figure.subplots(
+        len(heights),
+        len(shown),
+        squeeze=False,
+        sharey="row",
+        height_ratios=heights,
+        width_ratios=[max(e.n_samples, 0.25 * _longest(record)) for e in shown],
+    )
+    predicted, free = one_step(fit.model, record), _shown_simulation(fit, record)
+    for k, e in enumerate(shown):
+        t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
+        for o, name in enumerate(record.outputs):
+            lines: list[tuple[str, Array, dict[str, Any]]] = [
+                ("measured", e.y[:, o], {"color": INK, "linewidth": 1.0, "alpha": 0.75})
+            ]
+            if free is not None:
+                lines.append(("simulated", free[k][:, o], {"color": BLUE, "linewidth": 1.6}))
+            lines.append(
+                ("one step ahead", predicted[k][:, o], {"color": ORANGE, "linewidth": 1.0, "linestyle": (0, (3, 1.2))})
+            )
+            ax = axes[o * (2 if closeup else 1), k]
+            panels.draw_record(ax, t, lines)
+            if closeup:
+                _closeup(axes[2 * o, k], axes[2 * o + 1, k], t, e.y[:, o], lines)
+            if k == 0:
+                ax.set_ylabel(with_unit(name, record.output_units[o]))
+        axes[-1, k].set_xlabel("time")
+    several = f", experiments 1-{len(shown)} of {record.n_experiments}" if record.n_experiments > 1 else ""
+    axes[0, 0].set_title(f"Fit over time: {title}{several}")
+    # outside the layout, where it would widen the column it stands in
+    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3, "borderaxespad": 0.2}
+    axes[0, -1].legend(**place, handlelength=1.6).set_in_layout(False)
+
+
+def _closeup(ax: Any, below: Any, t: Array, y: Array, lines: Sequence[tuple[str, Array, dict[str, Any]]]) -> None:
+    """Draw the stretch in which the output moves most, and mark it in the panel above."""
+    part = panels.liveliest(y[:, None])
+    panels.draw_record(below, t[part], [(label, signal[part], options) for label, signal, options in lines])
+    ax.axvspan(t[part][0], t[part][-1], color=MUTED, alpha=0.15, linewidth=0)
+    below.set_ylabel("close-up")
+
+
+def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
+    functions = static_functions(fit.model)
+    columns = min(len(functions), 3)
+    axes = figure.subplots(-(-len(functions) // columns), columns, squeeze=False)
+    record = fit.data.raw() if isinstance(fit.data, Data) else None
+    for ax in list(axes.flat)[len(functions) :]:
+        ax.set_axis_off()
+    for ax, function in zip(axes.flat, functions):
+        panels.draw_nonlinearity(
+            ax,
+            function.nonlinearity,
+            np.zeros(0) if record is None else function.samples(record),
+            None if function.fed_back else _f_band(fit, function.channel),
+            name=with_unit(function.name, function.unit),
+            label=plain(function.word),
+        )
+        ax.set_ylabel(plain(f"{function.word}({function.name})"))
+        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
+        ax.set_title(what if len(functions) == 1 else with_unit(f"{what} of {function.name}", ""))
+
+
+def _checked(fit: "Fit", record: Data) -> Validation:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return validate(fit.model, record)
+
+
+def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: int, inputs: int) -> None:
+    """One row per output: autocorrelation, then the cross-correlation with every input."""
+    axes = iter(figure.subplots(outputs, 1 + inputs, squeeze=False).ravel())
+    for name in record.outputs[:outputs]:
+        tests = [checked.autocorrelations[name]]
+        tests += [checked.cross_correlations[name, channel] for channel in record.inputs[:inputs]]
+        for k, test in enumerate(tests):
+            ax = next(axes)
+            title = "Autocorrelation" if test.input is None else f"With past {shorten(test.input)}"
+            panels.draw_correlation(ax, test, plain(title))
+            if k == 0:
+                ax.set_ylabel(plain(f"residual of {shorten(name)}"))
+
+
+def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
+    """Poles, the magnitude of every input-output pair and, where it is asked for, the step responses."""
+    model = fit.model
+    widths = [1.0, 1.45, 1.25] if step else [1.0, 1.7]
+    poles, response, *last = figure.subplots(1, len(widths), width_ratios=widths)
+    panels.draw_poles(poles, model.poles)
+    names = [plain(f"{u} to {y}") for u, y in response_pairs(model)]
+    for ax in last:
+        steps = model.step_response(step_length(model))
+        panels.draw_steps(ax, model.dt, steps.reshape(len(steps), -1), names)
+    w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
+    curves = model.frequency_response(w).reshape(w.size, -1)
+    panels.draw_response(response, w, curves, _response_bands(fit, w), names)
+
+
+def _f_band(fit: "Fit", channel: int) -> tuple[Array, Array, Array] | None:
+    known, _ = uncertainty(fit)
+    if known is None:
+        return None
+    band = known.band(channel)
+    return np.asarray(band.at), band.lower, band.upper
+
+
+def _response_bands(fit: "Fit", w: Array) -> list[tuple[Array, Array] | None]:
+    known, _ = uncertainty(fit)
+    if known is None:
+        return [None] * len(response_pairs(fit.model))
+    size, _ = known.frequency_response(w)
+    lower, upper = (edge.reshape(w.size, -1).T for edge in (size.lower, size.upper))
+    return list(zip(lower, upper))

@@ -1,0 +1,305 @@
+"""What there is to say about a fit, in words and rows; the printed result and the HTML page both read it here."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.data.record import Data
+from optid.identify.validation.predictions import predictors
+from optid.models.functions import has_feedback, static_functions
+from optid.models.noise_covariances import NoiseCovariances
+from optid.program.solution import Status
+from optid.show.wording import Table, gap_text, number, percent, seconds
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+
+Facts = list[tuple[str, str]]
+
+MOST = 12
+"""Entries of an array among the figures that are printed."""
+
+PRICE_NOTE = (
+    "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit (%) gained when the "
+    "bound is relaxed by 1 % of the range of f, or, where it is not about f, of the size of what it bounds."
+)
+
+
+def title(fit: "Fit") -> str:
+    """Say what was identified from what."""
+    model = fit.model
+    return f"{model.title} of {_and(model.outputs)} from {_and(model.inputs)}"
+
+
+def verdict(fit: "Fit") -> tuple[str, str, str]:
+    """Return a tone ("good", "fair", "bad"), the status in words, and one sentence that says what it means."""
+    solution = fit.solution
+    bound, gap = solution.bound, solution.gap
+    if solution.proof and solution.status is Status.OPTIMAL and bound is not None:
+        which = "this structure that keeps the constraints" if fit.prices else "this structure"
+        proof = f"{bound.method}, relative gap {gap_text(gap)}"
+        sentence = f"No model of {which} has a smaller objective on this record: global optimality is proved ({proof})."
+        return "good", "optimal (proved)", sentence
+    word = f"{solution.status} (not proved)" if solution.has_point else str(solution.status)
+    reason = (solution.reason or (bound.reason if bound is not None else "") or fit.program.note).rstrip(".")
+    because = f": {reason}" if reason else ""
+    if solution.status not in (Status.LOCAL, Status.OPTIMAL):
+        return "bad", word, f"The solver stopped early{because}. Read the figures below with care."
+    if fit.procedure and because:
+        return "fair", word, f"Not proved to be the best model of this structure{because}."
+    if gap < 1:
+        most = f"{100 * gap:.2g} %"
+        return "fair", word, f"A local optimum; no model of this structure can lower the objective by more than {most}."
+    return "fair", word, f"A local optimum; whether a better one exists is not known{because}."
+
+
+def fit_table(fit: "Fit") -> Table:
+    """Fit of every output on the estimation record, by every predictor that the model has."""
+    columns = [np.atleast_1d(fit.one_step_fit)]
+    if has_feedback(fit.model):
+        columns.append(np.atleast_1d(fit.measured_feedback_fit))
+    columns.append(simulation_fit(fit))
+    rows = [(name, *map(percent, values)) for name, *values in zip(fit.model.outputs, *columns)]
+    return Table("Fit on the estimation record", ("output", *predictors(fit.model)), rows)
+
+
+def simulation_fit(fit: "Fit") -> np.ndarray:
+    """Simulation fit of every output in %; NaN where there is none: see `Fit.simulation_fit`, or an unstable model.
+
+    With nonlinear feedback the poles of the linear part do not decide about stability; the simulation does.
+    """
+    if not (fit.model.is_stable or has_feedback(fit.model)):
+        return np.full(fit.model.l, np.nan)
+    return np.atleast_1d(fit.simulation_fit)
+
+
+def constraint_table(fit: "Fit") -> Table:
+    """Activity, slack and price of every user constraint."""
+    rows = []
+    for p in fit.prices:
+        state = f"active ({p.active} of {p.rows})" if p.binding else "not active"
+        priced = p.binding and not np.isnan(p.multiplier)
+        rows.append(
+            (
+                p.name,
+                state,
+                "-" if p.binding else number(p.slack, 3),
+                number(p.multiplier, 3) if priced else "-",
+                number(p.points_per_step, 3) if priced else "-",
+            )
+        )
+    return Table("Constraints", ("constraint", "state", "slack", "multiplier", "price"), rows, PRICE_NOTE)
+
+
+def certificate_facts(fit: "Fit") -> Facts:
+    """Why the solver stopped, whether there is a point, whether it is proved, and our own measurements."""
+    s, r = fit.solution, fit.solution.residuals
+    facts = [("Why it stopped", f"{s.solver} said: {s.claimed}"), ("Is there a point", "yes" if s.has_point else "no")]
+    if s.bound is None:
+        facts.append(("Is it proved", "no: " + (fit.program.note or "this programme has no certificate")))
+    else:
+        facts.append(("Is it proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
+        known = np.isfinite(s.bound.value)
+        facts.append(("Bound", f"{number(s.bound.value, 10)} ({s.bound.method})" if known else "none"))
+    facts.append(("Objective", number(s.objective, 10)))
+    facts.append(("Relative gap", gap_text(s.gap)))
+    if r is not None:
+        worst = f" in {r.worst!r}" if r.violation > 0 and r.worst else ""
+        facts.append(("Largest violation", f"{gap_text(r.violation)}{worst}"))
+        facts.append(("Stationarity", f"{r.stationarity:.1e}" if np.isfinite(r.stationarity) else "not measured"))
+        facts.append(
+            ("Complementarity", f"{r.complementarity:.1e}" if np.isfinite(r.complementarity) else "not measured")
+        )
+    return facts
+
+
+def record_facts(fit: "Fit") -> Facts:
+    """Name, length, experiments, missing samples and rows used."""
+    data, figures = fit.data, fit.figures
+    count = data.n_samples
+    facts = [
+        ("Record", data.name or "unnamed"),
+        ("Samples", (f"{count} every {data.dt:g}" if count else f"every {data.dt:g}")),
+    ]
+    if isinstance(data, Data):
+        facts.append(("Experiments", str(data.n_experiments)))
+        missing = [f"{name} {share:.2%}" for name, share in data.missing.items() if share]
+        facts.append(("Missing", ", ".join(missing) or "none"))
+        if not data.transform.is_identity:
+            facts.append(("Units", "detrended or scaled for the fit; everything here is in raw units"))
+    if "rows" in figures:
+        facts.append(("Rows used", f"{figures['rows']} of {figures['candidates']}"))
+        facts.append(
+            (
+                "Condition",
+                f"{figures['condition']:.1e} ({'Gram matrix' if figures['method'] == 'gram' else 'streamed QR'})",
+            )
+        )
+    return facts
+
+
+def evidence_facts(fit: "Fit") -> Facts:
+    """What a procedure measured on its way, in its own words and order."""
+    return [(name[:1].upper() + name[1:], _measured(value)) for name, value in fit.figures.items() if name not in _ROWS]
+
+
+def spectra(fit: "Fit") -> dict[str, np.ndarray]:
+    """Return the singular values and other falling sequences among the figures of a procedure, by their names."""
+    named = {name: value for name, value in fit.figures.items() if "singular" in name.lower()}
+    lists = {name: value for name, value in named.items() if isinstance(value, np.ndarray | list | tuple)}
+    found = {name: np.asarray(value, dtype=float) for name, value in lists.items()}
+    return {name: values for name, values in found.items() if values.ndim == 1 and values.size > 1}
+
+
+def channel_table(fit: "Fit") -> Table | None:
+    """What every channel looks like; None for a stream."""
+    if not isinstance(fit.data, Data):
+        return None
+    rows = [
+        (
+            c.name,
+            c.role,
+            c.unit or "-",
+            number(c.low, 4),
+            number(c.high, 4),
+            number(c.mean, 4),
+            number(c.std, 4),
+            str(c.levels) if c.levels <= 1000 else "many",
+            f"{c.missing:.2%}",
+        )
+        for c in fit.data.raw().channels
+    ]
+    return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
+
+
+def solver_facts(fit: "Fit") -> Facts:
+    """Which solver, why, and how long each part took."""
+    s = fit.solution
+    facts = [("Solver", s.solver)]
+    if s.chosen:
+        facts.append(("Chosen because", s.chosen.partition(": ")[2] or s.chosen))
+    if s.iterations >= 0:
+        facts.append(("Iterations", str(s.iterations)))
+    if len(fit.steps) > 1:
+        facts.append(("Programmes solved", str(len(fit.steps))))
+    facts += [
+        (name, seconds(value))
+        for name, value in (
+            ("Posing", s.times.build),
+            ("Solving", s.times.solve),
+            ("Judging", s.times.judge),
+            ("Proving", s.times.prove),
+            ("In all", fit.seconds),
+        )
+    ]
+    return facts
+
+
+def call(fit: "Fit") -> str:
+    """Write the Python call behind the fit; constraints by their names."""
+    words = [f"{key}={_argument(value)}" for key, value in fit.arguments.items() if key != "constraints"]
+    if fit.arguments.get("constraints"):
+        names = [getattr(constraint, "name", None) or "a user function" for constraint in fit.arguments["constraints"]]
+        words.append(f"constraints=[{', '.join(names)}]")
+    return f"optid.fit(data, {fit.formulation!r}, {', '.join(words)})"
+
+
+def model_facts(fit: "Fit") -> Facts:
+    """Orders, poles, noise, gauge, what f does outside the range, and why its offset is not identifiable."""
+    model = fit.model
+    facts = [
+        ("Orders", ", ".join(f"{name} {_order(value)}" for name, value in model.orders.items())),
+        ("Poles", ", ".join(_complex(p) for p in model.poles) or "none"),
+    ]
+    if isinstance(getattr(model, "noise", None), str):
+        facts.append(("Noise", model.noise))
+    if gauge := _gauge(model):
+        facts.append(("Gauge", gauge))
+    functions = [function for function in static_functions(model) if not function.is_linear]
+    outside = sorted({f"{function.nonlinearity.basis.outside}" for function in functions})
+    if outside:
+        facts.append(("Outside the range", ", ".join(outside)))
+    if model.offset_note and functions:
+        facts.append(("Offset", model.offset_note))
+    return facts
+
+
+def _gauge(model: Any) -> str:
+    """Say how the scale between f and the linear part is fixed; "" where the word says nothing."""
+    positive = all(b.flat[0] >= 0 for b in getattr(model, "b", ()))
+    sign = "its first coefficient positive" if positive else "its sign follows from the constraints"
+    known = {
+        "norm": f"norm of b is one, {sign}",
+        "gain": "static gain of the linear part is one",
+        "b0": "first coefficient of b is one",
+        "none": "",
+    }
+    return known.get(model.gauge, str(model.gauge))
+
+
+def has_noise(model: Any) -> bool:
+    """Whether a model has noise covariances."""
+    return isinstance(getattr(model, "noise", None), NoiseCovariances)
+
+
+def noise_table(fit: "Fit") -> Table | None:
+    """Innovations, noise at the outputs and its colour for a state-space model with noise covariances."""
+    model = fit.model
+    if not has_noise(model):
+        return None
+    from optid.identify.noise import colour, output_noise
+
+    tests = colour(model, fit.data) if isinstance(fit.data, Data) else {}
+    spread = np.sqrt(np.diag(output_noise(model)))
+    own = np.sqrt(np.diag(model.noise.innovation))
+    rows = []
+    for name, unit, innovation, total in zip(model.outputs, model.output_units, own, spread):
+        test = tests.get(name)
+        word = "-" if test is None or np.isnan(test.p_value) else "white" if test.passed else "coloured"
+        label = f"{name} ({unit})" if unit else name
+        p_value = "-" if test is None else number(test.p_value, 2)
+        rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
+    note = (
+        "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
+        "explain the record as well."
+    )
+    return Table("Noise", ("output", "innovations", "noise at output", "colour", "p value"), rows, note)
+
+
+_ROWS = ("rows", "candidates", "condition", "method")
+"""Figures of the compressed statistics, which `record_facts` tells."""
+
+
+def _measured(value: Any) -> str:
+    """Write a figure of a procedure: a number, a text, or the first entries of an array."""
+    if isinstance(value, bool | str) or value is None:
+        return value if isinstance(value, str) else {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_measured(entry)}" for key, entry in value.items())
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        return str(value)
+    if array.ndim == 0:
+        return number(float(array), 5)
+    shown = " ".join(number(float(entry), 4) for entry in array.ravel()[:MOST])
+    return shown + (f" ... ({array.size} in all)" if array.size > MOST else "")
+
+
+def _order(value: Any) -> str:
+    """Write an order, or those of the inputs."""
+    return str(value) if np.ndim(value) == 0 else " ".join(map(str, value))
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.4g}" if abs(value.imag) < 1e-12 else f"{value.real:.4g}{value.imag:+.4g}j"
+
+
+def _argument(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist())
+    return repr(value)
+
+
+def _and(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,0 +1,1 @@
+"""Solve programmes and procedures with any back end."""

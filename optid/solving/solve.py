@@ -1,0 +1,369 @@
+"""Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, ask for a proof."""
+
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from optid.backends import Answer, BackEnd, Settings, choose, fallbacks, find
+from optid.certificate.convex import TANGENT, certify_convex
+from optid.certificate.infeasibility import satisfiable
+from optid.errors import SolverRefused, StructureError
+from optid.program.judging import judge, measure_violation
+from optid.program.program import Program, Values
+from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
+from optid.solving.isolated import run_isolated
+
+Procedure = Generator[Program, Solution, Any]
+
+LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
+CONFLICT = "the constraints contradict each other"
+NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
+
+
+def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
+          time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
+          verbose: bool = False, **options: Any) -> Solution:
+    """Solve one programme with one back end and judge the answer.
+
+    Args:
+        program: what to solve.
+        solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
+        accuracy: requested relative accuracy, translated for each solver.
+        time_limit: seconds; implies a process of its own, which is killed when it does not stop.
+        isolate: run in a process of its own (default: only with a time limit), so that a crash is an outcome.
+        warm: start from the programme's ``start``.
+        prove: ask the programme's certificate for a proof of global optimality.
+        verbose: let the solver print.
+        options: native options of the solver.
+
+    Returns:
+        The outcome, always as a value: infeasible, failed and limit are statuses here.
+
+    Raises:
+        LookupFailed: no such solver.
+        SolverMissing: not installed (with the pip line).
+        SolverRefused: the solver cannot take this class of programme; the message names the nonconvex part.
+    """
+    chosen = ""
+    if solver == "auto":
+        back_end, chosen = choose(program)
+    elif isinstance(solver, str):
+        back_end = find(solver)
+    else:
+        back_end = solver if isinstance(solver, BackEnd) else BackEnd(
+            getattr(solver, "__name__", "callable"), frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"}), solver)
+    refusal = back_end.refuses(program)
+    if refusal:
+        raise SolverRefused(refusal)
+    settings = Settings(accuracy, time_limit, warm, verbose, options)
+
+    separate = (time_limit is not None) if isolate is None else isolate
+    clock = time.perf_counter()
+    answer = _attempt(program, back_end, settings, separate)
+    solved = time.perf_counter()
+    solution = _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
+    if chosen and solution.status is Status.FAILED and not options:
+        return _substitute(program, solution, settings, prove, separate)
+    if chosen and solution.status is Status.INACCURATE and not options:
+        return _sharpened(program, back_end, solution, settings, prove, separate)
+    return solution
+
+
+def _sharpened(program: Program, back_end: BackEnd, first: Solution, settings: Settings, prove: bool, separate: bool
+               ) -> Solution:
+    """Return what a hundredth of the tolerance gives where that satisfies our measurements, else the first answer."""
+    clock = time.perf_counter()
+    answer = _attempt(program, back_end, replace(settings, accuracy=settings.accuracy / 100), separate)
+    seconds = first.times.solve + time.perf_counter() - clock
+    again = _verdict(program, back_end, answer, first.chosen, settings, seconds, prove, separate)
+    return again if again.status in (Status.LOCAL, Status.OPTIMAL) else first
+
+
+def _substitute(program: Program, first: Solution, settings: Settings, prove: bool, separate: bool) -> Solution:
+    """Return the first usable answer of another back end of the class, or the failure of the one chosen."""
+    for back_end in fallbacks(program, first.solver):
+        clock = time.perf_counter()
+        answer = _attempt(program, back_end, settings, separate)
+        seconds = time.perf_counter() - clock
+        chosen = f"{back_end.name}: in place of {first.solver}"
+        solution = _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
+        if solution.has_point and solution.status is not Status.FAILED:
+            return replace(solution, failed=first.solver)
+    return first
+
+
+def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
+    """Say in one sentence how many programmes another back end than the one chosen first has solved."""
+    replaced = [solution for _, solution in steps if solution.failed]
+    if not replaced:
+        return {}
+    first, others = replaced[0].failed, ", ".join(dict.fromkeys(solution.solver for solution in replaced))
+    return {"solver fallback": f"{first} gave no usable answer for {len(replaced)} of {len(steps)} programmes, which "
+                               f"{others} solved"}
+
+
+def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
+    """Run a back end from the programme's start; whatever happens to it is an answer."""
+    program.clear_duals()
+    if settings.warm and program.start:
+        program.assign(program.start)
+    try:
+        return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
+    except StructureError as refusal:  # it says what to change, so it must reach the user
+        raise SolverRefused(str(refusal)) from refusal
+    except Exception as error:  # a solver that crashes is an outcome, not a traceback
+        return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
+
+
+def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, settings: Settings, seconds: float,
+             prove: bool, separate: bool) -> Solution:
+    base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
+                    iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
+                    claim=answer.status)
+    values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
+    if not values:
+        status, reason = _without_point(program, answer, back_end.name)
+        if status is Status.FAILED and _contradictory(program):
+            return _conflict(program, base, reason)
+        return replace(base, status=status, reason=reason).in_units(program.unit)
+    if not all(np.all(np.isfinite(value)) for value in values.values()):
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
+    if missing := set(program.variables) - set(values) - set(program.derived):
+        return replace(base, status=Status.FAILED,
+                       reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
+
+    clock = time.perf_counter()
+    try:
+        point = _judged(program, answer)
+    except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
+        why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
+    judged = time.perf_counter()
+    status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
+    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
+        return _conflict(program, base, reason)
+    bound: Bound | None = None
+    if status in (Status.LOCAL, Status.INACCURATE) and prove:
+        point, bound = _proof(program, back_end, settings, point, separate)
+        if bound is not None and bound.proved and status is Status.LOCAL:
+            status = Status.OPTIMAL
+        elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
+            status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
+    done = time.perf_counter()
+    return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
+                   values=point.values, duals=point.duals, objective=point.objective, bound=bound,
+                   residuals=point.residuals,
+                   times=replace(base.times, judge=judged - clock, prove=done - judged)).in_units(program.unit)
+
+
+def _conflict(program: Program, base: Solution, reason: str) -> Solution:
+    """Say that no point satisfies the constraints; where a solver stopped is then nothing to go on with."""
+    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}").in_units(program.unit)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A point with what we measured there."""
+
+    values: Values
+    duals: Values
+    objective: float
+    residuals: Residuals
+
+
+def _judged(program: Program, answer: Answer) -> _Judged:
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
+        objective, residuals = judge(program, answer.values, answer.duals)
+    return _Judged(program.values(), dict(answer.duals), objective, residuals)
+
+
+def _overflowed(program: Program) -> bool:
+    """Whether quantities that follow from the assigned variables are not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = [np.asarray(expression.value) for expression in program.derived.values()]
+    return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
+
+
+def _contradictory(program: Program) -> bool:
+    """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
+    return program.rank_one is not None and bool(program.user_constraints) and not satisfiable(
+        program, list(program.user_constraints))
+
+
+def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status, str]:
+    """Judge a claim that comes without a point."""
+    if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
+        return Status.FAILED, f"{name} claims success, but returned no point"
+    if answer.status is Status.INFEASIBLE and program.start:
+        program.assign(program.start)
+        if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
+            return Status.FAILED, f"{name} says infeasible, but the start satisfies every constraint"
+    return answer.status, answer.word
+
+
+def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
+    """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
+    limit = tolerance(accuracy)
+    claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
+    outside = residuals.violation > limit
+    amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
+    if answer.status is Status.INFEASIBLE and not outside:
+        return Status.FAILED, f"{name} says infeasible at a point that satisfies every constraint"
+    if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
+        return answer.status, f"{answer.word}; {amount}" if amount else answer.word
+    if outside:
+        if residuals.violation > LIE:
+            return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
+        return Status.INACCURATE, amount
+    if residuals.stationarity > GRADIENT * limit or residuals.complementarity > limit:
+        return Status.INACCURATE, (
+            f"{name + ' claims success' if claims else answer.word}, but the point is not stationary: "
+            f"residual {residuals.stationarity:.1e}, complementarity {residuals.complementarity:.1e}")
+    if not claims and not np.isfinite(residuals.stationarity):
+        return Status.INACCURATE, answer.word
+    return Status.LOCAL, ""
+
+
+def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) -> bool:
+    """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
+    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
+        return False
+    return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
+
+
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool
+           ) -> tuple[_Judged, Bound | None]:
+    """Ask for a proof; when the attempt proposes a better start, solve again from there and keep the better point."""
+    if program.certify is None:
+        return point, _convex_proof(program, point)
+    bound, start = program.certify(program, point.values, point.duals)
+    if start is not None and not bound.proved:
+        answer = _attempt(replace(program, start=start), back_end, settings, separate)
+        if answer.values:
+            again = _judged(program, answer)
+            lower = point.objective - 1e-10 * abs(point.objective)
+            if again.objective < lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
+                bound, _ = program.certify(program, again.values, again.duals)
+                point = again
+        program.assign(point.values)
+    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
+        wider = replace(settings, options={**back_end.thorough, **settings.options})
+        point, bound = _better(program, back_end, wider, point, bound, separate)
+    return point, bound
+
+
+def _better(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound, separate: bool
+            ) -> tuple[_Judged, Bound]:
+    """Search further for a local optimum that lies lower, and certify it."""
+    answer = _attempt(program, back_end, settings, separate)
+    again = _judged(program, answer) if answer.values else point
+    lower = again.objective < point.objective - 1e-10 * abs(point.objective)
+    if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9) and program.certify is not None:
+        return again, program.certify(program, again.values, again.duals)[0]
+    program.assign(point.values)
+    return point, bound
+
+
+def _convex_proof(program: Program, point: _Judged) -> Bound | None:
+    if program.kind == "NLP":
+        return None
+    try:
+        return certify_convex(program, point.values, point.duals, point.objective)
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a procedure returns when its objective is not that of its last programme.
+
+    Attributes:
+        model: the model.
+        objective: value of the procedure's own objective.
+        bound: bound on that objective, with the reason where there can be none.
+        status: status of the procedure as a whole.
+        reason: one sentence for people.
+        figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
+            "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
+            which the report draws. The fit prints them in this order.
+    """
+
+    model: Any
+    objective: float
+    bound: Bound
+    status: Status
+    reason: str = ""
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def pointless(cls, status: Status, reason: str) -> "Evidence":
+        """Say why there is no model."""
+        return cls(None, float("nan"), Bound.none(reason), status, reason)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a formulation ended with.
+
+    Attributes:
+        model: the model, or None where no programme had a point.
+        solution: the last solution.
+        program: the last programme.
+        steps: every (name, solution) on the way; one entry for a plain programme.
+        figures: those of the procedure's `Evidence`.
+        constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
+            constraints to the steps they are about.
+        procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
+    """
+
+    model: Any
+    solution: Solution
+    program: Program
+    steps: tuple[tuple[str, Solution], ...]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
+    procedure: bool = False
+
+
+def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
+    """Solve a programme, or drive a procedure that yields programmes, with one solver.
+
+    The time that a procedure itself takes, between its programmes, counts as building.
+
+    Args:
+        problem: a `Program`, or a generator that yields programmes, receives their solutions and returns the model.
+        solver: as in `solve`.
+        settings: as in `solve`.
+    """
+    constrained: dict[str, tuple[Program, Solution]] = {}
+    steps: list[tuple[str, Solution]] = []
+    if isinstance(problem, Program):
+        solution = solve(problem, solver, **settings)
+        model = problem.recover(solution.values) if solution.has_point else None
+        constrained = dict.fromkeys(problem.user_constraints, (problem, solution))
+        return Outcome(model, solution, problem, ((problem.name, solution),), constrained=constrained)
+    clock = time.perf_counter()
+    program = next(problem)
+    building = time.perf_counter() - clock
+    while True:
+        solution = solve(program, solver, **settings)
+        steps.append((program.name, solution))
+        constrained |= dict.fromkeys(program.user_constraints, (program, solution))
+        clock = time.perf_counter()
+        try:
+            program = problem.send(solution)
+            building += time.perf_counter() - clock
+        except StopIteration as stop:
+            found = stop.value
+            building += time.perf_counter() - clock
+            solution = replace(solution, times=replace(solution.times, build=building))
+            if not isinstance(found, Evidence):
+                return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
+            solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
+                               reason=found.reason)
+            figures = {**found.figures, **_substitutions(steps)}
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True)

@@ -1,0 +1,246 @@
+"""Signals of a subspace fit: functions of the inputs, of the measured outputs and of simulated outputs.
+
+Functions of an output enter orthogonalised against {1, y} on the record: the linear part of a feedback cannot be told
+from an output injection (A - LC, B - LD), and a function nearly linear in y would make the regressors nearly singular.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases.basis import Basis
+from optid.errors import DataError, DataWarning, RankError
+from optid.statistics.factors import add_to_root
+
+SMALLEST = 1e-6
+"""Part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding."""
+
+NEARLY_LINEAR = 0.05
+"""Part of the feedback functions outside {1, y}, relative to their spread, below which the user is warned."""
+
+LINEAR = 1e-3
+"""The same part below which the fit is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """The functions of one output that enter the state equation, in orthonormal coordinates on the record.
+
+    zeta_r = V^T zeta(y_o) - intercept - slope y, of unit variance and uncorrelated with {1, y}.
+
+    Attributes:
+        output: index o of the output.
+        basis: its basis, with an interval.
+        vectors: (Q, r) V; r < Q where the basis contains functions that are linear on the record.
+        intercept: (r,).
+        slope: (r, l).
+        share: spread left after the orthogonalisation, relative to the spread of the functions.
+    """
+
+    output: int
+    basis: Basis
+    vectors: Array
+    intercept: Array
+    slope: Array
+    share: float
+
+    @property
+    def size(self) -> int:
+        """Number r of coordinates."""
+        return self.vectors.shape[1]
+
+    def values(self, y: Array) -> Array:
+        """Evaluate zeta_r, (T, r), at outputs y (T, l)."""
+        return _values(self.basis, y[:, self.output]) @ self.vectors - self.intercept - y @ self.slope.T
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Turns raw channels [u | y (| simulated y)] into signals [eta | zeta_r | y (| zeta_r of the simulated y)].
+
+    Attributes:
+        inputs: one basis per input, with intervals.
+        feedback: feedback functions, at most one family per output.
+        input_names: names of the m inputs.
+        output_names: names of the l outputs.
+        simulated: whether simulated outputs follow the measured ones.
+    """
+
+    inputs: tuple[Basis, ...]
+    feedback: tuple[Feedback, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    simulated: bool = False
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.input_names)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.output_names)
+
+    @cached_property
+    def input_sizes(self) -> tuple[int, ...]:
+        """Number of functions of every input."""
+        return tuple(basis.size for basis in self.inputs)
+
+    @property
+    def p(self) -> int:
+        """Number of functions of all inputs."""
+        return sum(self.input_sizes)
+
+    @property
+    def q(self) -> int:
+        """Number of coordinates of all feedback functions."""
+        return sum(family.size for family in self.feedback)
+
+    @property
+    def eta(self) -> range:
+        """Positions of the input functions among the signals."""
+        return range(self.p)
+
+    @property
+    def zeta(self) -> range:
+        """Positions of the feedback functions of the measured outputs."""
+        return range(self.p, self.p + self.q)
+
+    @property
+    def y(self) -> range:
+        """Positions of the outputs."""
+        return range(self.p + self.q, self.p + self.q + self.l)
+
+    @property
+    def zeta_simulated(self) -> range:
+        """Positions of the feedback functions of the simulated outputs."""
+        start = self.p + self.q + self.l
+        return range(start, start + self.q * self.simulated)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name every signal, e.g. polynomial2(valve)."""
+        names = [f"{_family(basis)}{j}({channel})" if basis.size > 1 else channel
+                 for channel, basis in zip(self.input_names, self.inputs) for j in range(1, basis.size + 1)]
+        zetas = [f"feedback function {j} of {self.output_names[family.output]}"
+                 for family in self.feedback for j in range(1, family.size + 1)]
+        return (*names, *zetas, *self.output_names, *(f"simulated {name}" for name in zetas * self.simulated))
+
+    def __call__(self, raw: Array) -> Array:
+        """Evaluate the signals of samples (T, m + l) or (T, m + 2 l)."""
+        m, l = self.m, self.l  # noqa: E741
+        y = raw[:, m : m + l]
+        parts = [_values(basis, raw[:, c]) for c, basis in enumerate(self.inputs)]
+        parts += [family.values(y) for family in self.feedback]
+        parts.append(y)
+        if self.simulated:
+            parts += [family.values(raw[:, m + l :]) for family in self.feedback]
+        return np.concatenate(parts, axis=1)
+
+    def injection(self, e: Array) -> tuple[Array, Array]:
+        """Return L (n, l) and the constant (n,) that ``E zeta_r`` adds to the state equation beside ``E V^T zeta(y)``.
+
+        Args:
+            e: (n, q) E, families side by side.
+        """
+        slopes = np.concatenate([np.zeros((0, self.l)), *(family.slope for family in self.feedback)])
+        intercepts = np.concatenate([np.zeros(0), *(family.intercept for family in self.feedback)])
+        return -e @ slopes, -e @ intercepts
+
+    def with_simulated(self, simulated: bool = True) -> "Expansion":
+        """Return the same expansion, with or without the functions of simulated outputs."""
+        return replace(self, simulated=simulated)
+
+    def without_feedback(self) -> "Expansion":
+        """Return the open-loop expansion."""
+        return replace(self, feedback=(), simulated=False)
+
+
+def expand(
+    records: Sequence[Array],
+    inputs: Sequence[Basis],
+    feedback: Sequence[Basis | None],
+    input_names: Sequence[str],
+    output_names: Sequence[str],
+) -> Expansion:
+    """Fit the feedback functions to a record and return its expansion.
+
+    Args:
+        records: (N, m + l) arrays [u | y], one per experiment; NaN = missing.
+        inputs: one basis per input, with an interval.
+        feedback: one basis per output, with an interval, or None for an output that is not fed back; empty for none.
+        input_names: m names.
+        output_names: l names.
+
+    Raises:
+        RankError: the feedback functions of an output are linear in y on this record.
+        DataError: no sample at which all outputs are present.
+
+    Warns:
+        DataWarning: they are nearly linear.
+    """
+    m, l = len(input_names), len(output_names)  # noqa: E741
+    families = []
+    for output, basis in enumerate(feedback):
+        if basis is not None:
+            families.append(_orthogonalised([record[:, m : m + l] for record in records], output, basis, output_names))
+    return Expansion(tuple(inputs), tuple(families), tuple(input_names), tuple(output_names))
+
+
+def _values(basis: Basis, u: Array) -> Array:
+    """Evaluate a basis as `Basis.values`; a family without a redundant or local function as it comes."""
+    if basis.dropped is not None:
+        return basis.values(u)
+    _, weights = basis.local(u)
+    if weights.shape[1] < basis.full_size:
+        return basis.values(u)
+    missing = np.isnan(u)
+    if missing.any():
+        weights = np.where(missing[:, None], np.nan, weights)
+    return weights
+
+
+def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: Sequence[str]) -> Feedback:
+    l, q = len(names), basis.size  # noqa: E741
+    root, count = np.zeros((1 + l + q, 1 + l + q)), 0
+    for record in outputs:
+        y = record[~np.isnan(record).any(axis=1)]
+        count += len(y)
+        for start in range(0, len(y), 8192):
+            part = y[start : start + 8192]
+            rows = np.concatenate([np.ones((len(part), 1)), part, basis.values(part[:, output])], axis=1)
+            root = add_to_root(root, rows)
+    if not count:
+        raise DataError("no sample has all outputs: the feedback functions cannot be formed.")
+    slopes = np.linalg.lstsq(root[: 1 + l, : 1 + l], root[: 1 + l, 1 + l :], rcond=None)[0]  # (1 + l, Q)
+    rest = root[:, 1 + l :] - root[:, : 1 + l] @ slopes
+    spread = np.linalg.norm(root[1:, 1 + l :])
+    share = float(np.linalg.norm(rest) / spread) if spread > 0 else 0.0
+    if share < LINEAR:
+        raise RankError(_nearly_linear(basis, names[output], share) + " Use more functions, or a record in which this "
+                        "output moves further.")
+    if share < NEARLY_LINEAR:
+        warnings.warn(_nearly_linear(basis, names[output], share) + " What it adds will be uncertain.", DataWarning,
+                      stacklevel=4)
+    _, values, right = np.linalg.svd(rest)
+    sizes = np.linalg.norm(root[1:, 1 + l :])
+    kept = values > SMALLEST * sizes
+    vectors = right[: values.size][kept].T / (values[kept] / np.sqrt(count))
+    reduced = slopes @ vectors
+    return Feedback(output, basis, vectors, reduced[0], reduced[1:].T, share)
+
+
+def _nearly_linear(basis: Basis, name: str, share: float) -> str:
+    degree = "" if share < LINEAR else "nearly "
+    return (f"the {_family(basis)} feedback functions of output {name!r} are {degree}linear in the outputs on this "
+            f"record: only {share:.1e} of their spread is not. A linear feedback cannot be told from an output "
+            "injection (A - LC, B - LD).")
+
+
+def _family(basis: Basis) -> str:
+    return type(basis).__name__.lower()

@@ -1,0 +1,104 @@
+"""Triangular factors of Gram matrices and of stacked rows, with the digits of badly scaled columns kept."""
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.models.layout import Layout
+from optid.statistics.sums import FORMED, Block, dense_rows
+
+ROUNDING = {"qr": 1e-12, "gram": 1e-7}
+"""Part of a column outside the span of those before it, relative to the column, that is rounding, not information."""
+
+
+def _nonnegative_diagonal(root: Array) -> Array:
+    return root * np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]
+
+
+def add_to_root(root: Array, rows: Array) -> Array:
+    """Return the upper triangular R, diagonal >= 0, with R^T R = root^T root + rows^T rows.
+
+    Args:
+        root: (n, n) upper triangular.
+        rows: (K, n).
+    """
+    return _nonnegative_diagonal(np.asarray(np.linalg.qr(np.concatenate([root, rows]), mode="r")))
+
+
+def root_of_gram(gram: Array, n: int) -> Array:
+    """Return an upper triangular R, diagonal >= 0, with R^T R = gram.
+
+    The first n columns are scaled to norm one before they are factorised (Cholesky). From the first column on that
+    depends on those before it, rows of R are zero. What remains of the last columns may be singular, as for data
+    without noise.
+
+    Args:
+        gram: (n + l, n + l) symmetric, positive semidefinite up to rounding.
+        n: number of regressor columns.
+    """
+    from scipy.linalg import solve_triangular
+    from scipy.linalg.lapack import dpotrf  # pyright: ignore[reportAttributeAccessIssue]
+
+    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    scale[scale == 0] = 1.0
+    scaled = gram / np.outer(scale, scale)
+    root = np.zeros_like(gram)
+    inner, info = dpotrf(scaled[:n, :n], lower=0, clean=1)
+    sound = n if info == 0 else int(info) - 1
+    root[:sound, :sound] = inner[:sound, :sound]
+    if sound:
+        root[:sound, sound:] = solve_triangular(inner[:sound, :sound], scaled[:sound, sound:], trans=1)
+    remainder = scaled[n:, n:] - root[:n, n:].T @ root[:n, n:]
+    values, vectors = np.linalg.eigh(remainder)
+    root[n:, n:] = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")
+    return _nonnegative_diagonal(root) * scale
+
+
+def dependent_column(root: Array, n: int, method: str) -> int | None:
+    """Return the first of n columns that depends on those before it to the rounding of the method, or None."""
+    norms = np.linalg.norm(root[:, :n], axis=0)
+    dependent = np.diag(root)[:n] <= ROUNDING[method] * norms
+    return int(np.argmax(dependent)) if dependent.any() else None
+
+
+def conditioning(root: Array) -> float:
+    """Estimate the condition number, 1-norm, of an upper triangular matrix with its columns scaled to norm one."""
+    from scipy.linalg.lapack import dtrcon  # pyright: ignore[reportAttributeAccessIssue]
+
+    norms = np.linalg.norm(root, axis=0)
+    if not np.all(np.diag(root) > 0):
+        return float("inf")
+    reciprocal, _ = dtrcon(np.asfortranarray(root / norms))
+    return 1 / reciprocal if reciprocal > 0 else float("inf")
+
+
+class Factor:
+    """Running triangular factor of the rows of [Phi | Y], by tall and skinny QR decomposition.
+
+    Attributes:
+        root: (n + l, n + l) upper triangular.
+        rows: rows used so far.
+        candidates: rows that would have been used, had no sample been missing.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.rows = self.candidates = 0
+        self.root = np.zeros((layout.n_columns + layout.l,) * 2)
+
+    def add(self, block: Block) -> None:
+        """Add the valid rows of a block."""
+        used = np.flatnonzero(block.valid)
+        self.rows += used.size
+        self.candidates += block.candidates
+        for start in range(0, used.size, FORMED):
+            part = used[start : start + FORMED]
+            formed = self.layout.contrasted(dense_rows(block, part, self.layout.n_complete))
+            if block.weights is not None:
+                formed *= np.sqrt(block.weights[part])[:, None]
+            self.root = add_to_root(self.root, formed)
+
+    def merge(self, other: "Factor") -> None:
+        """Add the factor of other rows, of the same layout."""
+        self.rows += other.rows
+        self.candidates += other.candidates
+        self.root = add_to_root(self.root, other.root)

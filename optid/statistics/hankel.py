@@ -1,0 +1,339 @@
+"""Gram matrices of block Hankel matrices that are never formed.
+
+A column of a block Hankel matrix is a window: the samples s(k), ..., s(k + rows - 1) of d signals. Block (i, j) of the
+Gram matrix over all windows of a run of samples depends on j - i only, up to the two ends of the run, so that one
+product of the signals per lag replaces one per pair of block rows. Ends are added, never subtracted: no digit is lost.
+
+Windows that touch a missing sample are left out, which cuts a record into runs; experiments are further runs.
+Statistics add up over runs, experiments, chunks and workers.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.data.stretches import runs_of
+from optid.errors import DataError, RankError, StructureError
+from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+
+Expand = Callable[[Array], Array]
+"""From raw channels (T, c) to signals (T, d), sample by sample."""
+
+CHUNK = 8192
+"""Samples expanded at a time."""
+
+NARROW = 8
+"""Signals up to which a compiled loop is faster than one matrix product per lag."""
+
+SHORT = 5000
+"""Samples up to which it would not make up for its import."""
+
+FORMED = 2048
+"""Windows formed at once where that is the cheapest way."""
+
+CONDITION_LIMIT = 1e5
+"""Condition number of the scaled windows beyond which their Gram matrix, which squares it, is replaced by a streamed QR
+decomposition: small singular values would drown in its rounding, about 1e-16 times the square of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class HankelStatistics:
+    """Second moments of [1; s(k) - centre; ...; s(k + rows - 1) - centre] over all complete windows k.
+
+    Position 0 is the constant; signal c at block row i has position 1 + i d + c (`at`).
+
+    Attributes:
+        rows: number of block rows.
+        names: names of the d signals.
+        centre: (d,) subtracted from the signals beforehand.
+        gram: (1 + rows d, 1 + rows d) sum over the windows, in squared units of the signals.
+        candidates: number of windows there would be, were no sample missing.
+        factor: upper triangular R with R^T R = gram from a streamed QR decomposition; None when there was none.
+    """
+
+    rows: int
+    names: tuple[str, ...]
+    centre: Array
+    gram: Array
+    candidates: int
+    factor: Array | None = None
+
+    @property
+    def d(self) -> int:
+        """Number of signals."""
+        return len(self.names)
+
+    @property
+    def windows(self) -> int:
+        """Number of windows, the columns of the Hankel matrix."""
+        return round(float(self.gram[0, 0]))
+
+    @property
+    def method(self) -> Literal["gram", "qr"]:
+        """How the statistics were taken."""
+        return "gram" if self.factor is None else "qr"
+
+    def __add__(self, other: "HankelStatistics") -> "HankelStatistics":
+        if (self.rows, self.names) != (other.rows, other.names) or not np.array_equal(self.centre, other.centre):
+            raise StructureError("Hankel statistics to be added must have the same block rows, signals and centre.")
+        factor = None  # digits that one Gram matrix has lost do not come back
+        if self.factor is not None and other.factor is not None:
+            factor = add_to_root(self.factor, other.factor)
+        return HankelStatistics(self.rows, self.names, self.centre, self.gram + other.gram,
+                                self.candidates + other.candidates, factor)
+
+    def at(self, signals: Sequence[int] | range, rows: Sequence[int] | range | None = None) -> NDArray[np.intp]:
+        """Return the positions of some signals at some block rows (all by default), block rows outermost."""
+        block_rows = np.asarray(range(self.rows) if rows is None else rows, dtype=np.intp)
+        return (1 + block_rows[:, None] * self.d + np.asarray(signals, dtype=np.intp)[None, :]).ravel()
+
+    def name(self, position: int) -> str:
+        """Name what stands at a position."""
+        if position == 0:
+            return "the constant"
+        row, signal = divmod(position - 1, self.d)
+        return f"{self.names[signal]} at block row {row + 1}"
+
+    def triangle(self, order: Sequence[int] | NDArray[np.intp]) -> Array:
+        """Return the upper triangular R, diagonal >= 0, with R^T R = gram[order][:, order]."""
+        order = np.asarray(order, dtype=np.intp)
+        if self.factor is not None:
+            return add_to_root(np.zeros((order.size, order.size)), self.factor[:, order])
+        return root_of_gram(self.gram[np.ix_(order, order)], order.size)
+
+    @cached_property
+    def root(self) -> Array:
+        """Upper triangular R, diagonal >= 0, with R^T R = gram."""
+        return self.triangle(np.arange(len(self.gram)))
+
+    @cached_property
+    def condition(self) -> float:
+        """Estimate of the condition number of the windows with their rows scaled to norm one; inf when singular."""
+        return conditioning(self.root)
+
+    @cached_property
+    def means(self) -> Array:
+        """Mean of every signal over the windows and block rows, (d,)."""
+        return self.centre + self.gram[0, 1:].reshape(self.rows, self.d).mean(axis=0) / self.windows
+
+    def check(self, per_row: float = 1.0) -> None:
+        """Refuse fewer windows than `per_row` times the rows of the Hankel matrix.
+
+        Raises:
+            RankError: with both numbers.
+        """
+        needed = int(np.ceil(per_row * self.rows * self.d)) + 1
+        if self.windows < needed:
+            lost = self.candidates - self.windows
+            missing = f" (missing samples cost {lost} of {self.candidates})" if lost else ""
+            raise RankError(
+                f"{self.windows} complete windows of {self.rows} samples{missing} for {self.rows} block rows of "
+                f"{self.d} signals: at least {needed} are needed. Use a longer record, fewer block rows or fewer basis "
+                "functions."
+            )
+
+
+def hankel_statistics(
+    records: Sequence[Array],
+    rows: int,
+    expand: Expand | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    centre: Array | Literal["mean"] | None = None,
+    method: Literal["auto", "gram", "qr"] = "auto",
+    chunk: int = CHUNK,
+) -> HankelStatistics:
+    """Take the statistics of all windows of some records.
+
+    Args:
+        records: one array (N, c) per experiment; NaN = missing.
+        rows: block rows, the samples of a window.
+        expand: turns raw channels (T, c) into signals (T, d), for instance the functions of a basis; chunk by chunk, so
+            that the signals of a whole record never exist. None for the channels themselves.
+        names: one name per signal.
+        centre: (d,) to be subtracted from the signals, or "mean" for about their means; it keeps the digits of signals
+            far from zero and changes nothing where the constant is an instrument and a regressor.
+        method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next windows, slower
+            and with twice the digits; "auto" takes the Gram matrix and goes over to "qr" when `condition` is above 1e5.
+        chunk: samples expanded at a time.
+
+    Raises:
+        StructureError: rows < 1, an unknown method.
+        RankError: an experiment shorter than the block rows, or no complete window at all.
+    """
+    if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 1:
+        raise StructureError(f"block rows: a whole number from 1 is needed; got {rows!r}.")
+    if method not in ("auto", "gram", "qr"):
+        raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
+    records = [np.asarray(record, dtype=float) for record in records]
+    for i, record in enumerate(records):
+        if record.ndim != 2:
+            raise DataError(f"experiment {i + 1}: an array (N, channels) is needed; got shape {record.shape}.")
+        if len(record) < rows:
+            raise RankError(
+                f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it out or use "
+                "fewer block rows."
+            )
+    runs = [run for record in records for run in complete_runs(record, rows)]
+    candidates = sum(len(record) - rows + 1 for record in records)
+    if not runs:
+        raise RankError(f"no window of {rows} samples is complete: every one touches a missing sample. Use fewer block "
+                        "rows or data with fewer gaps.")
+    d = runs[0].shape[1] if expand is None else expand(runs[0][:1]).shape[1]
+    sums = _Sums(rows, expand, d, chunk)
+    names = tuple(names) if names is not None else tuple(f"s{c + 1}" for c in range(sums.d))
+    if len(names) != sums.d:
+        raise StructureError(f"{len(names)} names for {sums.d} signals.")
+    if isinstance(centre, str):
+        sums.centre = _means(runs, expand or (lambda raw: raw), chunk)
+    elif centre is not None:
+        sums.centre = np.asarray(centre, dtype=float)
+    if method != "qr":
+        for run in runs:
+            sums.add(run)
+        found = HankelStatistics(rows, names, sums.centre, sums.gram(), candidates)
+        if method == "gram" or found.condition <= CONDITION_LIMIT:
+            return found
+    root = sums.factorised(runs)
+    return HankelStatistics(rows, names, sums.centre, root.T @ root, candidates, root)
+
+
+def complete_runs(record: Array, rows: int) -> Iterator[Array]:
+    """Yield the stretches of at least `rows` samples of a record (N, c) in which nothing is missing."""
+    if not np.isnan(record.sum()):  # the usual case, ten times faster
+        yield record
+        return
+    for start, stop in runs_of(~np.isnan(record).any(axis=1)):
+        if stop - start >= rows:
+            yield record[start:stop]
+
+
+def windows_of(signals: Array, rows: int) -> Array:
+    """View the windows of signals (T, d) as (T - rows + 1, rows, d), nothing copied."""
+    return np.lib.stride_tricks.sliding_window_view(signals, rows, axis=0).transpose(0, 2, 1)
+
+
+def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArray[np.intp]) -> str | None:
+    """Name the first of some positions whose row of the Hankel matrix depends on those before it, or None."""
+    order = np.asarray(order, dtype=np.intp)
+    column = dependent_column(statistics.triangle(order), order.size, statistics.method)
+    if column is None:
+        return None
+    return statistics.name(int(order[column]))
+
+
+def _means(runs: Sequence[Array], expand: Expand, chunk: int) -> Array:
+    """Means over samples spread over the runs: a centre has to be near the signals, no more."""
+    total, count = 0.0, 0
+    for run in runs:
+        signals = expand(run[:: 1 + len(run) // chunk])
+        total, count = total + signals.sum(axis=0), count + len(signals)
+    return np.asarray(total / count)
+
+
+class _Sums:
+    """Running sums over runs: per lag in the middle, per sample and lag at the ends."""
+
+    def __init__(self, rows: int, expand: Expand | None, d: int, chunk: int) -> None:
+        self.rows, self.d = rows, d
+        self.centre: Array = np.zeros(d)
+        self._expand, self._chunk = expand, max(chunk, 4 * rows)
+        self._middle = np.zeros((rows, d, d))  # sum of s(k) s(k + lag)^T
+        self._heads = np.zeros((rows, d, rows, d))  # the same for single samples before the middle, by sample and lag
+        self._tails = np.zeros((rows, d, rows, d))
+        self._totals = np.zeros((2, rows, d))
+        self._total = np.zeros(d)
+        self._direct = np.zeros((1 + rows * d, 1 + rows * d))
+        self._short: list[Array] = []
+        self._windows = 0
+
+    def _signals(self, raw: Array) -> Array:
+        signals = raw if self._expand is None else self._expand(raw)
+        return signals - self.centre if np.any(self.centre) else np.ascontiguousarray(signals)
+
+    def add(self, run: Array) -> None:
+        """Add the windows of a run of complete samples."""
+        rows, count = self.rows, len(run) - self.rows + 1
+        if count < rows:
+            self._short.append(windows_of(self._signals(run), rows).reshape(count, -1))
+            if sum(map(len, self._short)) >= FORMED:
+                self._flush()
+            return
+        self._windows += count
+        signals = self._signals(run[rows - 1 : rows - 1 + self._chunk])
+        start = rows - 1  # of the signals at hand; the middle is rows - 1 <= k < count
+        while start < count:
+            stop = min(start + len(signals) - (rows - 1), count)
+            self._add_lags(signals, stop - start)
+            following = run[start + len(signals) : start + len(signals) + self._chunk]
+            signals, start = signals[stop - start :], stop
+            if len(following):
+                signals = np.concatenate([signals, self._signals(following)])
+        ends = self._signals(run[: 2 * rows - 1]), self._signals(run[count:])
+        for end, products, totals in zip(ends, (self._heads, self._tails), self._totals):
+            padded = np.concatenate([end, np.zeros((rows, self.d))])
+            for k in range(rows - 1):
+                products[k] += np.multiply.outer(padded[k], padded[k : k + rows])
+            totals[: rows - 1] += end[: rows - 1]
+
+    def _add_lags(self, signals: Array, count: int) -> None:
+        """Add the products of the first `count` samples with those up to rows - 1 samples later."""
+        part = signals[:count]
+        self._total += np.ones(count) @ part
+        if self.d <= NARROW and count > SHORT:
+            from optid.statistics.subspace_kernels import window_products
+
+            found = np.zeros((self.d, self.rows * self.d))
+            window_products(signals.reshape(-1), count, self.d, found)
+            self._middle += found.reshape(self.d, self.rows, self.d).transpose(1, 0, 2)
+            return
+        for lag in range(self.rows):
+            self._middle[lag] += part.T @ signals[lag : lag + count]
+
+    def gram(self) -> Array:
+        """Return the Gram matrix of [1; window], symmetric."""
+        self._flush()
+        rows, d = self.rows, self.d
+        heads = np.cumsum(self._heads[::-1], axis=0)[::-1]  # samples i and later
+        tails = np.concatenate([np.zeros((1, d, rows, d)), np.cumsum(self._tails, axis=0)[:-1]])  # before sample i
+        inner = np.zeros((rows, d, rows, d))
+        for i in range(rows):
+            row = self._middle[: rows - i].transpose(1, 0, 2) + heads[i, :, : rows - i] + tails[i, :, : rows - i]
+            inner[i, :, i:] = row
+            inner[i + 1 :, :, i] = row[:, 1:].transpose(1, 2, 0)
+        gram = self._direct.copy()
+        gram[1:, 1:] += inner.reshape(rows * d, rows * d)
+        totals = np.cumsum(self._totals[0][::-1], axis=0)[::-1] + self._total
+        totals[1:] += np.cumsum(self._totals[1], axis=0)[:-1]
+        gram[0, 1:] += totals.ravel()
+        gram[1:, 0] += totals.ravel()
+        gram[0, 0] += self._windows
+        return (gram + gram.T) / 2
+
+    def factorised(self, runs: Sequence[Array]) -> Array:
+        """Return the triangular factor of [1; window] over all runs by stacked QR decompositions."""
+        n = 1 + self.rows * self.d
+        root, waiting, size = np.zeros((n, n)), [], max(FORMED, 2 * n)
+        for run in runs:
+            for start in range(0, len(run) - self.rows + 1, size):
+                waiting.append(run[start : start + size + self.rows - 1])
+                if sum(map(len, waiting)) >= size:
+                    root, waiting = add_to_root(root, self._formed(waiting)), []
+        return add_to_root(root, self._formed(waiting)) if waiting else root
+
+    def _formed(self, runs: Sequence[Array]) -> Array:
+        parts = [windows_of(self._signals(run), self.rows).reshape(len(run) - self.rows + 1, -1) for run in runs]
+        stacked = np.concatenate(parts)
+        return np.concatenate([np.ones((len(stacked), 1)), stacked], axis=1)
+
+    def _flush(self) -> None:
+        if self._short:
+            formed = np.concatenate(self._short)
+            formed = np.concatenate([np.ones((len(formed), 1)), formed], axis=1)
+            self._direct += formed.T @ formed
+            self._short = []

@@ -1,0 +1,125 @@
+"""Sums over the parts of a record that are read apart.
+
+A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is
+associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter than the
+lags. Sums of different trees differ by rounding alone: a sum of n products in any order is off by at most n
+rounding errors of the sum of their magnitudes (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2),
+in practice by far less, and a tree over parts by less than one pass.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.reading.chunks import Chunk
+from optid.data.reading.parts import Part
+from optid.models.layout import Layout
+from optid.statistics.blocks import Stretch, blocks_of, check_channels, length_of_stretches, too_short
+from optid.statistics.sums import Block, make_block, stretches
+
+
+class Total(Protocol):
+    """Running sums: `Sums` or `Factor`."""
+
+    def add(self, block: Block) -> None:
+        """Add the valid rows of a block."""
+        ...
+
+    def merge(self, other: Any) -> None:
+        """Add the sums of other blocks."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Neighbouring parts: their sums, and the samples that joining them to what is around takes.
+
+    Attributes:
+        total: sums over the rows inside.
+        first: experiment in which the run begins.
+        last: experiment in which it ends.
+        head: u and y of the first samples of its first experiment, as many as the lags reach back, or all there are.
+        tail: u and y of the last samples of its last experiment likewise.
+    """
+
+    total: Any
+    first: int
+    last: int
+    head: tuple[Array, Array]
+    tail: tuple[Array, Array]
+
+
+def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Any], chunk: int, threads: int) -> Any:
+    """Return the sums over all parts of a stream, each added up where it is read.
+
+    Args:
+        stream: a `Stream` in parts.
+        layout: the columns.
+        start: returns empty sums.
+        chunk: samples evaluated at a time.
+        threads: threads that read parts on this machine.
+
+    Raises:
+        RankError: an experiment shorter than the lags.
+    """
+    check_channels(stream, layout)
+    for i, count in enumerate(stream.lengths):
+        if count <= layout.first_row:
+            raise too_short(f"experiment {i + 1}: " if len(stream.lengths) > 1 else "", count, layout)
+    return stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, layout, start), threads).total
+
+
+def _run_of(layout: Layout, start: Callable[[], Any], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
+    reach = layout.first_row
+    nothing = np.empty((0, layout.m)), np.empty((0, layout.l))
+    head, tail = nothing, nothing
+
+    def watched() -> Iterable[Sequence[Array]]:
+        nonlocal head, tail
+        for u, y, _ in chunks:
+            head, tail = _first(head, (u, y), reach), _last(tail, (u, y), reach)
+            yield u, y
+
+    total, length = start(), length_of_stretches(layout, chunk)
+    for i, arrays in enumerate(stretches(watched(), reach, length)):
+        for block in blocks_of(Stretch(arrays, f"{part.label}, ", i * length), layout, chunk):
+            total.add(block)
+    return Run(total, part.experiment, part.experiment, head, tail)
+
+
+def _joined(layout: Layout, start: Callable[[], Any], runs: Sequence[Run]) -> Run:
+    total, reach = start(), layout.first_row
+    total.merge(runs[0].total)
+    whole = replace(runs[0], total=total)
+    for run in runs[1:]:
+        total.merge(run.total)
+        head, tail = whole.head, run.tail
+        if run.first == whole.last:
+            u, y = (np.concatenate(pair) for pair in zip(whole.tail, run.head))
+            if len(u) > reach:
+                total.add(make_block(u, y, None, layout))
+            if whole.first == whole.last:
+                head = _first(head, run.head, reach)
+            if run.first == run.last:
+                tail = _last(whole.tail, tail, reach)
+        whole = Run(total, whole.first, run.last, head, tail)
+    return whole
+
+
+def _first(before: tuple[Array, Array], behind: tuple[Array, Array], count: int) -> tuple[Array, Array]:
+    if len(before[0]) >= count:
+        return before
+    u, y = (np.concatenate(pair)[:count] for pair in zip(before, behind))
+    return u, y
+
+
+def _last(before: tuple[Array, Array], behind: tuple[Array, Array], count: int) -> tuple[Array, Array]:
+    if len(behind[0]) >= count:  # copies: a view would keep the whole chunk in memory
+        u, y = (samples[len(samples) - count :].copy() for samples in behind)
+    else:
+        u, y = (joint[max(len(joint) - count, 0) :] for joint in map(np.concatenate, zip(before, behind)))
+    return u, y

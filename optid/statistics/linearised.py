@@ -1,0 +1,154 @@
+"""Errors and their sensitivities as small factors: compressed chunk by chunk, put together over experiments.
+
+A block of rows [x0 | shared | errors] leaves a Gram matrix, or a triangular factor where that would have too few
+digits. The initial states of an experiment are eliminated within it. Whose errors they are does not matter here.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.statistics.factors import add_to_root, conditioning
+
+CONDITION_LIMIT = 1e6
+"""Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Errors (model less record) near a point: ``|e(x + dx)|² = |root dx_s + pull|² + states + remainder``.
+
+    Attributes:
+        root: (p, p) upper triangular factor for the shared unknowns, initial states eliminated.
+        pull: (p,) compressed errors.
+        states: (X, S, e) of every experiment: its initial state moves by ``-X^+ (S dx_s + e)``.
+        remainder: what no step changes.
+        rows: outputs present.
+        condition: estimated condition number of the column-scaled factor.
+        method: "gram" or "qr".
+    """
+
+    root: Array
+    pull: Array
+    states: tuple[tuple[Array, Array, Array], ...]
+    remainder: float
+    rows: int
+    condition: float
+    method: Literal["gram", "qr"]
+
+    @property
+    def reach(self) -> float:
+        """By how much a full step of the linearised problem would lower the sum of squares."""
+        return float(self.pull @ self.pull) + sum(float(e @ e) for _, _, e in self.states)
+
+    @property
+    def value(self) -> float:
+        """Sum of squared errors at the point."""
+        return self.reach + self.remainder
+
+    def follow(self, step: Array) -> Array:
+        """Return the steps (E n,) of the initial states that belong to a step (p,) of the shared unknowns."""
+        moves = [-np.linalg.lstsq(x, s @ step + e, rcond=1e-12)[0] for x, s, e in self.states]
+        return np.asarray(np.concatenate([*moves, np.zeros(0)]), dtype=float)
+
+    @cached_property
+    def whole(self) -> tuple[Array, Array]:
+        """Factor (p + E n, p + E n) and errors of all unknowns together, initial states last."""
+        p, n = len(self.pull), len(self.states[0][0])
+        total = p + n * len(self.states)
+        matrix, errors = np.zeros((total, total)), np.zeros(total)
+        matrix[:p, :p], errors[:p] = self.root, self.pull
+        for i, (x, s, e) in enumerate(self.states):
+            rows = slice(p + i * n, p + (i + 1) * n)
+            matrix[rows, :p], matrix[rows, rows], errors[rows] = s, x, e
+        return matrix, errors
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """One experiment: a factor of [x0 | shared | (measured) | errors], and the number of errors in it."""
+
+    factor: Array
+    rows: int
+
+
+def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
+               first: int = 0) -> Compressed:
+    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
+
+    Args:
+        blocks: (rows, columns) and the number of errors in each.
+        columns: number of columns.
+        method: "gram" or "qr".
+        gauge: (rows, p) directions without effect, which are given weight; None for none.
+        first: column of their first unknown.
+    """
+    total, rows = np.zeros((columns, columns)), 0
+    for block, count in blocks:
+        rows += count
+        used = slice(columns - block.shape[1], None)
+        if method == "qr":
+            total[used, used] = add_to_root(total[used, used], block) if used.start else add_to_root(total, block)
+        else:
+            total[used, used] += block.T @ block
+    if gauge is not None and len(gauge):
+        span = slice(first, first + gauge.shape[1])
+        energy = np.sum(total[:, span] ** 2, axis=0) if method == "qr" else np.diag(total)[span]
+        extra = np.zeros((len(gauge), columns))
+        extra[:, first:] = _weighted(gauge, energy)[0]
+        total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
+    return Compressed(total if method == "qr" else _factor(total), rows)
+
+
+def assembled(parts: Sequence[Compressed], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
+              ) -> Linearised:
+    """Put the experiments together.
+
+    Args:
+        parts: one for each experiment.
+        n: size of an initial state.
+        p: number of shared unknowns.
+        gauge: as in `linearise`.
+        method: how the parts were compressed.
+    """
+    states, rest = zip(*(eliminated(part.factor, n) for part in parts))
+    rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
+    together = len(rest) > 1 or len(rows_of_gauge)
+    stacked = np.vstack([*rest, *rows_of_gauge])
+    triangle = np.linalg.qr(stacked, mode="r") if together else stacked
+    full = np.zeros((p + 1, p + 1))
+    full[: len(triangle)] = triangle
+    condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
+    rows = sum(part.rows for part in parts)
+    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, method)
+
+
+def eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
+    """Split an upper triangular factor of [x0 | shared | errors] into the part of x0 and the rest."""
+    return (factor[:n, :n], factor[:n, n:-1], factor[:n, -1]), factor[n:, n:]
+
+
+def _factor(gram: Array) -> Array:
+    """Return F (square) with F^T F = gram, whatever its rank; the columns are scaled to norm one in between."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size[size == 0] = 1.0
+    scaled = gram / np.outer(size, size)
+    try:
+        return np.asarray(np.linalg.cholesky(scaled).T * size, dtype=float)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(scaled)
+        root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"), dtype=float)
+        return root * size
+
+
+def _weighted(gauge: Array | None, energy: Array) -> list[Array]:
+    """Rows [gauge | 0] that give the directions without effect a weight of the size of the others, of given energy."""
+    if gauge is None or not len(gauge):
+        return []
+    sizes = np.abs(gauge)
+    lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
+    return [np.hstack([gauge * np.where(lengths > 0, lengths, 1.0)[:, None], np.zeros((len(gauge), 1))])]

@@ -1,0 +1,309 @@
+"""The regression y = Phi theta + e behind an ARX model with static nonlinearities, and its sufficient statistics.
+
+Nothing of size samples x parameters is formed: one pass over the record gives the Gram matrix of [Phi | Y], which is
+all that a least-squares objective needs. Statistics add up, over chunks, experiments and workers.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases.basis import Basis
+from optid.data.workers import available_threads, mapped
+from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.models.layout import Layout
+from optid.statistics.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
+from optid.statistics.factors import Factor, add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.sums import Sums, rows_present, stretches
+
+if TYPE_CHECKING:
+    from optid.data.record import Data
+    from optid.data.streams import Stream
+
+CONDITION_LIMIT = 1e7
+"""Condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left."""
+
+LEAST_REMAINDER = 1e-6
+"""Share of an output that least squares leaves, below which its difference of sums has too few digits left."""
+
+RETAINED = 1 << 23
+"""Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
+long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
+
+ROWS_PER_COLUMN = 1.1
+KEPT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Sufficient statistics of the regression: all that least squares needs to know of a record.
+
+    Statistics of one layout add up exactly: `a + b` are those of both records.
+
+    Attributes:
+        layout: the columns.
+        gram: (n + l, n + l) Gram matrix of [Phi | Y], in squared data units.
+        rows: rows used.
+        candidates: rows that would have been used, had no sample been missing.
+        factor: upper triangular R with R^T R = gram, from a streamed QR decomposition; None when there was none.
+    """
+
+    layout: Layout
+    gram: Array
+    rows: int
+    candidates: int
+    factor: Array | None = None
+
+    def __add__(self, other: "Statistics") -> "Statistics":
+        if self.layout != other.layout:
+            raise StructureError("Statistics to be added must have the same layout: na, nb, nk, bases and names.")
+        factor = None  # digits that one Gram matrix has lost do not come back
+        if self.factor is not None and other.factor is not None:
+            factor = add_to_root(self.factor, other.factor)
+        return Statistics(
+            self.layout, self.gram + other.gram, self.rows + other.rows, self.candidates + other.candidates, factor
+        )
+
+    @property
+    def method(self) -> Literal["gram", "qr"]:
+        """How the statistics were taken."""
+        return "gram" if self.factor is None else "qr"
+
+    @cached_property
+    def _triangle(self) -> Array:
+        return root_of_gram(self.gram, self.layout.n_columns) if self.factor is None else self.factor
+
+    @cached_property
+    def root(self) -> Array:
+        """Upper triangular R (n + l, n + l), diagonal >= 0, with R^T R = gram.
+
+        Raises:
+            RankError: a column of Phi depends on the columns before it; named.
+        """
+        column = dependent_column(self._triangle, self.layout.n_columns, self.method)
+        if column is not None:
+            raise RankError(_explain_dependence(self.layout, self._triangle, column))
+        return self._triangle
+
+    @cached_property
+    def condition(self) -> float:
+        """Estimate of the condition number of Phi with its columns scaled to norm one; inf when it is singular."""
+        n = self.layout.n_columns
+        return conditioning(self._triangle[:n, :n])
+
+    @cached_property
+    def remainder(self) -> float:
+        """Sum of squares that least squares leaves of an output, as a share of the output; the smallest of them."""
+        n = self.layout.n_columns
+        energy = np.sum(self._triangle[:, n:] ** 2, axis=0)
+        rest = np.sum(self._triangle[n:, n:] ** 2, axis=0)
+        return float(np.min(np.where(energy > 0, rest / np.maximum(energy, np.finfo(float).tiny), 1.0)))
+
+    def check(self) -> None:
+        """Refuse a record that does not determine the parameters.
+
+        Raises:
+            RankError: fewer than 1.1 rows per column, or a column without energy.
+
+        Warns:
+            DataWarning: less than half of the rows are left by missing samples.
+        """
+        n, lost = self.layout.n_columns, 1 - self.rows / max(self.candidates, 1)
+        if self.rows < ROWS_PER_COLUMN * n:
+            needed = int(np.ceil(ROWS_PER_COLUMN * n))
+            missing = f"Missing samples cost {100 * lost:.0f} % of {self.candidates} rows. " if lost > 0 else ""
+            raise RankError(
+                f"{self.rows} rows for {n} parameters: at least {needed} are needed. {missing}"
+                "Use a longer record, fewer lags or fewer basis functions."
+            )
+        energy = np.diag(self.gram)[:n]
+        silent = np.flatnonzero(energy[: self.layout.na * self.layout.l] == 0)
+        if silent.size:
+            raise RankError(f"Output {self.layout.outputs[silent[0] % self.layout.l]!r} is zero in every used row.")
+        for c, (channel, basis) in enumerate(zip(self.layout.inputs, self.layout.bases)):
+            block = energy[self.layout.block(c)].reshape(-1, basis.size)
+            lags, functions = np.nonzero(block <= 1e-14 * block.mean())
+            if functions.size:
+                raise RankError(_explain_silence(basis, channel, int(functions[0]), self.layout.lags[c][lags[0]]))
+        if lost > KEPT:
+            warnings.warn(
+                f"Missing samples leave {self.rows} of {self.candidates} rows ({100 * (1 - lost):.0f} %): a row is "
+                f"lost with any sample among its {self.layout.first_row} lags. Fewer lags keep more.",
+                DataWarning,
+                stacklevel=3,
+            )
+
+
+def collect(
+    data: "Data | Stream",
+    layout: Layout,
+    weights: Sequence[Array] | None = None,
+    method: Literal["auto", "gram", "qr"] = "auto",
+    chunk: int = CHUNK,
+    threads: int | None = None,
+) -> Statistics:
+    """Take the statistics of a record that determines the parameters.
+
+    A row is used when every sample it touches is present, in all inputs and outputs.
+
+    Args:
+        data: experiments in memory, or a stream that can be read twice.
+        layout: the columns.
+        weights: one array (N,) per experiment, weight >= 0 of the row of each sample; None for ones. Not for streams.
+        method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next rows, slower and
+            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or what no
+            parameter explains is a share of the outputs that rounding reaches.
+            `Statistics.method` says which it was.
+        chunk: samples evaluated at a time.
+        threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
+            same to the last digit whatever their number, and a short record takes one.
+
+    Raises:
+        RankError: an experiment shorter than the lags, too few rows, a silent basis function, dependent columns.
+        DataError: other channels than in the layout, weights that do not fit, samples outside a basis with
+            outside="error".
+
+    Warns:
+        DataWarning: less than half of the rows are left by missing samples.
+    """
+    if method not in ("auto", "gram", "qr"):
+        raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
+    if method == "qr":
+        statistics = factorise(data, layout, weights, chunk)
+        statistics.check()
+        return statistics
+    statistics = accumulate(data, layout, weights, chunk, threads)
+    statistics.check()
+    if method == "auto" and (statistics.condition > CONDITION_LIMIT or statistics.remainder < LEAST_REMAINDER):
+        statistics = factorise(data, layout, weights, chunk)
+        _ = statistics.root  # refuses dependent columns by name
+    return statistics
+
+
+def accumulate(
+    data: "Data | Stream",
+    layout: Layout,
+    weights: Sequence[Array] | None = None,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+) -> Statistics:
+    """Take the Gram matrix in one pass, without asking whether the record determines the parameters.
+
+    This is for parts of a record that are to be added; arguments and errors as `collect`.
+    """
+    threads = available_threads(threads)
+    sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout))
+    complete = sums.complete()
+    if sums.cancelled(complete):
+        sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout, direct=True))
+        complete = sums.complete()
+    gram = layout.contrasted(layout.contrasted(complete).T)
+    return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
+
+
+def factorise(
+    data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
+) -> Statistics:
+    """Take the triangular factor in one pass, by tall and skinny QR decomposition.
+
+    Arguments and errors as `collect`, without its checks of rank.
+    """
+    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout))
+    return Statistics(layout, total.root.T @ total.root, total.rows, total.candidates, total.root)
+
+
+def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) -> list[Array]:
+    """Compute the one-step residuals Y - Phi theta without forming Phi.
+
+    Args:
+        data: the experiments.
+        layout: the columns of Phi.
+        theta: (n_columns, l) coefficients.
+        chunk: samples evaluated at a time.
+
+    Returns:
+        One array (N, l) per experiment, in output units; NaN where a sample of the row is missing or before the record.
+    """
+    theta = np.asarray(theta, dtype=float)
+    if theta.shape != (layout.n_columns, layout.l):
+        raise StructureError(f"theta has shape {theta.shape}; this layout needs ({layout.n_columns}, {layout.l}).")
+    check_channels(data, layout)
+    return [_residuals_of(e.u, e.y, layout, theta, chunk) for e in data.experiments]
+
+
+def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) -> Array:
+    reach, outs = layout.first_row, layout.l
+    result = np.full(y.shape, np.nan)
+    tables = [
+        np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
+        for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))
+    ]  # (full size, lags, l)
+    start = reach
+    for part_u, part_y in stretches([(u, y)], reach, max(chunk, reach)):
+        count = len(part_y) - reach
+        error = part_y[reach:] - theta[layout.offset]
+        for i in range(1, layout.na + 1):
+            error += part_y[reach - i : reach - i + count] @ theta[(i - 1) * outs : i * outs]
+        for c, (basis, table) in enumerate(zip(layout.bases, tables)):
+            first, values = basis.local(part_u[:, c])
+            for lag, column in zip(layout.lags[c], table.transpose(1, 0, 2)):
+                at = slice(reach - lag, reach - lag + count)
+                for i, weight in enumerate(values[at].T):
+                    error -= weight[:, None] * column[first[at] + i]
+        error[~rows_present(part_u, part_y, layout)] = np.nan
+        result[start : start + count] = error
+        start += count
+    return result
+
+
+def _total(
+    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Any]
+) -> Any:
+    """Return the sums, of what `start` begins, over all rows of a record."""
+    np.empty(RETAINED, dtype=np.uint8)  # freed at once
+    if getattr(data, "parts", ()):
+        from optid.statistics.joining import total_of_parts
+
+        if weights is not None:
+            raise DataError(NO_WEIGHTS)
+        return total_of_parts(data, layout, start, chunk, threads)
+
+    def sum_part(part: Stretch) -> Any:
+        sums = start()
+        for block in blocks_of(part, layout, chunk):
+            sums.add(block)
+        return sums
+
+    total = start()
+    for sums in mapped(sum_part, cut(data, layout, weights, chunk), threads):
+        total.merge(sums)
+    return total
+
+
+def _explain_silence(basis: Basis, channel: str, function: int, lag: int) -> str:
+    points = basis.grid(2001)
+    alive = points[basis.values(points)[:, function] != 0]
+    where = f", which lives on [{alive[0]:.4g}, {alive[-1]:.4g}]," if alive.size else ""
+    whole = "[{:.4g}, {:.4g}]".format(*basis.interval) if basis.interval else "the real line"
+    return (
+        f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} is "
+        f"never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower interval, "
+        "or data that cover it."
+    )
+
+
+def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
+    names = layout.names()
+    scale = np.linalg.norm(root[:, : column + 1], axis=0)
+    combination = np.linalg.lstsq(root[:column, :column] / scale[:column], root[:column, column] / scale[column])[0]
+    partners = [names[j] for j in np.argsort(-np.abs(combination))[:3] if abs(combination[j]) > 1e-3]
+    return (
+        f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
+        "the record does not tell them apart. Use fewer lags or basis functions, or an input with more levels and "
+        "frequencies."
+    )

@@ -1,0 +1,143 @@
+"""The second triangularisation of instrumental-variable subspace methods, from Hankel statistics alone.
+
+With instruments Z, regressors Phi and outputs Y (rows of one block Hankel matrix) and [Z; Phi; Y] = L Q,
+
+    [L21; L31] = [R11 0; R21 R22] Q',     range(Gamma) = range(R22),     H = R21 R11^-1.
+
+Sources: Chou and Verhaegen 1997 (instrumental variables), Verhaegen and Dewilde 1992 (past inputs and outputs as
+instruments: Z = [U_f; U_p; Y_p], Phi = U_f gives the singular values that SLICOT's IB01AD prints).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.errors import RankError, StructureError
+from optid.statistics.hankel import HankelStatistics, dependent_signal
+
+FORMS = ("projection", "correlation")
+TINY = 1e-12
+"""Smallest singular value of the scaled R11, relative to the largest, that is not rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class RQ:
+    """The blocks of the second RQ decomposition.
+
+    Attributes:
+        r11: (p, p) regressors projected on the instruments; lower triangular, or diagonal with a tolerance.
+        r21: (y, p) outputs along the regressors.
+        r22: (y, r) outputs projected on the instruments, with the regressors removed: Gamma times the projected states.
+        residual: (y, y) triangular factor of the outputs' part outside the instruments and regressors.
+        gain: (y, p) H = r21 r11^-1 in units of the signals.
+        condition: condition number of the projected regressors, their rows scaled to the norm of the regressors
+            themselves: it grows with the record where instruments and regressors are not correlated.
+        windows: number of Hankel columns.
+        discarded: directions of the regressors that a tolerance left out.
+    """
+
+    r11: Array
+    r21: Array
+    r22: Array
+    residual: Array
+    gain: Array
+    condition: float
+    windows: int
+    discarded: int = 0
+
+    @cached_property
+    def decomposition(self) -> tuple[Array, Array, Array]:
+        """Left vectors, singular values and right vectors (as rows) of r22."""
+        left, values, right = np.linalg.svd(self.r22)
+        return left, values, right
+
+    @property
+    def singular_values(self) -> Array:
+        """Singular values of r22, largest first."""
+        return self.decomposition[1]
+
+
+def rq(
+    statistics: HankelStatistics,
+    instruments: Sequence[int] | NDArray[np.intp],
+    regressors: Sequence[int] | NDArray[np.intp],
+    outputs: Sequence[int] | NDArray[np.intp],
+    *,
+    form: str = "projection",
+    tolerance: float | None = None,
+) -> RQ:
+    """Triangularise twice.
+
+    Args:
+        statistics: moments of the windows.
+        instruments: positions of Z (`HankelStatistics.at`; 0 is the constant), in any order.
+        regressors: positions of Phi; those that are also instruments are projected on themselves.
+        outputs: positions of Y.
+        form: "projection" (weight (Z Z^T / j)^-1/2) or "correlation" (no weight).
+        tolerance: None asks that R11 be regular; a number drops the directions of the scaled projected regressors whose
+            singular value, relative to the largest, lies below it (pseudo-inverse).
+
+    Raises:
+        StructureError: an unknown form, or centred statistics without the constant among Z and Phi.
+        RankError: fewer instruments than regressors, or regressors that the instruments do not reach.
+    """
+    z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
+    if form not in FORMS:
+        raise StructureError(f"form={form!r}: use one of {', '.join(FORMS)}.")
+    if np.any(statistics.centre) and not (0 in z and 0 in phi):
+        raise StructureError("These statistics are centred: the constant (position 0) must be among the instruments "
+                             "and the regressors, or take them without a centre.")
+    if z.size < phi.size:
+        raise RankError(f"{z.size} instruments for {phi.size} regressors: use more block rows of instruments or fewer "
+                        "basis functions.")
+    own = ~np.isin(phi, z)  # regressors that are not instruments themselves
+    order = np.concatenate([z, phi[own], y])
+    triangle = statistics.triangle(order)
+    column = {int(position): c for c, position in enumerate(order)}
+    of_phi = [column[int(position)] for position in phi]
+    of_y = np.arange(order.size - y.size, order.size)
+    l21, l31 = triangle[: z.size, of_phi].T, triangle[: z.size, of_y].T
+    size = np.linalg.norm(triangle[:, of_phi], axis=0)  # of the regressors before the projection
+    if not size.all():
+        raise RankError(f"{statistics.name(int(phi[int(np.argmin(size))]))} is zero in every window: leave that basis "
+                        "function or channel out.")
+    if form == "correlation":
+        weight = triangle[: z.size, : z.size] / statistics.windows
+        l21, l31 = l21 @ weight, l31 @ weight
+    residual = triangle[order.size - y.size :, of_y]
+    scaled = l21 / size[:, None]
+    if tolerance is None:
+        found = _regular(scaled, l31)
+        condition = _condition(found[0])
+        if not condition < 1 / TINY:
+            lost = dependent_signal(statistics, phi)
+            reason = f"{lost} depends on the regressors before it" if lost else "the instruments do not reach them all"
+            raise RankError(f"The regressors are singular on the instruments: {reason}. Use an input with more levels "
+                            "and frequencies, fewer block rows or basis functions, or augmented instruments.")
+        r11, r21, r22 = found
+        gain = np.linalg.solve(r11.T, r21.T).T
+        discarded = 0
+    else:
+        left, values, right = np.linalg.svd(scaled, full_matrices=True)
+        kept = int(np.sum(values > tolerance * values[0]))
+        condition = _condition(scaled)
+        r11, r21, r22 = np.diag(values[:kept]), l31 @ right[:kept].T, l31 @ right[kept:].T
+        gain = (r21 / values[:kept]) @ left[:, :kept].T
+        discarded = phi.size - kept
+        r11 = left[:, :kept] @ r11
+    return RQ(r11 * size[:, None], r21, r22, residual.T, gain / size, condition, statistics.windows, discarded)
+
+
+def _regular(l21: Array, l31: Array) -> tuple[Array, Array, Array]:
+    p = len(l21)
+    triangle = np.asarray(np.linalg.qr(np.concatenate([l21, l31]).T, mode="r")).T
+    return triangle[:p, :p], triangle[p:, :p], triangle[p:, p:]
+
+
+def _condition(matrix: Array) -> float:
+    values = np.linalg.svd(matrix, compute_uv=False)
+    return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")

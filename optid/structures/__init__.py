@@ -1,0 +1,1 @@
+"""Structures of programmes that special methods exploit, as numbers."""

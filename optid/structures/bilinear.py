@@ -1,0 +1,294 @@
+"""Local solution of rank-one least squares: Newton's method on the manifold, and alternating least squares.
+
+The method is Newton's with Levenberg damping in one factor, the other one eliminated, in Kronecker-whitened
+coordinates, from several starts. :func:`alternate` is the classical alternating least squares (Bai, Automatica 34,
+1998), an independent method for comparison.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
+
+from optid.structures.rank_one import Array, Core, Point, RankOne, block_slices, matrices, reduce
+
+(_posv,) = get_lapack_funcs(("posv",), dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalSolution:
+    """What a local method returns.
+
+    Attributes:
+        point: in the gauge ||b|| = 1.
+        value: objective there.
+        iterations: steps taken.
+        gradient: gradient in the tangent space over ||R^T s||, in whitened coordinates.
+        converged: whether the gradient tolerance was reached.
+    """
+
+    point: Point
+    value: float
+    iterations: int
+    gradient: float
+    converged: bool
+
+
+def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array], list[Array]]]:
+    """Starting factors in whitened coordinates: the whitened SVD, the plain SVD split, further pairs, random ones.
+
+    Args:
+        core: the reduced problem.
+        count: how many.
+        seed: of the random directions b.
+    """
+    if not core.shapes:  # linear least squares: nothing to start
+        return [([], [])]
+    estimates = matrices(core.least_squares, core.shapes)
+    factors = list(zip(estimates, core.whitening.factors_mu, core.whitening.factors_b))
+    white = [np.linalg.svd(left.T @ theta @ right, full_matrices=False) for theta, left, right in factors]
+    plain = [np.linalg.svd(theta, full_matrices=False) for theta in estimates]
+    rank = [min(shape) for shape in core.shapes]
+    rng = np.random.default_rng(seed)
+
+    def pair(svd, k):
+        return svd[0][:, k] * svd[1][k], svd[2][k]
+
+    found = []
+    for k in range(count):
+        if k == 1:
+            mus, bs = core.whitening.forward(*zip(*(pair(svd, 0) for svd in plain)))
+        elif k < 4:
+            mus, bs = zip(*(pair(svd, max(k - 1, 0) % r) for svd, r in zip(white, rank)))
+        else:
+            bs = [rng.standard_normal(nb) for _, nb in core.shapes]
+            mus = [u @ (d * (vt @ b)) / (b @ b) for (u, d, vt), b in zip(white, bs)]
+        found.append((list(mus), list(bs)))
+    return found
+
+
+def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e-12, iterations: int = 1000,
+            alternations: int = 0) -> LocalSolution:
+    """Newton's method in the b alone, every mu the best for them; the objective never increases beyond roundoff.
+
+    The mu are eliminated at every step (variable projection, Golub and Pereyra 1973), so that a valley along which
+    large mu of correlated inputs cancel, however narrow, is no obstacle. A step d b_i is measured in units of
+    ||mu_i||; directions of negative curvature are followed downwards.
+
+    Args:
+        core: the reduced problem; without blocks the answer is exact least squares.
+        mus: whitened starting mu_i; they count where alternations come first.
+        bs: whitened starting b_i.
+        tolerance: on the tangent gradient relative to ||R^T s||.
+        iterations: at most.
+        alternations: alternating half-steps for mu and b before Newton starts, for starts far away.
+    """
+    if not core.shapes:
+        point = core.point([], [])
+        return LocalSolution(point, core.problem.value(point.lift()), 0, 0.0, True)
+    target, root = core.target, core.root
+    pieces, start = [], 0
+    for p, nb in core.shapes:  # (nb, k, P) contiguous, so that both half-Jacobians are plain products
+        part = root[:, start:start + p * nb].reshape(-1, nb, p)
+        pieces.append(np.ascontiguousarray(part.transpose(1, 0, 2)))
+        start += p * nb
+    reference = max(float(np.linalg.norm(root.T @ target)), np.finfo(float).tiny)
+    noise = 1e-30 * float(target @ target)
+    if alternations:
+        state = [_unit(mu, b) for mu, b in zip(mus, bs)]
+        for _ in range(alternations):
+            state = _half_steps(pieces, target, state)
+        bs = [b for _, _, b in state]
+    here = _Projected.at(pieces, target, bs)
+    damping, taken, gradient, settled, promise = 0.0, 0, np.inf, False, np.inf
+    while True:
+        slope, hessian = here.curvature(root, core.shapes)
+        before, gradient = gradient, float(np.linalg.norm(slope)) / reference
+        settled = promise <= 1e-14 * here.value + noise and gradient > 0.5 * before  # what is left is rounding
+        if gradient <= tolerance or taken >= iterations or settled:
+            break
+        sizes, directions = np.linalg.eigh(hessian)
+        sizes = np.maximum(np.abs(sizes), 1e-14 * np.max(np.abs(sizes)))
+        along, improved, promise = directions.T @ slope, False, np.inf
+        while not improved and damping < 1e12:
+            forces = along / (sizes + damping * float(np.mean(sizes)))
+            trial = _Projected.at(pieces, target, here.moved(-directions @ forces))
+            improved = trial.value <= here.value * (1 + 1e-14) + noise
+            promise = min(promise, float(along @ forces))
+            if not improved:
+                damping = max(4 * damping, 1e-3)
+        if not improved:
+            settled = promise <= 1e-13 * here.value + noise
+            break
+        fall, here = here.value - trial.value, trial
+        damping = damping / 8 if damping > 1e-3 and fall > 0.25 * promise else damping if damping > 1e-3 else 0.0
+        taken += 1
+    point = core.point(here.mus, here.bs)
+    return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= tolerance or settled)
+
+
+@dataclass(frozen=True, eq=False)
+class _Projected:
+    """The best mu_i for some b_i of unit length, and the least squares that gave them.
+
+    Attributes:
+        pieces: (nb, k, P) of every block.
+        bs: unit vectors.
+        mus: the best for them.
+        basis: (k, sum P) orthonormal and
+        triangle: with basis @ triangle the regressors of the mu_i.
+        residual: (k,).
+    """
+
+    pieces: list[Array]
+    bs: list[Array]
+    mus: list[Array]
+    basis: Array
+    triangle: Array
+    residual: Array
+
+    @classmethod
+    def at(cls, pieces: list[Array], target: Array, bs: list[Array]) -> "_Projected":
+        units = [_unit(np.ones(1), b)[2] for b in bs]
+        design = np.concatenate([np.tensordot(b, piece, 1) for piece, b in zip(pieces, units)], axis=1)
+        basis, triangle = np.linalg.qr(design)
+        diagonal = np.abs(np.diag(triangle))
+        if not np.min(diagonal) > 1e-13 * np.max(diagonal):  # an input without effect, or two that are one
+            mus = np.linalg.lstsq(design, target, rcond=1e-13)[0]
+        else:
+            mus = solve_triangular(triangle, basis.T @ target)
+        split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
+        return cls(pieces, units, split, basis, triangle, design @ mus - target)
+
+    @property
+    def value(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def sizes(self) -> list[float]:
+        """Length of every mu_i."""
+        return [float(np.linalg.norm(mu)) for mu in self.mus]
+
+    def moved(self, step: Array) -> list[Array]:
+        """Return the b_i after a step in units of the mu_i; those of a mu_i that vanishes stay."""
+        parts = np.split(step, np.cumsum([b.size for b in self.bs])[:-1])
+        return [b + part / size if size > 0 else b for b, part, size in zip(self.bs, parts, self.sizes)]
+
+    def curvature(self, root: Array, shapes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
+        """Gradient and Hessian of half the value in the b_i, definite along each b_i, which changes nothing."""
+        regressors, forces, gauges = [], [], []
+        gradients = matrices(root.T @ self.residual, tuple(shapes))
+        for piece, mu, b, size, gradient in zip(self.pieces, self.mus, self.bs, self.sizes, gradients):
+            scale = 1.0 / size if size > 0 else 0.0
+            regressors.append((piece @ (scale * mu)).T)
+            forces.append(scale * gradient)
+            gauges.append(np.outer(b, b))
+        across = np.concatenate(regressors, axis=1)
+        diagonal = np.abs(np.diag(self.triangle))
+        usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
+        mixed = self.basis.T @ across
+        if usable:
+            forced: Any = solve_triangular(self.triangle, block_diag(*forces), trans=1)
+            mixed = mixed + forced
+        hessian = across.T @ across - mixed.T @ mixed
+        weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
+        gauge: Any = block_diag(*gauges)
+        return across.T @ self.residual, hessian + weight * gauge
+
+
+def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
+    """(||mu|| ||b||, unit mu, unit b); a zero factor keeps an arbitrary direction."""
+    size_mu, size_b = float(np.linalg.norm(mu)), float(np.linalg.norm(b))
+    unit_mu = mu / size_mu if size_mu else np.full(len(mu), len(mu) ** -0.5)
+    unit_b = b / size_b if size_b else np.full(len(b), len(b) ** -0.5)
+    return size_mu * size_b, unit_mu, unit_b
+
+
+def _half_steps(pieces: list[Array], target: Array, state: list) -> list:
+    """Least squares for all mu_i with the b_i fixed, then for all b_i with the mu_i fixed."""
+    design = np.concatenate([np.tensordot(b, piece, 1) for piece, (_, _, b) in zip(pieces, state)], axis=1)
+    mus = np.split(_normal_equations(design, target), np.cumsum([piece.shape[2] for piece in pieces])[:-1])
+    state = [_unit(mu, b) for mu, (_, _, b) in zip(mus, state)]
+    design = np.concatenate([(piece @ mu).T for piece, (_, mu, _) in zip(pieces, state)], axis=1)
+    bs = np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
+    return [_unit(mu, b) for b, (_, mu, _) in zip(bs, state)]
+
+
+def _normal_equations(design: Array, target: Array) -> Array:
+    """Least squares by Cholesky: in whitened coordinates the columns are nearly orthogonal."""
+    gram = design.T @ design
+    gram.flat[::len(gram) + 1] += 1e-13 * np.trace(gram) / len(gram)
+    return _posv(gram, design.T @ target)[1]
+
+
+def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0,
+             tolerance: float = 1e-12, iterations: int = 1000) -> LocalSolution:
+    """Best local minimiser over several starts, or the one reached from a given start.
+
+    Args:
+        problem: the least-squares problem.
+        start: descend from here only.
+        count: number of starts when none is given.
+        seed: of the random starts.
+        tolerance: relative gradient at which a descent stops.
+        iterations: at most, each start.
+
+    Raises:
+        RankError: the compressed regressor is singular.
+    """
+    core = reduce(problem)
+    if start is not None:
+        _, mus, bs = core.factors(start)
+        return descend(core, mus, bs, tolerance, iterations)
+    return best_of(core, count, seed, tolerance, iterations)
+
+
+def best_of(core: Core, count: int = 8, seed: int = 0, tolerance: float = 1e-12, iterations: int = 1000,
+            first: int = 0) -> LocalSolution:
+    """Best local minimiser of a reduced problem over the starts ``first .. count - 1``."""
+    if not core.shapes:
+        return descend(core, [], [])
+    found = [descend(core, mus, bs, tolerance, iterations, alternations=0 if k < 2 else 2)
+             for k, (mus, bs) in enumerate(starts(core, count, seed)) if k >= first]
+    return min(found, key=lambda solution: solution.value)
+
+
+def alternate(problem: RankOne, start: Point, *, tolerance: float = 1e-12, sweeps: int = 5000) -> LocalSolution:
+    """Alternating least squares on the original root: all mu_i and w for fixed b_i, then all b_i and w.
+
+    Independent of the whitening and of Newton's method; converges linearly.
+
+    Args:
+        problem: the least-squares problem.
+        start: starting factors.
+        tolerance: on the relative decrease of the objective in one sweep.
+        sweeps: at most.
+    """
+    w, mus, bs = start.w, list(start.mus), list(start.bs)
+    pieces = [problem.root[:, columns].reshape(-1, nb, p)
+              for columns, (p, nb) in zip(block_slices(problem), problem.blocks)]
+    head = problem.root[:, :problem.linear]
+    value, done, sweep = np.inf, False, 0
+    while not done and sweep < sweeps:
+        designs = [np.einsum("njp,j->np", piece, b) for piece, b in zip(pieces, bs)]
+        _, *mus = _split_solution(head, designs, problem.target)
+        designs = [piece @ mu for piece, mu in zip(pieces, mus)]
+        w, *bs = _split_solution(head, designs, problem.target)
+        point = Point(w, tuple(mus), tuple(bs)).normalised()
+        mus, bs = list(point.mus), list(point.bs)
+        new = problem.value(point.lift())
+        done = value - new <= tolerance * max(new, 1e-16 * problem.scale)
+        value, sweep = new, sweep + 1
+    core = reduce(problem)
+    _, white_mus, white_bs = core.factors(point)
+    gradient = descend(core, white_mus, white_bs, iterations=0).gradient
+    return LocalSolution(point, value, sweep, gradient, done)
+
+
+def _split_solution(head: Array, designs: Sequence[Array], target: Array) -> list[Array]:
+    whole = np.concatenate([head, *designs], axis=1)
+    solution = np.linalg.lstsq(whole, target, rcond=None)[0]
+    return np.split(solution, np.cumsum([head.shape[1], *(d.shape[1] for d in designs)])[:-1])

@@ -1,0 +1,360 @@
+"""The structured problem: ``min ‖left H(v) right - T(theta) Phi‖_* + weight ‖v - y‖²``.
+
+H(v) is the block Hankel matrix of output sequences v (all windows of the record that can be used, experiments side by
+side), T(theta) the block Toeplitz and constant part that known signals explain. Everything an iteration needs is an
+operation on matrices of the size of H; what it solves has a Gram matrix of the size of one output sequence, which is
+decomposed once for all weights and step sizes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+
+RANK = 1e-11  # eigenvalues below this part of the largest are none
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """Known signals that enter through lower block Toeplitz matrices, and a constant for every block row.
+
+    ``(T Phi)_i = sum_k t_k phi(i - k) + c_i``, k from 0 for the direct signals, from 1 for the others.
+
+    Attributes:
+        windows: (alpha, d, j): signal c at sample i of window w.
+        direct: (d,) whether a signal acts at once.
+        constant: whether every block row has a constant of its own.
+    """
+
+    windows: Array
+    direct: np.ndarray
+    constant: bool
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """(count, 2) lag k and signal c of every Toeplitz coefficient."""
+        alpha, d, _ = self.windows.shape
+        found = [(k, c) for k in range(alpha) for c in range(d) if k or self.direct[c]]
+        return np.array(found, dtype=int).reshape(-1, 2)
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients for one output."""
+        return len(self.places) + self.constant * len(self.windows)
+
+    @cached_property
+    def stacked(self) -> Array:
+        """(alpha d, j)."""
+        alpha, d, j = self.windows.shape
+        return self.windows.reshape(alpha * d, j)
+
+    @cached_property
+    def inverse(self) -> Array:
+        """Pseudo-inverse of the Gram matrix of the coefficients of one output."""
+        values, vectors = np.linalg.eigh(self.gram)
+        kept = values > RANK * max(float(values[-1]), np.finfo(float).tiny)
+        return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+
+    @cached_property
+    def gram(self) -> Array:
+        """(size, size) inner products of the matrices the coefficients multiply."""
+        alpha, d, j = self.windows.shape
+        products = (self.stacked @ self.stacked.T).reshape(alpha, d, alpha, d)
+        sums = self.stacked.sum(axis=1).reshape(alpha, d)
+        table = np.zeros((alpha, d, alpha, d))  # by (lag, signal, lag, signal)
+        for k in range(alpha):
+            for kk in range(alpha):
+                i = np.arange(max(k, kk), alpha)
+                table[k, :, kk, :] = products[i - k, :, i - kk, :].sum(axis=0)
+        k, c = self.places.T
+        whole = np.zeros((self.size, self.size))
+        n = len(self.places)
+        whole[:n, :n] = table[k[:, None], c[:, None], k[None], c[None]]
+        if self.constant:
+            for i in range(alpha):
+                inside = k <= i
+                whole[:n, n + i][inside] = sums[i - k[inside], c[inside]]
+            whole[n:, :n] = whole[:n, n:].T
+            whole[n:, n:] = j * np.eye(alpha)
+        return whole
+
+    def toeplitz(self, theta: Array) -> Array:
+        """Return T (alpha l, alpha d) of coefficients theta (size, l), without the constants."""
+        alpha, d, _ = self.windows.shape
+        blocks = np.zeros((alpha, theta.shape[1], d))
+        blocks[self.places[:, 0], :, self.places[:, 1]] = theta[: len(self.places)]
+        whole = np.zeros((alpha, theta.shape[1], alpha, d))
+        for k in range(alpha):
+            i = np.arange(k, alpha)
+            whole[i, :, i - k, :] = blocks[k]
+        return whole.reshape(alpha * theta.shape[1], alpha * d)
+
+    def apply(self, theta: Array) -> Array:
+        """Return ``T(theta) Phi`` plus constants, (alpha l, j)."""
+        found = self.toeplitz(theta) @ self.stacked
+        if self.constant:
+            found += theta[len(self.places) :].reshape(-1)[:, None]
+        return found
+
+    def adjoint(self, z: Array, outputs: int) -> Array:
+        """Return (size, l): inner products of z with the matrices the coefficients multiply."""
+        alpha, d, _ = self.windows.shape
+        products = (z @ self.stacked.T).reshape(alpha, outputs, alpha, d)
+        lags = np.array([np.einsum("iocd->ocd", products[np.arange(k, alpha), :, np.arange(alpha - k), :][:, :, None])
+                         [:, 0] for k in range(alpha)])
+        found = lags[self.places[:, 0], :, self.places[:, 1]]
+        if self.constant:
+            found = np.vstack([found, z.sum(axis=1).reshape(alpha, outputs)])
+        return found
+
+    def coupling(self, starts: np.ndarray, samples: int) -> Array:
+        """Return (samples, size): adjoint of the Hankel operator of one output on every coefficient's matrix."""
+        alpha = len(self.windows)
+        found = np.zeros((samples, self.size))
+        n = len(self.places)
+        for i in range(alpha):
+            inside = np.flatnonzero(self.places[:, 0] <= i)
+            k, c = self.places[inside].T
+            found[np.ix_(starts + i, inside)] += self.windows[i - k, c, :].T
+            if self.constant:
+                found[starts + i, n + i] += 1.0
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class NuclearProblem:
+    """The numbers of one structured problem.
+
+    Attributes:
+        y: (T, l) measured outputs of all experiments, stacked; NaN where missing: these are free.
+        starts: (j,) first sample of every window.
+        rows: number alpha of block rows.
+        left: (r, alpha l) weight on the left, or None for none.
+        right: (j, q) weight on the right, or None for none.
+        predictor: known signals, only without weights; None for none.
+    """
+
+    y: Array
+    starts: np.ndarray
+    rows: int
+    left: Array | None = None
+    right: Array | None = None
+    predictor: Predictor | None = None
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return self.y.shape[1]
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """(T, l) which outputs are measured."""
+        return ~np.isnan(self.y)
+
+    @cached_property
+    def data(self) -> Array:
+        """(T, l) measured outputs with zeros where missing."""
+        return np.nan_to_num(self.y)
+
+    @cached_property
+    def index(self) -> np.ndarray:
+        """(alpha l, j) positions in the flattened outputs of the entries of the Hankel matrix."""
+        samples = self.starts[None, :] + np.arange(self.rows)[:, None]
+        return (samples[:, None, :] * self.l + np.arange(self.l)[None, :, None]).reshape(-1, len(self.starts))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the matrix whose nuclear norm is taken."""
+        return (self.rows * self.l if self.left is None else self.left.shape[0],
+                len(self.starts) if self.right is None else self.right.shape[1])
+
+    @property
+    def parameters(self) -> int:
+        """Number of coefficients of the predictor for one output."""
+        return 0 if self.predictor is None else self.predictor.size
+
+    def hankel(self, v: Array) -> Array:
+        """Return the weighted Hankel matrix of outputs v (T, l)."""
+        found = np.ravel(v)[self.index]
+        found = found if self.left is None else self.left @ found
+        return found if self.right is None else found @ self.right
+
+    def hankel_adjoint(self, z: Array) -> Array:
+        """Return the adjoint of `hankel` at z, (T, l)."""
+        z = z if self.right is None else z @ self.right.T
+        z = z if self.left is None else self.left.T @ z
+        return np.asarray(np.bincount(self.index.ravel(), z.ravel(), self.y.size), dtype=float).reshape(self.y.shape)
+
+    def matrix(self, v: Array, theta: Array) -> Array:
+        """Return the matrix whose nuclear norm is taken."""
+        found = self.hankel(v)
+        return found if self.predictor is None else found - self.predictor.apply(theta)
+
+    def explained(self, z: Array) -> Array:
+        """Return (parameters, l): the coefficients that bring ``T(theta) Phi`` nearest to z."""
+        if self.predictor is None:
+            return np.zeros((0, self.l))
+        return self.predictor.inverse @ self.predictor.adjoint(z, self.l)
+
+    def projected(self, z: Array) -> Array:
+        """Return z without what the predictor can explain."""
+        return z if self.predictor is None else z - self.predictor.apply(self.explained(z))
+
+    @cached_property
+    def gram(self) -> tuple[Array, bool]:
+        """Gram matrix of the projected Hankel operator, and whether it is that of one output, equal for all.
+
+        (T, T) where outputs do not mix, else (T l, T l).
+        """
+        samples, j = len(self.y), len(self.starts)
+        if self.left is not None:
+            outer = np.eye(j) if self.right is None else self.right @ self.right.T
+            inner = (self.left.T @ self.left).reshape(self.rows, self.l, self.rows, self.l)
+            whole = np.zeros((self.l, self.l, samples, samples))
+            for i in range(self.rows):
+                for ii in range(self.rows):
+                    where = np.ix_(self.starts + i, self.starts + ii)
+                    if self.starts[-1] - self.starts[0] == j - 1:  # without gaps: slices instead of copies
+                        first = self.starts[0]
+                        where = slice(first + i, first + i + j), slice(first + ii, first + ii + j)
+                    for o in range(self.l):
+                        for oo in range(self.l):
+                            whole[o, oo][where] += inner[i, o, ii, oo] * outer
+            whole = whole.transpose(2, 0, 3, 1)
+            return whole.reshape(samples * self.l, samples * self.l), False
+        single = np.zeros((samples, samples))
+        if self.right is None:
+            counts = np.bincount((self.starts[None] + np.arange(self.rows)[:, None]).ravel(), minlength=samples)
+            single[np.diag_indices(samples)] = counts
+        else:
+            outer = self.right @ self.right.T
+            for i in range(self.rows):
+                single[np.ix_(self.starts + i, self.starts + i)] += outer
+        if self.predictor is not None:
+            coupling = self.predictor.coupling(self.starts, samples)
+            single -= coupling @ self.predictor.inverse @ coupling.T
+        return single, True
+
+    @cached_property
+    def groups(self) -> tuple["Group", ...]:
+        """Outputs that are solved for together, with their Gram matrices decomposed."""
+        gram, separate = self.gram
+        if not separate:
+            return (Group.of(np.arange(self.y.size), gram, self.known.ravel()),)
+        found: list[Group] = []
+        for o in range(self.l):
+            same = [g for g in range(o) if np.array_equal(self.known[:, g], self.known[:, o])]
+            where = np.arange(len(self.y)) * self.l + o
+            found.append(found[same[0]].moved(where) if same else Group.of(where, gram, self.known[:, o]))
+        return tuple(found)
+
+    def update(self, target: Array, weight: float, step: float) -> tuple[Array, Array]:
+        """Return (v, theta) that minimise ``weight ‖v - y‖² + step/2 ‖matrix(v, theta) - target‖²``."""
+        pull = self.hankel_adjoint(self.projected(target)).ravel()
+        v = np.zeros(self.y.size)
+        for group in self.groups:
+            group.solve(v, self.data.ravel(), pull, weight, step)
+        v = v.reshape(self.y.shape)
+        theta = self.explained(self.hankel(v) - target) if self.predictor is not None else np.zeros((0, self.l))
+        return v, theta
+
+    def value(self, v: Array, theta: Array, weight: float) -> float:
+        """Return the objective."""
+        misfit = np.where(self.known, v - self.data, 0.0)
+        return nuclear_norm(self.matrix(v, theta)) + weight * float(np.sum(misfit**2))
+
+    def dual(self, multipliers: Array, weight: float) -> tuple[float, Array]:
+        """Return a lower bound on the objective in closed form, and the dual point it is taken at.
+
+        The multipliers are projected on what the free variables demand, then scaled into the unit ball of the spectral
+        norm: what comes out is feasible whatever came in.
+
+        Args:
+            multipliers: (r, q) anything; those of ``X = matrix(v, theta)`` give a tight bound.
+            weight: of the misfit.
+        """
+        point = self.projected(multipliers)
+        for group in self.groups:
+            if group.free.size:
+                step = np.zeros(self.y.size)
+                step[group.free] = group.free_inverse @ self.hankel_adjoint(point).ravel()[group.free]
+                point = point - self.projected(self.hankel(step.reshape(self.y.shape)))
+        size = float(np.linalg.norm(point, 2))
+        if size == 0.0:
+            return 0.0, point
+        pull = np.where(self.known, self.hankel_adjoint(point), 0.0)
+        linear, square = float(np.sum(pull * self.data)), float(np.sum(pull**2))
+        best = 2.0 * weight * linear / square if square > 0 else np.inf
+        scale = float(np.clip(best, 0.0, 1.0 / size))
+        return scale * linear - scale**2 * square / (4.0 * weight), scale * point
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Outputs solved for together, measured ones in the eigenvectors of their Gram matrix with the free ones removed.
+
+    Attributes:
+        measured: positions of the measured outputs in the flattened array.
+        free: positions of the missing ones.
+        values: eigenvalues.
+        vectors: eigenvectors, as columns.
+        cross: (measured, free) part of the Gram matrix.
+        free_inverse: pseudo-inverse of the free part.
+    """
+
+    measured: np.ndarray
+    free: np.ndarray
+    values: Array
+    vectors: Array
+    cross: Array
+    free_inverse: Array
+
+    @classmethod
+    def of(cls, where: np.ndarray, gram: Array, known: np.ndarray) -> "Group":
+        """Decompose the Gram matrix of the outputs at some positions."""
+        cross, inner = gram[np.ix_(known, ~known)], gram[np.ix_(~known, ~known)]
+        sizes, directions = np.linalg.eigh(inner)
+        kept = sizes > RANK * float(np.max(np.diag(gram), initial=0.0))
+        inverse = (directions[:, kept] / sizes[kept]) @ directions[:, kept].T
+        reduced = gram[np.ix_(known, known)] - cross @ inverse @ cross.T
+        values, vectors = np.linalg.eigh((reduced + reduced.T) / 2)
+        return cls(where[known], where[~known], np.maximum(values, 0.0), vectors, cross, inverse)
+
+    def moved(self, where: np.ndarray) -> "Group":
+        """Return the same decomposition for another output with the same samples missing."""
+        known = np.zeros(where.size, dtype=bool)
+        order = np.argsort(np.concatenate([self.measured, self.free]))
+        known[order < self.measured.size] = True
+        return Group(where[known], where[~known], self.values, self.vectors, self.cross, self.free_inverse)
+
+    def solve(self, v: Array, y: Array, pull: Array, weight: float, step: float) -> None:
+        """Write the minimiser for given pulls into v."""
+        rest = pull[self.measured] - self.cross @ (self.free_inverse @ pull[self.free])
+        inner = self.vectors.T @ (2.0 * weight * y[self.measured] + step * rest)
+        v[self.measured] = self.vectors @ (inner / (2.0 * weight + step * self.values))
+        v[self.free] = self.free_inverse @ (pull[self.free] - self.cross.T @ v[self.measured])
+
+
+def nuclear_norm(matrix: Array) -> float:
+    """Sum of the singular values."""
+    return float(np.sum(np.linalg.svd(matrix, compute_uv=False)))
+
+
+def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the first samples of the windows whose samples are all usable, in the stacked record.
+
+    Args:
+        lengths: samples of every experiment.
+        rows: samples of a window.
+        usable: (N,) per experiment.
+    """
+    found, offset = [], 0
+    for length, good in zip(lengths, usable):
+        if length >= rows:
+            whole = np.lib.stride_tricks.sliding_window_view(good, rows).all(axis=1)
+            found.append(offset + np.flatnonzero(whole))
+        offset += length
+    return np.concatenate(found) if found else np.zeros(0, dtype=int)

@@ -1,0 +1,144 @@
+"""Kronecker whitening: coordinates in which every rank-one block of a least-squares problem sees nearly the identity.
+
+For independent inputs the Gram matrix of a Hammerstein block is ``G_b kron G_mu`` and the best rank-one fit is a plain
+singular value decomposition in the coordinates ``L_mu^T Theta L_b`` (G = L L^T). For correlated inputs the nearest
+Kronecker product still makes starts, Newton steps and proofs of optimality well conditioned, and it keeps rank one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from optid.arrays import Array
+
+_trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
+
+
+def kronecker_factors(gram: Array, shape: tuple[int, int], passes: int = 5) -> tuple[Array, Array]:
+    """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)``.
+
+    Flip-flop iteration, the maximum-likelihood fit of a separable covariance (Dutilleul, J. Stat. Comput. Simul. 64,
+    1999): each factor in turn is the average of the other one's whitened blocks.
+
+    Args:
+        gram: (P nb, P nb) positive semidefinite.
+        shape: (P, nb).
+        passes: alternations; five are enough for coordinates.
+    """
+    p, nb = shape
+    paired = gram.reshape(nb, p, nb, p).transpose(0, 2, 1, 3).reshape(nb * nb, p * p)
+    inverse_b = np.eye(nb)
+    factor_mu, factor_b = np.eye(p), np.eye(nb)
+    for _ in range(passes):
+        factor_mu, inverse_mu = _factor((inverse_b.ravel() @ paired).reshape(p, p) / nb)
+        factor_b, inverse_b = _factor((paired @ inverse_mu.ravel()).reshape(nb, nb) / p)
+    return factor_mu, factor_b
+
+
+def _factor(matrix: Array) -> tuple[Array, Array]:
+    """Lower Cholesky factor and inverse; a whisper of the identity keeps the coordinates invertible."""
+    size = len(matrix)
+    ridge = 1e-13 * max(float(np.trace(matrix)) / size, np.finfo(float).tiny)
+    factor = np.linalg.cholesky(matrix + ridge * np.eye(size))
+    inverse = invert_triangular(factor)
+    return factor, inverse.T @ inverse
+
+
+def invert_triangular(factor: Array, lower: bool = True) -> Array:
+    """Inverse of a triangular matrix whose diagonal has no zero."""
+    inverse, info = _trtri(factor, lower=int(lower))
+    if info:
+        raise np.linalg.LinAlgError(f"the triangular factor is singular at row {info - 1}")
+    return inverse
+
+
+def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
+    """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
+
+    Args:
+        theta: (P, nb).
+        factor_mu: (P, P) lower triangular.
+        factor_b: (nb, nb) lower triangular.
+    """
+    left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
+    return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``.
+
+    Attributes:
+        shapes: (P_i, nb_i) of every block.
+        factors_mu: (P_i, P_i) lower triangular.
+        factors_b: (nb_i, nb_i) lower triangular.
+        factor_w: (linear, linear) upper triangular.
+    """
+
+    shapes: tuple[tuple[int, int], ...]
+    factors_mu: tuple[Array, ...]
+    factors_b: tuple[Array, ...]
+    factor_w: Array
+
+    @property
+    def linear(self) -> int:
+        """Number of unknowns outside the blocks."""
+        return len(self.factor_w)
+
+    def columns(self, rows: Array) -> Array:
+        """Return ``rows @ K^-1``: linear forms in the old unknowns (k, n) written in the new ones."""
+        new = np.empty((len(rows), rows.shape[1]))
+        start = self.linear
+        new[:, :start] = rows[:, :start] @ invert_triangular(self.factor_w, lower=False) if start else 0.0
+        for (p, nb), factor_mu, factor_b in zip(self.shapes, self.factors_mu, self.factors_b):
+            stop = start + p * nb
+            block = rows[:, start:stop].reshape(-1, p) @ invert_triangular(factor_mu).T
+            new[:, start:stop] = np.matmul(invert_triangular(factor_b), block.reshape(-1, nb, p)).reshape(-1, p * nb)
+            start = stop
+        return new
+
+    def cone(self, block: int, rows: Array) -> Array:
+        """Rows (r, P) that act on mu of a block, written for the new coordinates."""
+        return rows @ invert_triangular(self.factors_mu[block]).T
+
+    def matrix(self) -> Array:
+        """The (n, n) matrix K of the change of coordinates ``z' = K z``."""
+        size = self.linear + sum(p * nb for p, nb in self.shapes)
+        whole = np.zeros((size, size))
+        start = self.linear
+        whole[:start, :start] = self.factor_w
+        for (p, nb), factor_mu, factor_b in zip(self.shapes, self.factors_mu, self.factors_b):
+            stop = start + p * nb
+            whole[start:stop, start:stop] = np.kron(factor_b.T, factor_mu.T)
+            start = stop
+        return whole
+
+    def forward(self, mus: tuple[Array, ...], bs: tuple[Array, ...]) -> tuple[list[Array], list[Array]]:
+        """Factors (mu_i, b_i) in the new coordinates."""
+        return ([factor.T @ mu for factor, mu in zip(self.factors_mu, mus)],
+                [factor.T @ b for factor, b in zip(self.factors_b, bs)])
+
+    def back(self, mus: list[Array], bs: list[Array]) -> tuple[list[Array], list[Array]]:
+        """Factors (mu_i, b_i) in the original coordinates."""
+        return ([_trtrs(factor, mu, lower=1, trans=1)[0] for factor, mu in zip(self.factors_mu, mus)],
+                [_trtrs(factor, b, lower=1, trans=1)[0] for factor, b in zip(self.factors_b, bs)])
+
+
+def whiten(root: Array, shapes: tuple[tuple[int, int], ...], linear: int = 0) -> Whitening:
+    """Choose the coordinates from the root of the Gram matrix.
+
+    Args:
+        root: (n, n) upper triangular; its first ``linear`` columns belong to unknowns outside the blocks.
+        shapes: (P_i, nb_i) of every block, in the order of the columns.
+        linear: number of leading columns outside the blocks.
+    """
+    factors_mu, factors_b = [], []
+    start = linear
+    for p, nb in shapes:
+        part = root[:, start:start + p * nb]
+        factor_mu, factor_b = kronecker_factors(part.T @ part, (p, nb))
+        factors_mu.append(factor_mu)
+        factors_b.append(factor_b)
+        start += p * nb
+    return Whitening(shapes, tuple(factors_mu), tuple(factors_b), root[:linear, :linear].copy())
