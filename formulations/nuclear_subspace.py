@@ -32,13 +32,13 @@ from optid.errors import DataError, RankError, StructureError
 from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.realisation import realise
 from optid.identify.validation import fit_percent
-from optid.program.program import NuclearForm, Program, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import energy_unit
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.expansion import Expansion
-from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
+from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem, Predictor, window_starts
 
 FORMS = ("predictor", "projection", "instruments")
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
@@ -368,7 +368,8 @@ def nuclear_programme(structured: Structured, penalty: float, units: Transform |
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,
         structural=frozenset(constraints), parameters={"weight": weight},
-        derived={"X": matrix, "residual": misfit}, nuclear=NuclearForm(problem), certify=partial(certify, problem),
+        derived={"X": matrix, "residual": misfit}, structure=NuclearNormStructure(problem),
+        certify=partial(certify, problem),
         scale=penalty * float(np.sum(problem.data**2)))
 
 

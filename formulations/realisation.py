@@ -26,10 +26,11 @@ from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.data.channels import Transform
 from optid.identify.subspace.observer import ObserverProblem
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
 from optid.structures.bilinear import starts
+from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
 from optid.structures.rank_one import reduce
 from optid.structures.whitening import leading_pair
 
@@ -170,7 +171,7 @@ def _factored(realisation: Realisation, name: str, linear: Mapping[str, cp.Varia
     return residual_programme(
         step, name, variables, _residual(step, linear, thetas), constraints={"gauge": tuple(gauges)}, start=start,
         recover=realisation.factors, view=_view(realisation, {**variables}, thetas),
-        rank_one=RankOneForm(step.problem, tuple(linear), tuple(names), "norm"),
+        structure=RankOneStructure(step.problem, tuple(linear), tuple(names), "norm"),
         certify=partial(certify_rank_one, max_size=RELAXED))
 
 
@@ -184,7 +185,8 @@ def _lumped(realisation: Realisation, name: str, linear: Mapping[str, cp.Variabl
         thetas.append(variables[whole])
     return residual_programme(
         step, name, variables, _residual(step, linear, thetas), start=start, recover=realisation.factors,
-        view=_view(realisation, {**variables}, thetas), least_squares=RankOneForm(step.problem, tuple(variables), ()))
+        view=_view(realisation, {**variables}, thetas),
+        structure=LeastSquaresStructure(step.problem, tuple(variables)))
 
 
 def least_squares_values(realisation: Realisation) -> dict[str, np.ndarray]:
