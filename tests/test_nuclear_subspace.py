@@ -16,6 +16,7 @@ from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.program.solution import Status
 from optid.solving.solve import solve
+from optid.structures.nuclear_norm import NuclearNormStructure
 
 A = np.array([[0.8, 0.4], [-0.4, 0.8]])
 B, C = np.array([[1.0, 0.2], [0.5, -0.7]]), np.array([[1.0, 0.3], [-0.2, 0.8]])
