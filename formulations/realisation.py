@@ -233,7 +233,7 @@ def _view(realisation: Realisation, expressions: dict[str, Any], thetas: Sequenc
     if all(isinstance(basis, Linear) for basis in x.inputs):
         expressions["B"], expressions["D"] = expressions["Bu"], expressions["Du"]
     bases = x.inputs if realisation.units is None else outer_bases(x.inputs, realisation.units)
-    return View(expressions, kind="realisation", channels=x.input_names, outputs=x.output_names,
+    return View(expressions, channels=x.input_names, outputs=x.output_names,
                 bases=dict(zip(x.input_names, bases)),
                 gauge="norm" if realisation.factored else "", reference={"A": form.a, "C": form.c},
                 units=realisation.units)

@@ -276,7 +276,7 @@ class _Step:
         n = len(self.basis)
         inner = self.change @ a @ self.basis
         p, margin = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable(name="margin")
-        view = View({"P": p, "Q": inner @ p}, kind="shift", reference={"A": self.free})
+        view = View({"P": p, "Q": inner @ p}, reference={"A": self.free})
         bare = Program("centre", cp.Minimize(-margin), _normalised(p), {"P": p, "margin": margin}, {}, dict, view,
                        structural=frozenset(_normalised(p))).subject_to(*rules)
         eased = {name: group if name in bare.structural else tuple(_eased(c, margin) for c in group)
@@ -290,7 +290,7 @@ class _Step:
         residual, height = cp.Variable(fit.size, name="residual"), cp.Variable(name="height")
         constraints = {"residual": (residual == cp.vec(fit, order="F"),), "norm": (cp.SOC(height, residual),),
                        **structural}
-        view = View({"P": p, "Q": q}, kind="shift", reference={"A": self.free})
+        view = View({"P": p, "Q": q}, reference={"A": self.free})
         program = Program(name, cp.Minimize(height), constraints, {**variables, "residual": residual, "height": height},
                           start, recover, view, structural=frozenset(constraints),
                           derived={"residual": cp.vec(fit, order="F")}, scale=self.size)
