@@ -1,19 +1,18 @@
 """Changes of the samples before a fit; what is affine is recorded in `Data.transform` and undone in reports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import Any, TypeVar
 
 import numpy as np
 
 from optid.errors import DataError, nearest
 
-if TYPE_CHECKING:
-    from optid.data.record import Data
+
+Changed = TypeVar("Changed", bound=Any)
+"""A record, `optid.Data`, which offers these changes as methods."""
 
 
-def detrend(data: Data, order: int = 0) -> Data:
+def detrend(data: Changed, order: int = 0) -> Changed:
     """Subtract the mean of every channel (order 0), and a drift of the outputs too (order 1).
 
     The means are taken over all experiments and kept in the transform, so that models report raw units. With
@@ -34,7 +33,7 @@ def detrend(data: Data, order: int = 0) -> Data:
     return _rescaled(level, np.ones_like(shift), shift)
 
 
-def scale(data: Data, factors: Mapping[str, float] | None = None) -> Data:
+def scale(data: Changed, factors: Mapping[str, float] | None = None) -> Changed:
     """Divide every channel by its standard deviation, or by the factors given; undone in what is reported.
 
     Args:
@@ -58,7 +57,7 @@ def scale(data: Data, factors: Mapping[str, float] | None = None) -> Data:
     return _rescaled(data, np.array([float(factors.get(name, 1.0)) for name in names]), np.zeros(len(names)))
 
 
-def decimate(data: Data, q: int) -> Data:
+def decimate(data: Changed, q: int) -> Changed:
     """Low-pass every channel with zero phase and keep every q-th sample; the new dt is q * dt.
 
     The filter is the FIR filter of `scipy.signal.decimate` (Hamming window, 20 q + 1 taps); the ends are continued
@@ -88,7 +87,7 @@ def decimate(data: Data, q: int) -> Data:
     return data.mapped(lowpass, lowpass, dt=data.dt * int(q))
 
 
-def _rescaled(data: Data, scale: np.ndarray, shift: np.ndarray) -> Data:
+def _rescaled(data: Changed, scale: np.ndarray, shift: np.ndarray) -> Changed:
     m = data.m
     return data.mapped(
         lambda u: (u - shift[:m]) / scale[:m],
