@@ -7,7 +7,6 @@ import numpy as np
 
 from optid.errors import DataError, nearest
 
-
 Changed = TypeVar("Changed", bound=Any)
 """A record, `optid.Data`, which offers these changes as methods."""
 
