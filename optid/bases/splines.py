@@ -186,7 +186,8 @@ class BSpline(_Cells):
     @property
     def _points(self) -> Array:
         """Greville abscissae of the control points."""
-        return np.array([self.knots[i + 1 : i + self.degree + 1].mean() for i in range(self.full_size)])
+        knots = self.knots
+        return np.array([knots[i + 1 : i + self.degree + 1].sum() for i in range(self.full_size)]) / self.degree
 
     def slope_rows(self) -> Array:
         """(full_size - 1, P) control points of f'; its values lie between their extremes."""

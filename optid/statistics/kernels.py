@@ -1,4 +1,4 @@
-"""Compiled inner loops: lagged products of families of functions of which few differ from zero, and sparse rows.
+"""Compiled inner loops: lagged products of families of functions of which few differ from zero, sparse outer products.
 
 Compiled at the first call and cached on disk. Every function is single threaded, so that the answer does not depend on
 the machine. Indices are unsigned: signed ones are tested for counting from the end, which takes half of the time.
@@ -81,24 +81,6 @@ def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: 
                 out[row, d] += weight * flat[start + d]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def dense_by_dense(signals: Array, flat: Array, step: int, out: Array) -> None:
-    """Add sum_t g(t) * flat[t * step : t * step + width]^T to out: a few dense signals g, in one thread.
-
-    Args:
-        signals: (T, s) values of g.
-        flat: samples of the other signals, one after the other.
-        step: number of the other signals.
-        out: (s, width).
-    """
-    for i in range(unsigned(signals.shape[1])):
-        for d in range(unsigned(out.shape[1])):
-            total = 0.0
-            for t in range(unsigned(signals.shape[0])):
-                total += signals[t, i] * flat[t * unsigned(step) + d]
-            out[i, d] += total
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> None:
     """Add scale[k] * x_k x_k^T to the upper triangle of gram for sparse rows x_k.
@@ -114,49 +96,3 @@ def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> Non
             weight, row = scale[k] * values[k, i], unsigned(columns[k, i])
             for j in range(i, unsigned(columns.shape[1])):
                 gram[row, unsigned(columns[k, j])] += weight * values[k, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def local_total(first: Indices, weights: Array, out: Array) -> None:
-    """Add the sum of a local family over time, first (T,) and weights (T, s), to out (functions,)."""
-    if weights.shape[1] == 2:
-        for t in range(unsigned(first.size)):
-            row = unsigned(first[t])
-            out[row] += weights[t, 0]
-            out[row + ONE] += weights[t, 1]
-        return
-    for t in range(unsigned(first.size)):
-        for i in range(unsigned(weights.shape[1])):
-            out[unsigned(first[t]) + i] += weights[t, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def list_entries(
-    first: Indices,
-    weights: Array,
-    samples: NDArray[np.int64],
-    lags: int,
-    start: int,
-    size: int,
-    columns: Indices,
-    values: Array,
-) -> None:
-    """List the entries of rows that one group of signals contributes, lag by lag.
-
-    Args:
-        first: (T,) position of the first function.
-        weights: (T, s) values from there on.
-        samples: (K,) sample of each row at the smallest lag.
-        lags: number of lags.
-        start: column of the first function at the smallest lag.
-        size: columns from one lag to the next.
-        columns: (K, lags * s) column numbers, written.
-        values: (K, lags * s) values there, written.
-    """
-    width = weights.shape[1]
-    for k in range(samples.size):
-        for lag in range(lags):
-            t = unsigned(samples[k] - lag)
-            for i in range(width):
-                columns[k, lag * width + i] = start + lag * size + first[t] + i
-                values[k, lag * width + i] = weights[t, i]

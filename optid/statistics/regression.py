@@ -18,8 +18,8 @@ from optid.data.workers import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
-from optid.statistics.factors import Factor, add_to_root, conditioning, dependent_column, root_of_gram
-from optid.statistics.sums import Sums, rows_present, stretches
+from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.sums import Factor, Sums, Total, rows_present, stretches
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -65,9 +65,8 @@ class Statistics:
         factor = None  # digits that one Gram matrix has lost do not come back
         if self.factor is not None and other.factor is not None:
             factor = add_to_root(self.factor, other.factor)
-        return Statistics(
-            self.layout, self.gram + other.gram, self.rows + other.rows, self.candidates + other.candidates, factor
-        )
+        return Statistics(self.layout, self.gram + other.gram, self.rows + other.rows,
+                          self.candidates + other.candidates, factor)
 
     @property
     def method(self) -> Literal["gram", "qr"]:
@@ -139,14 +138,9 @@ class Statistics:
             )
 
 
-def collect(
-    data: "Data | Stream",
-    layout: Layout,
-    weights: Sequence[Array] | None = None,
-    method: Literal["auto", "gram", "qr"] = "auto",
-    chunk: int = CHUNK,
-    threads: int | None = None,
-) -> Statistics:
+def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None,
+            method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK, threads: int | None = None
+            ) -> Statistics:
     """Take the statistics of a record that determines the parameters.
 
     A row is used when every sample it touches is present, in all inputs and outputs.
@@ -185,13 +179,8 @@ def collect(
     return statistics
 
 
-def accumulate(
-    data: "Data | Stream",
-    layout: Layout,
-    weights: Sequence[Array] | None = None,
-    chunk: int = CHUNK,
-    threads: int | None = None,
-) -> Statistics:
+def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK,
+               threads: int | None = None) -> Statistics:
     """Take the Gram matrix in one pass, without asking whether the record determines the parameters.
 
     This is for parts of a record that are to be added; arguments and errors as `collect`.
@@ -206,9 +195,8 @@ def accumulate(
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 
-def factorise(
-    data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
-) -> Statistics:
+def factorise(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
+              ) -> Statistics:
     """Take the triangular factor in one pass, by tall and skinny QR decomposition.
 
     Arguments and errors as `collect`, without its checks of rank.
@@ -262,7 +250,7 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
 
 
 def _total(
-    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Any]
+    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Total]
 ) -> Any:
     """Return the sums, of what `start` begins, over all rows of a record."""
     np.empty(RETAINED, dtype=np.uint8)  # freed at once
@@ -273,7 +261,7 @@ def _total(
             raise DataError(NO_WEIGHTS)
         return total_of_parts(data, layout, start, chunk, threads)
 
-    def sum_part(part: Stretch) -> Any:
+    def sum_part(part: Stretch) -> Total:
         sums = start()
         for block in blocks_of(part, layout, chunk):
             sums.add(block)
