@@ -69,9 +69,9 @@ class Signals:
             return np.ones(len(self.weights)) @ self.weights
         from optid.statistics import kernels
 
-        sums = np.zeros((self.size, 1))
-        kernels.local_by_dense(self.first, self.weights, np.ones(1), 0, sums)  # the one of every sample
-        return sums[:, 0]
+        sums = np.zeros(self.size)
+        kernels.local_total(self.first, self.weights, sums)
+        return sums
 
 
 @dataclass(frozen=True)
@@ -231,10 +231,10 @@ class Total:
 
     def add(self, block: Block) -> None:
         """Add the valid rows of a block."""
-        used = np.flatnonzero(block.valid)
-        self.rows += used.size
+        count = int(np.count_nonzero(block.valid))
+        self.rows += count
         self.candidates += block.candidates
-        self._add(block, used)
+        self._add(block, count)
 
     def merge(self, other: Self) -> None:
         """Add the sums of other blocks, of the same layout."""
@@ -242,7 +242,7 @@ class Total:
         self.candidates += other.candidates
         self._merge(other)
 
-    def _add(self, block: Block, used: NDArray[np.intp]) -> None:
+    def _add(self, block: Block, count: int) -> None:
         raise NotImplementedError
 
     def _merge(self, other: Any) -> None:
@@ -260,7 +260,8 @@ class Factor(Total):
         super().__init__(layout)
         self.root = np.zeros((layout.n_columns + layout.l,) * 2)
 
-    def _add(self, block: Block, used: NDArray[np.intp]) -> None:
+    def _add(self, block: Block, count: int) -> None:
+        used = np.flatnonzero(block.valid)
         for start in range(0, used.size, FORMED):
             part = used[start : start + FORMED]
             formed = self.layout.contrasted(dense_rows(block, part, self.layout.n_complete))
@@ -285,11 +286,10 @@ class Sums(Total):
         self._totals = [np.zeros(columns.shape[1]) for columns in layout.complete_columns]
         self._stretched = 0  # rows, with those around the ends, that were added by lag difference
 
-    def _add(self, block: Block, used: NDArray[np.intp]) -> None:
-        if block.weights is not None:
-            self._add_rows(block, used, block.weights[used])
-        elif self.direct or self._is_small(used.size) or self._direct_is_cheaper(block, used.size):
-            self._add_rows(block, used, np.ones(used.size))
+    def _add(self, block: Block, count: int) -> None:
+        if block.weights is not None or self.direct or self._is_small(count) or self._direct_is_cheaper(block, count):
+            used = np.flatnonzero(block.valid)
+            self._add_rows(block, used, np.ones(count) if block.weights is None else block.weights[used])
         else:
             self._add_by_difference(block)
             others = np.flatnonzero(~block.valid)
