@@ -177,9 +177,19 @@ class Basis:
         """(n,) points that cover the interval evenly."""
         return np.linspace(*span(self), n)
 
+    def is_outside(self, u: ArrayLike) -> NDArray[np.bool_]:
+        """Mark the samples of u (N,) outside the interval (none when there is no interval).
+
+        A change of units may move an end by a few ulp, which does not count.
+        """
+        lo, hi = self.interval or (-np.inf, np.inf)
+        slack = 1e-12 * max(abs(lo), abs(hi)) if self.interval else 0.0
+        u = samples(u)
+        return (u < lo - slack) | (u > hi + slack)
+
     def n_outside(self, u: ArrayLike) -> int:
         """Count the samples of u (N,) that lie outside the interval (none when there is no interval)."""
-        return 0 if self.interval is None else int(self._beyond(samples(u)).sum())
+        return int(self.is_outside(u).sum())
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the basis in JSON types; `optid.bases.from_dict` is the inverse."""
@@ -199,17 +209,11 @@ class Basis:
         """Ends (c + 1,) of the cells, and Gauss-Legendre points in each, by which `penalty` integrates."""
         raise NotImplementedError
 
-    def _beyond(self, u: Array) -> NDArray[np.bool_]:
-        """Mark samples outside; a change of units may move an end by a few ulp, which does not count."""
-        lo, hi = span(self)
-        slack = 1e-12 * max(abs(lo), abs(hi))
-        return (u < lo - slack) | (u > hi + slack)
-
     def _inside(self, u: Array) -> Array:
         """Apply the rule for values outside the interval; NaN stays NaN."""
         if self.interval is None or self.outside == "extrapolate":
             return u
-        if self.outside == "error" and (out := self._beyond(u)).any():
+        if self.outside == "error" and (out := self.is_outside(u)).any():
             k = int(np.argmax(out))
             raise DataError(
                 f"Sample {k} of the input is {u[k]:g}, outside the interval "

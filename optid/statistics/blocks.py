@@ -113,9 +113,8 @@ def check_channels(data: Any, layout: Layout) -> None:
 
 def _check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
     for c, basis in enumerate(layout.bases):
-        if basis.outside == "error" and basis.n_outside(u[:, c]):
-            k = next(k for k in range(len(u)) if basis.n_outside(u[k : k + 1, c]))
-            raise DataError(
-                f"{name}input {layout.inputs[c]!r}, sample {position + k}: {u[k, c]:g} is outside the interval "
-                f"{basis.interval} of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
-            )
+        if basis.outside == "error" and (out := basis.is_outside(u[:, c])).any():
+            k = int(np.argmax(out))
+            raise DataError(f"{name}input {layout.inputs[c]!r}, sample {position + k}: {u[k, c]:g} is outside the "
+                            f"interval {basis.interval} of the basis. Use data inside it, or outside='clamp' or "
+                            "'extrapolate'.")
