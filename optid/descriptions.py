@@ -1,4 +1,4 @@
-"""What a registered function says of itself: its signature and docstring, read from its source without importing it."""
+"""Signatures and docstrings of registered functions, read from their source without importing it."""
 
 import ast
 import inspect

@@ -282,7 +282,7 @@ def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band:
     if lines is not None:
         k = np.unique(np.asarray(lines))
         if k.dtype.kind not in "iu" or not k.size or k[0] < 1 or k[-1] > most:
-            raise StructureError(f"lines: whole numbers from 1 to {most} are needed for {size} samples a period.")
+            raise StructureError(f"lines: integers from 1 to {most} are needed for {size} samples per period.")
         return k
     everywhere = np.arange(1, most + 1)
     if band is not None:

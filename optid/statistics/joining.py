@@ -1,4 +1,4 @@
-"""Sums over the parts of a record that are read apart.
+"""Sums over the parts of a record that are read separately.
 
 A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is
 associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter than the
@@ -26,7 +26,7 @@ Ends = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Neighbouring parts: their sums, and the samples that joining them to what is around takes.
+    """Neighbouring parts: their sums, and the samples at their ends that joining them takes.
 
     Attributes:
         total: sums over the rows inside.

@@ -150,8 +150,8 @@ def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | No
         layout: the columns.
         weights: one array (N,) per experiment, weight >= 0 of the row of each sample; None for ones. Not for streams.
         method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next rows, slower and
-            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or what no
-            parameter explains is a share of the outputs that rounding reaches.
+            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or the
+            unexplained share of an output is so small that rounding reaches it.
             `Statistics.method` says which it was.
         chunk: samples evaluated at a time.
         threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
@@ -252,7 +252,7 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
 def _total(
     data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Total]
 ) -> Any:
-    """Return the sums, of what `start` begins, over all rows of a record."""
+    """Return the sums over all rows of a record; `start` returns empty ones."""
     np.empty(RETAINED, dtype=np.uint8)  # freed at once
     if getattr(data, "parts", ()):
         from optid.statistics.joining import total_of_parts
@@ -292,6 +292,6 @@ def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
     partners = [names[j] for j in np.argsort(-np.abs(combination))[:3] if abs(combination[j]) > 1e-3]
     return (
         f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
-        "the record does not tell them apart. Use fewer lags or basis functions, or an input with more levels and "
+        "the record does not distinguish them. Use fewer lags or basis functions, or an input with more levels and "
         "frequencies."
     )

@@ -76,7 +76,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of a stretch of time, with zeros before, behind and in place of what is missing.
+    """Samples of a stretch of time, with zeros before, behind and in place of missing ones.
 
     Attributes:
         groups: the outputs, then the functions of each input.
@@ -163,7 +163,7 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
 
 
 def sparse_rows(block: Block, rows: NDArray[np.intp], n: int) -> tuple[NDArray[np.int32], Array]:
-    """List what need not vanish in some rows of length n: increasing column numbers (K, z) and values (K, z)."""
+    """List the entries of some rows of length n that may differ from zero: columns (K, z), increasing, and values."""
     outputs, *inputs = block.groups
     constant = np.full((rows.size, 1), n - 1 - outputs.size, dtype=np.int32), np.ones((rows.size, 1))
     past = [_entries(outputs, rows + (block.reach - lag), lag) for lag in outputs.lags[1:]]

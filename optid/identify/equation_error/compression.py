@@ -39,7 +39,7 @@ class EquationError:
         meta: dt, names and units for the model.
         units: from those of the problem (`optid.program.units`) to those of the record.
         bases: one per input, in the units of the record.
-        unit: what one unit of the objective is in units of the record.
+        unit: size of one unit of the objective in units of the record.
         unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
     """
 
@@ -78,7 +78,7 @@ class EquationError:
         return self.problem.root @ z - self.problem.target
 
     def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
-        """Return what constraints may speak about."""
+        """Return the expressions that constraints may use."""
         full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
         return View(expressions, kind=kind, channels=inputs, bases=dict(zip(inputs, self.bases)), gauge=gauge,
                     reference=self.linear_part(full[: self.problem.linear]), units=self.units)

@@ -188,7 +188,7 @@ class _Rows:
         return True
 
     def figures(self, kind: str, width: float) -> dict[str, Any]:
-        """Return what the fit prints: the threshold of the loss, and the readings left out by where they were found."""
+        """Return the figures that the fit prints: the threshold of the loss, and the readings left out."""
         found: dict[str, Any] = {"threshold of the loss": width} if kind == "huber" else {}
         by_residuals = [wild & ~known for wild, known in zip(self._wild, self._examined)]
         for o, name in enumerate(self._layout.outputs):
