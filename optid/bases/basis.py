@@ -116,13 +116,10 @@ class Basis:
             DataError: outside="error" and a sample lies outside the interval.
             StructureError: the basis has no interval yet.
         """
-        x = self._inside(samples(u))
-        missing = np.isnan(x)
-        if not missing.any():
-            return self._evaluate(x)
-        x = np.where(missing, 0.0 if self.interval is None else self.interval[0], x)
+        x, missing = self._inside(samples(u))
         first, weights = self._evaluate(x)
-        weights[missing] = 0.0
+        if missing is not None:
+            weights[missing] = 0.0
         return first, weights
 
     def values(self, u: ArrayLike) -> Array:
@@ -139,12 +136,12 @@ class Basis:
     def slopes(self, u: ArrayLike) -> Array:
         """Evaluate d eta / du, (N, P); zero where the value is clamped, the slope to the right at kinks."""
         u = samples(u)
-        x = self._inside(u)
-        missing = np.isnan(x)
-        slopes = self._derivative(np.where(missing, 0.0 if self.interval is None else self.interval[0], x), 1)
+        x, missing = self._inside(u)
+        slopes = self._derivative(x, 1)
         if self.outside == "clamp" and self.interval is not None:
             slopes[(u < self.interval[0]) | (u > self.interval[1])] = 0.0
-        slopes[missing] = np.nan
+        if missing is not None:
+            slopes[missing] = np.nan
         return slopes
 
     def increments(self) -> Array:
@@ -209,18 +206,22 @@ class Basis:
         """Ends (c + 1,) of the cells, and Gauss-Legendre points in each, by which `penalty` integrates."""
         raise NotImplementedError
 
-    def _inside(self, u: Array) -> Array:
+    def _clipped(self, u: Array) -> Array:
         """Apply the rule for values outside the interval; NaN stays NaN."""
-        if self.interval is None or self.outside == "extrapolate":
-            return u
         if self.outside == "error" and (out := self.is_outside(u)).any():
-            k = int(np.argmax(out))
-            raise DataError(
-                f"Sample {k} of the input is {u[k]:g}, outside the interval "
-                f"[{self.interval[0]:g}, {self.interval[1]:g}] of the basis ({int(out.sum())} such samples). "
-                "Use data inside it, or outside='clamp' or 'extrapolate'."
-            )
-        return np.clip(u, *self.interval)
+            k, (lo, hi) = int(np.argmax(out)), span(self)
+            raise DataError(f"Sample {k} of the input is {u[k]:g}, outside the interval [{lo:g}, {hi:g}] of the basis "
+                            f"({int(out.sum())} such samples). Use data inside it, or outside='clamp' or "
+                            "'extrapolate'.")
+        return u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
+
+    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """Clip u, put the lower end (or 0) where a sample is missing, and mark them (None: no sample is missing)."""
+        x = self._clipped(u)
+        missing = np.isnan(x)
+        if not missing.any():
+            return x, None
+        return np.where(missing, 0.0 if self.interval is None else self.interval[0], x), missing
 
     def _reduced(self, complete: Array) -> Array:
         """Multiply the complete family by the contrast: remove the column that is redundant."""

@@ -123,9 +123,7 @@ class Linear(_Dense):
         """The slope, (1, 1)."""
         return np.ones((1, 1))
 
-    def slope_rows(self) -> Array:
-        """The slope, (1, 1)."""
-        return np.ones((1, 1))
+    slope_rows = increments
 
     def curvature(self) -> Array:
         """No rows, (0, 1): a line is convex and concave."""
@@ -182,10 +180,8 @@ class UserFunctions(_Dense):
         """Refuse: functions of one unit are not known in another."""
         if (scale, offset) == (1.0, 0.0):
             return super().mapped(scale, offset)
-        raise StructureError(
-            "A model with UserFunctions keeps the units it was identified in: identify it on data that are neither "
-            "scaled nor detrended."
-        )
+        raise StructureError("A model with UserFunctions keeps the units it was identified in: identify it on data "
+                             "that are neither scaled nor detrended.")
 
     def penalty(self, order: int = 2) -> Array:
         """Integral of f'^2 by quadrature; of f''^2 by second differences on the grid."""
@@ -196,12 +192,7 @@ class UserFunctions(_Dense):
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the basis in JSON types: the functions by name only."""
-        return {
-            "type": "userfunctions",
-            "names": list(self.names),
-            "interval": self.interval,
-            "outside": self.outside,
-        }
+        return {"type": "userfunctions", "names": list(self.names), "interval": self.interval, "outside": self.outside}
 
     def _quadrature(self) -> tuple[Array, int]:
         return self.grid(), 4
@@ -221,20 +212,17 @@ class UserFunctions(_Dense):
             if not np.all(np.isfinite(column)):
                 raise StructureError(f"Function {name!r} is not finite at u = {grid[~np.isfinite(column)][0]:g}.")
             if np.ptp(column) <= 1e-12 * np.max(np.abs(column)):
-                raise StructureError(
-                    f"Function {name!r} is constant on the interval: leave it out, the model has an offset."
-                )
+                raise StructureError(f"Function {name!r} is constant on the interval: leave it out, the model has an "
+                                     "offset.")
         rest = 1 - columns @ np.linalg.lstsq(columns, np.ones(grid.size))[0]
         if np.max(np.abs(rest)) < 1e-9:
-            raise StructureError(
-                f"Functions {', '.join(self.names)} contain the constant: drop one of them, the model has an offset."
-            )
+            raise StructureError(f"Functions {', '.join(self.names)} contain the constant: drop one of them, the model "
+                                 "has an offset.")
 
     def _columns(self, functions: Sequence[Function], x: Array) -> Array:
         columns = [np.asarray(function(x), dtype=float) for function in functions]
         for name, column in zip(self.names, columns):
             if column.shape != x.shape:
-                raise StructureError(
-                    f"Function {name!r} maps shape {x.shape} to {column.shape}: it must be vectorised."
-                )
+                raise StructureError(f"Function {name!r} maps shape {x.shape} to {column.shape}: it must be "
+                                     "vectorised.")
         return np.column_stack(columns)

@@ -101,7 +101,7 @@ class Triangular(_Cells):
         from optid.bases import kernels
 
         lo, hi = span(self)
-        return kernels.hats(self._inside(u), lo, self.p / (hi - lo), self.p)
+        return kernels.hats(self._clipped(u), lo, self.p / (hi - lo), self.p)
 
     def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
         cell, position = self._split(x)

@@ -116,10 +116,8 @@ class Statistics:
         if self.rows < ROWS_PER_COLUMN * n:
             needed = int(np.ceil(ROWS_PER_COLUMN * n))
             missing = f"Missing samples cost {100 * lost:.0f} % of {self.candidates} rows. " if lost > 0 else ""
-            raise RankError(
-                f"{self.rows} rows for {n} parameters: at least {needed} are needed. {missing}"
-                "Use a longer record, fewer lags or fewer basis functions."
-            )
+            raise RankError(f"{self.rows} rows for {n} parameters: at least {needed} are needed. {missing}"
+                            "Use a longer record, fewer lags or fewer basis functions.")
         energy = np.diag(self.gram)[:n]
         silent = np.flatnonzero(energy[: self.layout.na * self.layout.l] == 0)
         if silent.size:
@@ -130,12 +128,9 @@ class Statistics:
             if functions.size:
                 raise RankError(_explain_silence(basis, channel, int(functions[0]), self.layout.lags[c][lags[0]]))
         if lost > KEPT:
-            warnings.warn(
-                f"Missing samples leave {self.rows} of {self.candidates} rows ({100 * (1 - lost):.0f} %): a row is "
-                f"lost with any sample among its {self.layout.first_row} lags. Fewer lags keep more.",
-                DataWarning,
-                stacklevel=3,
-            )
+            warnings.warn(f"Missing samples leave {self.rows} of {self.candidates} rows ({100 * (1 - lost):.0f} %): a "
+                          f"row is lost with any sample among its {self.layout.first_row} lags. Fewer lags keep more.",
+                          DataWarning, stacklevel=3)
 
 
 def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None,
@@ -227,10 +222,8 @@ def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) ->
 def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) -> Array:
     reach, outs = layout.first_row, layout.l
     result = np.full(y.shape, np.nan)
-    tables = [
-        np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
-        for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))
-    ]  # (full size, lags, l)
+    tables = [np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
+              for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))]  # (full size, lags, l)
     start = reach
     for part_u, part_y in stretches([(u, y)], reach, max(chunk, reach)):
         count = len(part_y) - reach
@@ -278,11 +271,9 @@ def _explain_silence(basis: Basis, channel: str, function: int, lag: int) -> str
     alive = points[basis.values(points)[:, function] != 0]
     where = f", which lives on [{alive[0]:.4g}, {alive[-1]:.4g}]," if alive.size else ""
     whole = "[{:.4g}, {:.4g}]".format(*basis.interval) if basis.interval else "the real line"
-    return (
-        f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} is "
-        f"never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower interval, "
-        "or data that cover it."
-    )
+    return (f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} "
+            f"is never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower "
+            "interval, or data that cover it.")
 
 
 def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
@@ -290,8 +281,6 @@ def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
     scale = np.linalg.norm(root[:, : column + 1], axis=0)
     combination = np.linalg.lstsq(root[:column, :column] / scale[:column], root[:column, column] / scale[column])[0]
     partners = [names[j] for j in np.argsort(-np.abs(combination))[:3] if abs(combination[j]) > 1e-3]
-    return (
-        f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
-        "the record does not distinguish them. Use fewer lags or basis functions, or an input with more levels and "
-        "frequencies."
-    )
+    return (f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
+            "the record does not distinguish them. Use fewer lags or basis functions, or an input with more levels and "
+            "frequencies.")
