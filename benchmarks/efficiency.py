@@ -16,7 +16,7 @@ from montecarlo import STRUCTURE, TRUTHS, A, B, mapped, noise_level, record
 from scipy.linalg import null_space
 
 import optid
-from formulations.equation_error import compress
+from optid.identify.equation_error import compress
 
 VALUES = TRUTHS["dead zone"]
 MU = np.delete(VALUES, 4) - VALUES[4]

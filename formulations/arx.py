@@ -9,11 +9,10 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import EquationError, compress, residual_programme
-from formulations.losses import degree, with_loss
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.streams import Stream
+from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.models import HammersteinARX
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
@@ -39,25 +38,25 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    options = {"na": na, "nb": nb, "nk": nk, "basis": Linear(), "ridge": ridge, "degree": degree(loss)}
-
-    def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
-        problem = compress(data, weights=weights, **options)
-        return _arx(problem, constraints), problem
-
-    return with_loss(loss, data, pose, convex=True)
+    return pose_with_loss(loss, data, lambda problem: _programme(problem).subject_to(*constraints), convex=True,
+                          na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge)
 
 
-def _arx(problem: EquationError, constraints: Sequence[Any]) -> Program:
-    linear = problem.linear_variables()
-    keys = [problem.key("b", c) for c in range(len(problem.channels))]
-    numerators = {key: cp.Variable(problem.b_shape(c), name=key) for c, key in enumerate(keys)}
+def _programme(problem: EquationError) -> Program:
+    linear = problem.linear_variables()  # a, offset
+    b = {key: cp.Variable(problem.b_shape(c), name=key) for c, key in enumerate(problem.keys("b"))}
+    residual = problem.residual(linear, b.values())
+    r = cp.Variable(residual.size, name="residual")
+
+    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
+    constraints = {"residual": (r == residual,)}
 
     def recover(values: Values) -> HammersteinARX:
-        ones = [np.ones(1)] * len(keys)
-        return problem.model(values, ones, [values[key] for key in keys], gauge="none", flip=False)
+        return problem.model(values, [np.ones(1)] * len(b), [values[key] for key in b], gauge="none", flip=False)
 
-    return residual_programme(
-        problem, "arx", {**linear, **numerators}, problem.residual(linear, list(numerators.values())), start={},
-        recover=recover, view=problem.view({**linear, **numerators}),
-        structure=LeastSquaresStructure(problem.problem, (*linear, *keys), ())).subject_to(*constraints)
+    return Program(
+        "arx", objective, constraints, {**linear, **b, "residual": r}, {}, recover,
+        problem.view({**linear, **b}), structural=frozenset(constraints), derived={"residual": residual},
+        structure=LeastSquaresStructure(problem.problem, (*linear, *b)), scale=problem.problem.scale,
+        unit=problem.unit,
+        compressed=problem)

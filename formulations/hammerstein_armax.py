@@ -17,13 +17,13 @@ allow, C gets a small bias when gaps are many, a few hundredths with a third of 
 from collections.abc import Sequence
 from typing import Any
 
-from formulations.arguments import one_output, per_channel, whole_number
-from formulations.gauges import check_gauge
 from formulations.noise_models import PredictionErrors, extended_least_squares, other_zeros, procedure
 from formulations.output_error_records import in_own_units
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.record import Data
+from optid.identify.arguments import one_output, per_channel, whole_number
+from optid.identify.gauges import check_gauge
 from optid.solving.solve import Procedure
 from optid.statistics import Layout
 from optid.statistics.noise_sensitivities import NoiseUnknowns

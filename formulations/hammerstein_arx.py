@@ -1,18 +1,11 @@
-"""Hammerstein-ARX: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + e`` with ``f_c = mu_cᵀ eta_c``.
+"""Hammerstein-ARX: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + e`` with ``f_c = mu_cᵀ eta_c``, the bilinear least squares.
 
-Three formulations of one problem (Luo, chapter 3; Bai 1998 for the over-parametrisation):
-
-* `exact`: the bilinear least-squares problem itself. Named variables: ``a``, ``b``, ``mu``, ``offset``, and the
-  expression ``Theta = mu bᵀ``.
-* `nuclear`: the rank constraint on Theta relaxed to a nuclear-norm penalty. Named variables: ``a``, ``Theta``,
-  ``offset``.
-* `overparametrised`: the rank constraint dropped, the rank-one factor split off afterwards (Algorithm 3.1). Named
-  variables as for `nuclear`.
-
-With several inputs the per-channel names carry the input, as in ``mu[valve]``.
+Named variables: ``a``, ``b``, ``mu``, ``offset``, and the expression ``Theta = mu bᵀ``; with several inputs the
+per-channel names carry the input, as in ``mu[valve]``. `formulations.hammerstein_arx_relaxed` drops or relaxes the
+rank-one constraint on Theta.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,23 +13,20 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import EquationError, compress, residual_programme
-from formulations.gauges import check_gauge, scale_fixed
-from formulations.losses import degree, with_loss
 from optid.bases.basis import Basis
-from optid.certificate.lifting import certify_nuclear, certify_rank_one
+from optid.certificate.lifting import certify_rank_one
 from optid.data.record import Data
 from optid.data.streams import Stream
-from optid.errors import StructureError
+from optid.identify.equation_error import EquationError, pose_with_loss
+from optid.identify.gauges import check_gauge, in_gauge, scale_fixed
 from optid.models import HammersteinARX
-from optid.models.gauges import gauge_factor
+from optid.program.expressions import flat
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.bilinear import starts
-from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
-from optid.structures.rank_one import Core, reduce
-from optid.structures.whitening import leading_pair
+from optid.structures.least_squares import RankOneStructure
+from optid.structures.rank_one import reduce
 
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -66,55 +56,51 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         RankError: the record does not determine the parameters.
     """
     check_gauge(gauge)
-    options = {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
-               "degree": degree(loss)}
-
-    def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
-        problem = compress(data, weights=weights, **options)
-        return _exact(problem, constraints, gauge), problem
-
-    return with_loss(loss, data, pose, convex=False)
+    return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
+                          nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
 
 
-def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Program:
-    linear = problem.linear_variables()
-    variables: dict[str, cp.Variable] = dict(linear)
-    expressions: dict[str, cp.Expression] = dict(linear)
-    thetas, gauges, blocks, start = [], [], [], {}
-    core = reduce(problem.problem)
-    point = core.point(*starts(core, count=1)[0])
-    start.update(problem.linear_part(point.w))
-    for c in range(len(problem.channels)):
-        names = problem.key("mu", c), problem.key("b", c)
-        mu = cp.Variable(problem.layout.bases[c].size, name=names[0])
-        b = cp.Variable(problem.b_shape(c), name=names[1])
-        theta = cp.outer(mu, cp.vec(b, order="F") if b.ndim == 2 else b)
-        gauges.append(scale_fixed(gauge, b, linear.get("a")))
-        blocks.append(names)
-        thetas.append(theta)
-        variables[names[0]], variables[names[1]] = mu, b
-        expressions[names[0]], expressions[names[1]], expressions[problem.key("Theta", c)] = mu, b, theta
-        values = _in_gauge(gauge, point.mus[c], point.bs[c].reshape(b.shape, order="F"), start.get("a"),
-                           problem.channels[c])
-        start.update(dict(zip(names, values)))
-    program = residual_programme(
-        problem, "hammerstein_arx.exact", variables, problem.residual(linear, thetas),
-        constraints={"gauge": tuple(gauges)}, start=start, recover=lambda values: None,
-        view=problem.view(expressions, gauge),
-        structure=RankOneStructure(problem.problem, tuple(linear), tuple(blocks), gauge),
-        certify=certify_rank_one)
-    program = program.subject_to(*constraints)
-    signed = _speaks_of_factors(program, {variables[name].id for names in blocks for name in names})
+def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:
+    linear, inputs = problem.linear_variables(), range(problem.layout.m)  # a, offset
+    mu = [cp.Variable(problem.layout.bases[c].size, name=problem.keys("mu")[c]) for c in inputs]
+    b = [cp.Variable(problem.b_shape(c), name=problem.keys("b")[c]) for c in inputs]
+    theta = {problem.keys("Theta")[c]: cp.outer(mu[c], flat(b[c])) for c in inputs}
+    residual = problem.residual(linear, theta.values())
+    r = cp.Variable(residual.size, name="residual")
+
+    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
+    constraints = {"residual": (r == residual,), "gauge": tuple(scale_fixed(gauge, one, linear.get("a")) for one in b)}
+
+    factors = {one.name(): one for pair in zip(mu, b) for one in pair}
+    pairs = tuple((m.name(), one.name()) for m, one in zip(mu, b))
+    program = Program(
+        "hammerstein_arx.exact", objective, constraints, {**linear, **factors, "residual": r},
+        _start(problem, pairs, gauge), lambda values: None,
+        problem.view({**linear, **factors, **theta}, gauge), structural=frozenset(constraints),
+        derived={"residual": residual},
+        structure=RankOneStructure(problem.problem, tuple(linear), pairs, gauge), certify=certify_rank_one,
+        scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
+    signed = gauge == "norm" and _has_signed_factors(program, {one.id for one in factors.values()})
 
     def recover(values: Values) -> HammersteinARX:
-        return problem.model(values, [values[mu] for mu, _ in blocks], [values[b] for _, b in blocks],
-                             gauge=gauge, flip=gauge == "norm" and not signed)
+        return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,
+                             flip=gauge == "norm" and not signed)
 
-    turn = signed and gauge == "norm"
-    return replace(program, recover=recover, start=_signed_start(program, blocks) if turn else start)
+    return replace(program, recover=recover, start=_signed_start(program, pairs) if signed else program.start)
 
 
-def _speaks_of_factors(program: Program, factors: set[int]) -> bool:
+def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str) -> dict[str, np.ndarray]:
+    """Return the best rank-one start without the constraints, in the gauge."""
+    core = reduce(problem.problem)
+    point = core.point(*starts(core, count=1)[0])
+    start = problem.linear_part(point.w)
+    for c, (names, channel) in enumerate(zip(pairs, problem.layout.inputs)):
+        b = point.bs[c].reshape(problem.b_shape(c), order="F")
+        start.update(zip(names, in_gauge(gauge, point.mus[c], b, start.get("a"), channel)))
+    return start
+
+
+def _has_signed_factors(program: Program, factors: set[int]) -> bool:
     """Whether a constraint speaks of a mu or a b itself, and thereby decides their sign, not of ``mu bᵀ`` alone."""
     stand_in = {id(theta): cp.Variable(theta.shape) for name, theta in program.view.inner.items()
                 if name.partition("[")[0] == "Theta"}
@@ -122,144 +108,16 @@ def _speaks_of_factors(program: Program, factors: set[int]) -> bool:
                for v in member.tree_copy(stand_in).variables())
 
 
-def _signed_start(program: Program, blocks: Sequence[tuple[str, str]]) -> dict[str, np.ndarray]:
+def _signed_start(program: Program, pairs: Sequence[tuple[str, str]]) -> Mapping[str, np.ndarray]:
     """Turn the sign of every (mu, b) of the start to where the constraints are violated least.
 
     Methods that follow one start would otherwise stay at ``mu = 0`` on a plant whose sign the constraints turn round.
     """
-    start = dict(program.start)
-    for mu, b in blocks:
-        turned = {**start, mu: -start[mu], b: -start[b]}
-        sizes = []
-        for values in (start, turned):
-            program.assign(values)
-            sizes.append(measure_violation(program)[0])
-        if sizes[1] < sizes[0]:
-            start = turned
+    def violation(values: Values) -> float:
+        program.assign(values)
+        return measure_violation(program)[0]
+
+    start = program.start
+    for mu, b in pairs:
+        start = min(start, {**start, mu: -start[mu], b: -start[b]}, key=violation)
     return start
-
-
-def _in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, channel: str
-              ) -> tuple[np.ndarray, np.ndarray]:
-    if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
-        return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
-    factor = gauge_factor(gauge, np.zeros(0) if a is None else a, b, channel)
-    return mu * factor, b / factor
-
-
-def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
-            nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
-            ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
-    """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
-
-    The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
-    shrinks Theta, so a rank-one answer is a start for `exact` rather than its solution.
-
-    Named variables: ``Theta``, ``a``, ``offset``.
-
-    Args:
-        data: the record.
-        na: number of past outputs in A.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
-        nk: delay in samples, one per input or one for all.
-        weight: weight of the penalty, in units of the objective per unit of Theta.
-        constraints: builders in the variables ``a``, ``Theta``, ``offset``.
-        loss: as in `exact`; the convex forms carry a dual bound.
-        ridge: weight of ``‖Theta‖²``.
-        curvature: weight of the integral of ``f''²``.
-        gauge: gauge of the reported model.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, nonconvex constraints.
-        RankError: the record does not determine the parameters.
-    """
-    return _relaxed("hammerstein_arx.nuclear", data, constraints, loss, gauge, weight, "whitened",
-                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
-                     "degree": degree(loss)})
-
-
-def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
-                     basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
-                     constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
-                     curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
-    """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
-
-    Named variables: ``Theta``, ``a``, ``offset``.
-
-    Args:
-        data: the record.
-        na: number of past outputs in A.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
-        nk: delay in samples, one per input or one for all.
-        svd: "whitened" (in the Kronecker metric of the Gram matrix) or "plain" (as in the dissertation).
-        constraints: builders in the variables ``a``, ``Theta``, ``offset``.
-        loss: as in `exact`.
-        ridge: weight of ``‖Theta‖²``.
-        curvature: weight of the integral of ``f''²``.
-        gauge: gauge of the reported model.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge or split, nonconvex constraints.
-        RankError: the record does not determine the parameters.
-    """
-    if svd not in ("whitened", "plain"):
-        raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
-    return _relaxed("hammerstein_arx.overparametrised", data, constraints, loss, gauge, 0.0, svd,
-                    {"na": na, "nb": nb, "nk": nk, "basis": basis, "ridge": ridge, "curvature": curvature,
-                     "degree": degree(loss)})
-
-
-def _relaxed(name: str, data: Data | Stream, constraints: Sequence[Any], loss: str, gauge: str, weight: float,
-             svd: str, options: dict[str, Any]) -> Program | Procedure:
-    check_gauge(gauge)
-    if not weight >= 0:
-        raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
-
-    def pose(weights: list[np.ndarray] | None = None) -> tuple[Program, EquationError]:
-        problem = compress(data, weights=weights, **options)
-        return _matrix_programme(name, problem, constraints, gauge, weight, svd), problem
-
-    return with_loss(loss, data, pose, convex=True)
-
-
-def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[Any], gauge: str, weight: float,
-                      svd: str) -> Program:
-    linear = problem.linear_variables()
-    keys = [problem.key("Theta", c) for c in range(len(problem.channels))]
-    thetas = {key: cp.Variable(shape, name=key) for key, shape in zip(keys, problem.problem.blocks)}
-    tau = cp.Parameter(nonneg=True, name="weight", value=float(weight))
-    nuclear = name.endswith("nuclear")
-    heights = [problem.units.y_scale[0] / scale for scale in problem.units.u_scale]  # of Theta in the record's units
-    penalty = 2 / problem.unit * tau * sum(
-        height * cp.normNuc(t) for t, height in zip(thetas.values(), heights)) if nuclear else 0.0
-    program = residual_programme(
-        problem, name, {**linear, **thetas}, problem.residual(linear, list(thetas.values())), penalty=penalty,
-        start={}, recover=partial(_split_model, problem, reduce(problem.problem), keys, gauge, svd),
-        view=problem.view({**linear, **thetas}),
-        parameters={"weight": tau} if nuclear else {},
-        structure=None if nuclear else LeastSquaresStructure(problem.problem, (*linear, *keys), ()),
-        certify=partial(certify_nuclear, problem.problem, np.array(heights) / problem.unit) if nuclear else None)
-    return program.subject_to(*constraints)
-
-
-def _split_model(problem: EquationError, core: Core, keys: Sequence[str], gauge: str, svd: str, values: Values
-                 ) -> HammersteinARX:
-    mus, bs = [], []
-    for c, key in enumerate(keys):
-        mu, b = _pair(core, c, np.reshape(values[key], problem.problem.blocks[c]), svd == "whitened")
-        mu, b = _in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.channels[c])
-        mus.append(mu)
-        bs.append(b)
-    return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")
-
-
-def _pair(core: Core, c: int, theta: np.ndarray, whitened: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Leading singular pair of Theta, in the Kronecker metric of the Gram matrix where that is asked for."""
-    if whitened and c in core.kept:
-        position = core.kept.index(c)
-        left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
-    else:
-        left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
-    return leading_pair(theta, left, right)

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import one_output, whole_number
-from formulations.gauges import check_gauge
 from formulations.hammerstein_oe import search
 from formulations.noise_models import PredictionErrors, arma, extended_least_squares, other_zeros, procedure
 from formulations.output_error import OutputError
@@ -31,6 +29,8 @@ from optid.bases.basis import Basis
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import OptidError
+from optid.identify.arguments import one_output, whole_number
+from optid.identify.gauges import check_gauge
 from optid.models.roots import contained
 from optid.solving.solve import Procedure
 from optid.statistics import Layout

@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import one_output, whole_number
-from formulations.gauges import check_gauge
 from formulations.output_error import OutputError
 from formulations.output_error_programme import Posing
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
@@ -27,6 +25,8 @@ from optid.bases.basis import Basis
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import RankError
+from optid.identify.arguments import one_output, whole_number
+from optid.identify.gauges import check_gauge
 from optid.models.roots import contained
 from optid.program.units import energy_unit
 from optid.solving.solve import Procedure

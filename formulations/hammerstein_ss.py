@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import one_of
 from formulations.subspace_plan import in_record_units, planned
 from formulations.subspace_procedure import NOISES, identified
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.arguments import one_of
 from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.solving.solve import Procedure
 

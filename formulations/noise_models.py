@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import enough_rows
-from formulations.equation_error import compress
 from formulations.output_error import STABLE, OutputError
 from formulations.output_error_programme import Posing
 from formulations.prediction_error import Descent, agreement, best_of, descend, refine
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError, RankError
+from optid.identify.arguments import enough_rows
+from optid.identify.equation_error import compress
 from optid.models import HammersteinARX, HammersteinTF, roots
 from optid.program.program import Values
 from optid.program.units import energy_unit

@@ -23,12 +23,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.arguments import one_of
 from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import completed, preliminary, prepared
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.arguments import one_of
 from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.realisation import realise
 from optid.identify.validation import fit_percent

@@ -8,15 +8,16 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import flat, model_meta, tangent_product
-from formulations.gauges import scale_fixed
 from formulations.output_error import OutputError
 from formulations.output_error_starts import with_poles
 from formulations.prediction_error import Descent, Posed
+from optid.identify.equation_error.compression import model_meta
+from optid.identify.gauges import scale_fixed
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.models.roots import contained
+from optid.program.expressions import flat, tangent_product
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.program.units import energy_unit, outer_bases

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import ROWS_PER_UNKNOWN, enough_rows, outputs_present, per_channel, whole_number
-from formulations.equation_error import compress
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError
+from optid.identify.arguments import ROWS_PER_UNKNOWN, enough_rows, outputs_present, per_channel, whole_number
+from optid.identify.equation_error import compress
 from optid.program.units import in_units, inner_bases, own_units
 from optid.statistics import Layout
 from optid.statistics.sensitivities import CHUNK, Unknowns

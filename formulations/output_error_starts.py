@@ -8,11 +8,11 @@ import warnings
 
 import numpy as np
 
-from formulations.equation_error import compress
 from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
+from optid.identify.equation_error import compress
 from optid.identify.subspace.methods import default_block_rows, project
 from optid.identify.subspace.realisation import realise
 from optid.models.roots import contained, roots_of

@@ -21,11 +21,11 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import flat, residual_programme
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.data.channels import Transform
 from optid.identify.subspace.observer import ObserverProblem
+from optid.program.expressions import flat
 from optid.program.program import Program, Values
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
@@ -168,7 +168,7 @@ def _factored(realisation: Realisation, name: str, linear: Mapping[str, cp.Varia
         empty = not np.any(point.bs[i])
         start[first] = np.zeros(p) if empty else point.mus[i]
         start[second] = np.full(b, 1 / np.sqrt(b)) if empty else point.bs[i]
-    return residual_programme(
+    return _least_squares_programme(
         step, name, variables, _residual(step, linear, thetas), constraints={"gauge": tuple(gauges)}, start=start,
         recover=realisation.factors, view=_view(realisation, {**variables}, thetas),
         structure=RankOneStructure(step.problem, tuple(linear), tuple(names), "norm"),
@@ -183,10 +183,20 @@ def _lumped(realisation: Realisation, name: str, linear: Mapping[str, cp.Variabl
         whole = realisation.names(i)[2]
         variables[whole] = cp.Variable(shape, name=whole)
         thetas.append(variables[whole])
-    return residual_programme(
+    return _least_squares_programme(
         step, name, variables, _residual(step, linear, thetas), start=start, recover=realisation.factors,
         view=_view(realisation, {**variables}, thetas),
         structure=LeastSquaresStructure(step.problem, tuple(variables)))
+
+
+def _least_squares_programme(step: ObserverProblem, name: str, variables: dict[str, cp.Variable],
+                             residual: cp.Expression, *, constraints: dict[str, Any] | None = None, **parts: Any
+                             ) -> Program:
+    r = cp.Variable(residual.size, name="residual")
+    objective = cp.Minimize(cp.sum_squares(r) + step.problem.remainder)
+    constraints = {"residual": (r == residual,), **(constraints or {})}
+    return Program(name, objective, constraints, {**variables, "residual": r}, structural=frozenset(constraints),
+                   derived={"residual": residual}, scale=step.problem.scale, compressed=step, unit=step.unit, **parts)
 
 
 def least_squares_values(realisation: Realisation) -> dict[str, np.ndarray]:

@@ -25,15 +25,15 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.arguments import one_output
-from formulations.equation_error import model_meta
-from formulations.gauges import check_gauge, scale_fixed
 from formulations.output_error import OutputError
 from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
 from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, with_poles
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.arguments import one_output
+from optid.identify.equation_error.compression import model_meta
+from optid.identify.gauges import check_gauge, scale_fixed
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.roots import contained

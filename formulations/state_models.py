@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from formulations.equation_error import model_meta
 from optid.data.record import Data
+from optid.identify.equation_error.compression import model_meta
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import Expansion
 

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import enough_rows, in_memory, one_of, outputs_present
 from formulations.prediction_error import AGREE, Descent, best_of, descend, refine
 from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
@@ -34,6 +33,7 @@ from formulations.subspace_procedure import identified
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present
 from optid.identify.design.expansion import Bases
 from optid.identify.noise import with_noise
 from optid.models import HammersteinSS, NoiseCovariances

@@ -11,11 +11,11 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.equation_error import flat, tangent_product
 from formulations.prediction_error import Posed
 from formulations.state_error import StateError
 from optid.data.channels import Transform
 from optid.models import HammersteinSS
+from optid.program.expressions import flat, tangent_product
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.program.units import outer_bases

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from formulations.arguments import one_of
 from optid.bases import Linear, UserFunctions, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
+from optid.identify.arguments import one_of
 from optid.identify.design.expansion import feedback_bases
 from optid.identify.subspace.realisation import WEIGHTINGS
 from optid.program.units import in_units, inner_bases, own_units

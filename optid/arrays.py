@@ -67,10 +67,8 @@ def is_scalar_list(values: Any) -> bool:
         return True
     if kinds == {"array"}:
         return False
-    raise DataError(
-        "a list may hold the numbers of one record, or one array per experiment; this one is nested or mixed. "
-        "Wrap each record in numpy.asarray(...)."
-    )
+    raise DataError("a list may hold the numbers of one record, or one array per experiment; this one is nested or "
+                    "mixed. Wrap each record in numpy.asarray(...).")
 
 
 def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> None:
@@ -88,10 +86,8 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
     if not (np.fmax.reduce(samples, axis=None) > LARGEST or np.fmin.reduce(samples, axis=None) < -LARGEST):
         return
     k, c = np.argwhere(np.abs(samples) > LARGEST)[0]
-    raise DataError(
-        f"{labels[c]}: sample {first + k} is {samples[k, c]:g}. "
-        "Write NaN where a sample is missing, or remove the fault that produced it."
-    )
+    raise DataError(f"{labels[c]}: sample {first + k} is {samples[k, c]:g}. Write NaN where a sample is missing, or "
+                    "remove the fault that produced it.")
 
 
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
@@ -120,33 +116,20 @@ def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, 
                 "before passing the record."
             )
         if limits and (hi == info.max or (info.min < 0 and lo == info.min)):
-            _warn_at_limit(column, label, info)
+            _warn(label, (column == info.max) | ((column == info.min) & (info.min < 0)), 0,
+                  f"sample(s) at the limits of {info.dtype}", "the values are saturated or have overflowed. "
+                  "Convert to float before any arithmetic, and set saturated samples to NaN.")
         elif limits and hi - lo > WRAP * (int(info.max) - int(info.min)):
-            _warn_if_wrapped(column, label, info)
+            steps = np.abs(np.diff(column.astype(np.float64)))
+            _warn(label, steps > WRAP * (float(info.max) - float(info.min)), 1,
+                  f"step(s) above {WRAP:.0%} of the range of {info.dtype}",
+                  "the values may have wrapped around. Convert to float before any arithmetic.")
 
 
-def _warn_at_limit(column: np.ndarray, label: str, info: np.iinfo) -> None:
-    at_limit = (column == info.max) | ((column == info.min) & (info.min < 0))
-    warnings.warn(
-        f"{label}: {int(at_limit.sum())} sample(s) at the limits of {info.dtype} "
-        f"(first at sample {int(np.argmax(at_limit))}): the values are saturated or have overflowed. "
-        "Convert to float before any arithmetic, and set saturated samples to NaN.",
-        DataWarning,
-        stacklevel=5,
-    )
-
-
-def _warn_if_wrapped(column: np.ndarray, label: str, info: np.iinfo) -> None:
-    steps = np.abs(np.diff(column.astype(np.float64)))
-    wrapped = steps > WRAP * (float(info.max) - float(info.min))
-    if wrapped.any():
-        warnings.warn(
-            f"{label}: {int(wrapped.sum())} step(s) above {WRAP:.0%} of the range of {info.dtype} "
-            f"(first at sample {int(np.argmax(wrapped)) + 1}): the values may have wrapped around. "
-            "Convert to float before any arithmetic.",
-            DataWarning,
-            stacklevel=5,
-        )
+def _warn(label: str, found: np.ndarray, offset: int, what: str, remedy: str) -> None:
+    if found.any():
+        where = f"first at sample {int(np.argmax(found)) + offset}"
+        warnings.warn(f"{label}: {int(found.sum())} {what} ({where}): {remedy}", DataWarning, stacklevel=5)
 
 
 def _kind(item: Any) -> str:

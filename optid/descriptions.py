@@ -1,4 +1,4 @@
-"""What a registered function says of itself: its signature and docstring, read from its source without importing it."""
+"""Signatures and docstrings of registered functions, read from their source without importing it."""
 
 import ast
 import inspect
@@ -57,10 +57,7 @@ def describe(point: EntryPoint) -> Description:
     Raises:
         ImportError: its module cannot be found.
     """
-    found = _in_source(point.module, point.attr)
-    if found is not None:
-        return found
-    return describe_function(point.load())
+    return _in_source(point.module, point.attr) or describe_function(point.load())
 
 
 def describe_function(function: Callable[..., Any]) -> Description:
@@ -77,19 +74,16 @@ def _in_source(module: str, name: str) -> Description | None:
     if node is None or node.decorator_list:
         return None
     given = node.args
-    parameters = []
     plain = [*given.posonlyargs, *given.args]
-    missing = [None] * (len(plain) - len(given.defaults))
-    for argument, default in zip(plain, [*missing, *given.defaults]):
-        parameters.append(_parameter(argument, inspect.Parameter.POSITIONAL_OR_KEYWORD, default))
-    if given.vararg:
-        parameters.append(_parameter(given.vararg, inspect.Parameter.VAR_POSITIONAL, None))
-    for argument, default in zip(given.kwonlyargs, given.kw_defaults):
-        parameters.append(_parameter(argument, inspect.Parameter.KEYWORD_ONLY, default))
-    if given.kwarg:
-        parameters.append(_parameter(given.kwarg, inspect.Parameter.VAR_KEYWORD, None))
+    first = [None] * (len(plain) - len(given.defaults))
+    kind = inspect.Parameter
+    parameters = [*((a, kind.POSITIONAL_OR_KEYWORD, default) for a, default in zip(plain, [*first, *given.defaults])),
+                  (given.vararg, kind.VAR_POSITIONAL, None),
+                  *((a, kind.KEYWORD_ONLY, default) for a, default in zip(given.kwonlyargs, given.kw_defaults)),
+                  (given.kwarg, kind.VAR_KEYWORD, None)]
+    signature = inspect.Signature([_parameter(a, *rest) for a, *rest in parameters if a is not None])
     siblings = {other: ast.get_docstring(found) or "" for other, found in functions.items()}
-    return Description(inspect.Signature(parameters), siblings[name], siblings)
+    return Description(signature, siblings[name], siblings)
 
 
 @cache

@@ -47,7 +47,7 @@ def dead_zone(seed: int = 0, n: int = 1000, noise: float | None = None) -> Examp
     u = rng.uniform(-1.0, 1.0, n)
     variance_of_f = 0.75**3 / 3  # integral of (|u| - 0.25)^2 over the density 1/2, f has zero mean
     power = variance_of_f * _energy(_DEAD_ZONE.b[0], _DEAD_ZONE.a)
-    return _DEAD_ZONE.example(u[:, None], power / 22 if noise is None else power * noise**2, rng)
+    return _DEAD_ZONE.example(u[:, None], 22, noise, rng, power)
 
 
 def thruster(seed: int = 0, n: int = 600, noise: float | None = None) -> Example:
@@ -66,8 +66,7 @@ def thruster(seed: int = 0, n: int = 600, noise: float | None = None) -> Example
     """
     rng = np.random.default_rng(seed)
     u = _currents(n, seed)
-    power = float(np.mean(_THRUSTER.output(u) ** 2))
-    return _THRUSTER.example(u, power / 30 if noise is None else power * noise**2, rng)
+    return _THRUSTER.example(u, 30, noise, rng, float(np.mean(_THRUSTER.output(u) ** 2)))
 
 
 def broken_thruster(seed: int = 0, n: int = 400) -> Example:
@@ -83,11 +82,8 @@ def broken_thruster(seed: int = 0, n: int = 400) -> Example:
     rng = np.random.default_rng([seed, 2])
     u = _currents(n, seed + 1)
     left = np.where(np.arange(n) < 5 * n // 8, 1.0, 0.5)
-    sigma = thruster(seed).truth["sigma"]
     whole = _filter(_THRUSTER.b[0], _THRUSTER.a, left * _thrust(u[:, 0]))
-    noise = _filter(np.ones(1), _THRUSTER.a, sigma * rng.standard_normal(n))
-    data = Data(u, whole + noise, _THRUSTER.dt, inputs=["current"], outputs=["thrust"], input_units=["A"],
-                output_units=["N"], name="broken_thruster")
+    data = _THRUSTER.data(u, whole + _THRUSTER.noise(thruster(seed).truth["sigma"], n, rng), "broken_thruster")
     truth = {"f": (_thrust,), "noise_free": whole[:, None], "onset": 5 * n // 8, "lost": 0.5}
     return Example(data, truth, dict(_THRUSTER.suggestion))
 
@@ -106,8 +102,7 @@ def two_inputs(seed: int = 0, n: int = 2000, noise: float | None = None) -> Exam
     """
     rng = np.random.default_rng(seed)
     u = np.column_stack([rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0, n)])
-    power = float(np.var(_TWO_INPUTS.output(u)))
-    return _TWO_INPUTS.example(u, power / 25 if noise is None else power * noise**2, rng)
+    return _TWO_INPUTS.example(u, 25, noise, rng)
 
 
 def pendulum(seed: int = 0, n: int = 4000) -> Example:
@@ -182,29 +177,34 @@ class _System:
         """Return the noise-free output (N,) to the inputs (N, m), from rest."""
         return np.sum([_filter(b, self.a, f(x)) for b, f, x in zip(self.b, self.f, u.T)], axis=0)
 
-    def example(self, u: np.ndarray, noise_power: float, rng: np.random.Generator) -> Example:
-        """Return the record with output noise e / A of the power given."""
+    def noise(self, sigma: float, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Return output noise e / A (n,), with e of standard deviation sigma."""
+        return _filter(np.ones(1), self.a, sigma * rng.standard_normal(n))
+
+    def data(self, u: np.ndarray, y: np.ndarray, name: str = "") -> Data:
+        """Return a record with the names and units of the channels."""
+        return Data(u, y, self.dt, inputs=list(self.inputs), outputs=list(self.outputs),
+                    input_units=list(self.inputs.values()), output_units=list(self.outputs.values()),
+                    name=name or self.name)
+
+    def example(self, u: np.ndarray, ratio: float, noise: float | None, rng: np.random.Generator,
+                power: float | None = None) -> Example:
+        """Return the record to inputs u (N, m) with noise on the output.
+
+        Args:
+            u: (N, m) inputs.
+            ratio: of the power of the noise-free output to that of the noise.
+            noise: standard deviation of the noise over the root of that power, in place of the ratio.
+            rng: of the noise.
+            power: of the noise-free output; its variance in this record when not given.
+        """
         clean = self.output(u)
-        sigma = float(np.sqrt(noise_power / _energy(np.ones(1), self.a)))
-        noise = _filter(np.ones(1), self.a, sigma * rng.standard_normal(clean.size))
-        data = Data(
-            u,
-            clean + noise,
-            self.dt,
-            inputs=list(self.inputs),
-            outputs=list(self.outputs),
-            input_units=list(self.inputs.values()),
-            output_units=list(self.outputs.values()),
-            name=self.name,
-        )
-        truth = {
-            "a": self.a.copy(),
-            "b": tuple(b.copy() for b in self.b),
-            "f": self.f,
-            "sigma": sigma,
-            "noise_free": clean[:, None],
-        }
-        return Example(data, truth, dict(self.suggestion))
+        power = float(np.var(clean)) if power is None else power
+        wanted = power / ratio if noise is None else power * noise**2
+        sigma = float(np.sqrt(wanted / _energy(np.ones(1), self.a)))
+        truth = {"a": self.a.copy(), "b": tuple(b.copy() for b in self.b), "f": self.f, "sigma": sigma,
+                 "noise_free": clean[:, None]}
+        return Example(self.data(u, clean + self.noise(sigma, len(u), rng)), truth, dict(self.suggestion))
 
 
 def _currents(n: int, seed: int) -> np.ndarray:
@@ -244,34 +244,14 @@ def _thrust(u: np.ndarray) -> np.ndarray:
 
 
 _DEAD_ZONE = _System(
-    name="dead_zone",
-    dt=0.1,
-    inputs={"u": ""},
-    outputs={"y": ""},
-    a=np.array([-1.5, 0.7]),
-    b=(np.array([16 / 15, 0.8]),),
-    f=(_dead_band,),
-    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]},
-)
+    "dead_zone", 0.1, {"u": ""}, {"y": ""}, np.array([-1.5, 0.7]), (np.array([16 / 15, 0.8]),), (_dead_band,),
+    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})
 
 _THRUSTER = _System(
-    name="thruster",
-    dt=0.1,
-    inputs={"current": "A"},
-    outputs={"thrust": "N"},
-    a=np.array([-1.2, 0.4]),
-    b=(np.array([0.2]),),
-    f=(_thrust,),
-    suggestion={"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10", "constraints": ["monotone:increasing"]},
-)
+    "thruster", 0.1, {"current": "A"}, {"thrust": "N"}, np.array([-1.2, 0.4]), (np.array([0.2]),), (_thrust,),
+    {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10", "constraints": ["monotone:increasing"]})
 
 _TWO_INPUTS = _System(
-    name="two_inputs",
-    dt=1.0,
-    inputs={"valve": "", "heater": "V"},
-    outputs={"temperature": "K"},
-    a=np.array([-1.1, 0.3]),
-    b=(np.array([-0.6, -0.3]), np.array([0.5, 0.4])),
-    f=(_saturation, _power),
-    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]},
-)
+    "two_inputs", 1.0, {"valve": "", "heater": "V"}, {"temperature": "K"}, np.array([-1.1, 0.3]),
+    (np.array([-0.6, -0.3]), np.array([0.5, 0.4])), (_saturation, _power),
+    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})

@@ -14,20 +14,10 @@ from optid.errors import StructureError
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
-def multisine(
-    n: int,
-    low: float = -1.0,
-    high: float = 1.0,
-    *,
-    dt: float = 1.0,
-    lines: Sequence[int] | np.ndarray | None = None,
-    band: tuple[float, float] | None = None,
-    spectrum: Spectrum = None,
-    phases: str = "schroeder",
-    periods: int = 1,
-    crest_steps: int = 0,
-    seed: int = 0,
-) -> np.ndarray:
+def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
+              lines: Sequence[int] | np.ndarray | None = None, band: tuple[float, float] | None = None,
+              spectrum: Spectrum = None, phases: str = "schroeder", periods: int = 1, crest_steps: int = 0,
+              seed: int = 0) -> np.ndarray:
     """Return a sum of cosines on chosen lines of the period, stretched to fill low to high.
 
     Schroeder phases (M. R. Schroeder, IEEE Trans. Inf. Theory 16, 1970) keep the crest factor low; `crest_steps`
@@ -51,9 +41,7 @@ def multisine(
         StructureError: an argument out of its range, both lines and band, or no line in the band.
     """
     _check(n, low, high)
-    if periods < 1 or n % periods:
-        raise StructureError(f"n = {n} samples cannot hold {periods} whole periods; choose n as a multiple of periods.")
-    size = n // periods
+    size = _part(n, periods, "periods", "periods")
     k = _lines(size, dt, lines, band)
     frequencies = k / (size * dt)
     amplitudes = _amplitudes(spectrum, frequencies)
@@ -72,9 +60,8 @@ def multisine(
     return np.tile(_stretched(np.fft.irfft(coefficients, size), low, high), periods)
 
 
-def sinusoid(
-    n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, dt: float = 1.0, phase: float = 0.0
-) -> np.ndarray:
+def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, dt: float = 1.0, phase: float = 0.0
+             ) -> np.ndarray:
     """Return a sine around the middle of low and high.
 
     Never a sufficient excitation by itself: a static polynomial of degree p turns it into p harmonics.
@@ -92,7 +79,7 @@ def sinusoid(
     """
     _check(n, low, high)
     _check_rate(frequency, dt, "frequency")
-    return (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * frequency * dt * np.arange(n) + phase)
+    return _filled(np.sin(2 * np.pi * frequency * dt * np.arange(n) + phase), low, high)
 
 
 def crest_factor(u: np.ndarray) -> float:
@@ -100,9 +87,8 @@ def crest_factor(u: np.ndarray) -> float:
     return float(np.max(np.abs(u - np.mean(u))) / np.std(u))
 
 
-def prbs(
-    n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: int | None = None, seed: int = 0
-) -> np.ndarray:
+def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: int | None = None, seed: int = 0
+         ) -> np.ndarray:
     """Return a pseudo-random binary sequence of a maximum-length shift register.
 
     The register (`scipy.signal.max_len_seq`; Golomb, Shift Register Sequences, 1967) repeats after
@@ -132,17 +118,8 @@ def prbs(
     return np.repeat(np.where(sequence == 1, high, low), hold)[:n].astype(np.float64)
 
 
-def chirp(
-    n: int,
-    low: float = -1.0,
-    high: float = 1.0,
-    *,
-    f0: float,
-    f1: float,
-    dt: float = 1.0,
-    method: str = "linear",
-    repeats: int = 1,
-) -> np.ndarray:
+def chirp(n: int, low: float = -1.0, high: float = 1.0, *, f0: float, f1: float, dt: float = 1.0,
+          method: str = "linear", repeats: int = 1) -> np.ndarray:
     """Return a sine whose frequency runs from f0 to f1, several times over.
 
     Args:
@@ -162,27 +139,16 @@ def chirp(
 
     _check(n, low, high)
     _check_rate(max(f0, f1), dt, "f0 and f1")
-    if repeats < 1 or n % repeats:
-        raise StructureError(f"n = {n} samples cannot hold {repeats} whole sweeps; choose n as a multiple of repeats.")
-    t = dt * np.arange(n // repeats)
+    t = dt * np.arange(_part(n, repeats, "sweeps", "repeats"))
     try:
         sweep = swept(t, f0=f0, t1=dt * t.size, f1=f1, method=method, phi=-90)
     except ValueError as error:
         raise StructureError(f"chirp from {f0} to {f1}, method {method!r}: {error}") from error
-    return np.tile((low + high) / 2 + (high - low) / 2 * sweep, repeats)
+    return np.tile(_filled(sweep, low, high), repeats)
 
 
-def band_limited_noise(
-    n: int,
-    low: float = -1.0,
-    high: float = 1.0,
-    *,
-    cutoff: float | tuple[float, float],
-    dt: float = 1.0,
-    order: int = 4,
-    clip: float = 2.5,
-    seed: int = 0,
-) -> np.ndarray:
+def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: float | tuple[float, float],
+                       dt: float = 1.0, order: int = 4, clip: float = 2.5, seed: int = 0) -> np.ndarray:
     """Return white Gaussian noise through a Butterworth filter, clipped to low to high.
 
     The filter runs in before the record starts, so that the record is stationary.
@@ -217,12 +183,11 @@ def band_limited_noise(
     noise = np.asarray(sosfilt(sections, np.random.default_rng(seed).standard_normal(run_in + n)))[run_in:]
     # The deviation of the process, not of this record: records of one design then share one scale.
     deviation = float(np.linalg.norm(np.asarray(sosfilt(sections, np.eye(1, run_in)[0]))))
-    return (low + high) / 2 + (high - low) / 2 * np.clip(noise / (clip * deviation), -1.0, 1.0)
+    return _filled(np.clip(noise / (clip * deviation), -1.0, 1.0), low, high)
 
 
-def uniform_levels(
-    n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, levels: int | None = None, seed: int = 0
-) -> np.ndarray:
+def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, levels: int | None = None,
+                   seed: int = 0) -> np.ndarray:
     """Return independent uniform values, each held for some samples; with hold 1 uniform white noise.
 
     Args:
@@ -239,10 +204,7 @@ def uniform_levels(
     _check(n, low, high)
     rng = np.random.default_rng(seed)
     draws = _held_draws(n, hold)
-    if levels is None:
-        values = rng.uniform(low, high, draws)
-    else:
-        values = rng.choice(_spaced(low, high, levels), draws)
+    values = rng.uniform(low, high, draws) if levels is None else rng.choice(_spaced(low, high, levels), draws)
     return np.repeat(values, hold)[:n]
 
 
@@ -261,20 +223,23 @@ def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold
     """
     _check(n, low, high)
     up = _spaced(low, high, levels)
-    stairs = np.concatenate([up, up[-2:0:-1]]) if hold is not None else np.concatenate([up, up[-2::-1]])
-    if hold is None:
-        if n < stairs.size:
-            raise StructureError(f"n = {n} samples cannot hold {stairs.size} steps; use fewer levels.")
-        return stairs[np.arange(n) * stairs.size // n]
-    draws = _held_draws(n, hold)
-    return np.repeat(np.resize(stairs, draws), hold)[:n]
+    if hold is not None:
+        return np.repeat(np.resize(np.concatenate([up, up[-2:0:-1]]), _held_draws(n, hold)), hold)[:n]
+    stairs = np.concatenate([up, up[-2::-1]])
+    if n < stairs.size:
+        raise StructureError(f"n = {n} samples cannot hold {stairs.size} steps; use fewer levels.")
+    return stairs[np.arange(n) * stairs.size // n]
 
 
 def _check(n: int, low: float, high: float) -> None:
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-        raise StructureError(f"n = {n!r}: a positive number of samples is needed.")
+    _check_count("n", n)
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise StructureError(f"low = {low}, high = {high}: low must be below high.")
+
+
+def _check_count(name: str, value: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise StructureError(f"{name} = {value!r}: a positive number of samples is needed.")
 
 
 def _check_rate(frequency: float, dt: float, what: str) -> None:
@@ -282,9 +247,20 @@ def _check_rate(frequency: float, dt: float, what: str) -> None:
         raise StructureError(f"{what}: {frequency:g} is not between 0 and half the sampling rate, {0.5 / dt:g}.")
 
 
+def _part(n: int, count: int, what: str, argument: str) -> int:
+    """Return the samples of each of several equal parts of a record."""
+    if count < 1 or n % count:
+        raise StructureError(f"n = {n} samples cannot hold {count} whole {what}; choose n as a multiple of {argument}.")
+    return n // count
+
+
+def _filled(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Map [-1, 1] to [low, high]."""
+    return (low + high) / 2 + (high - low) / 2 * values
+
+
 def _held_draws(n: int, hold: int) -> int:
-    if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
-        raise StructureError(f"hold = {hold!r}: a positive number of samples is needed.")
+    _check_count("hold", hold)
     return -(-n // hold)
 
 
@@ -298,26 +274,23 @@ def _stretched(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return low + (high - low) * (x - x.min()) / (x.max() - x.min())
 
 
-def _lines(
-    size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None
-) -> np.ndarray:
+def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None
+           ) -> np.ndarray:
     most = (size - 1) // 2  # the line at half the sampling rate has no free phase
     if lines is not None and band is not None:
         raise StructureError("give lines or band, not both.")
     if lines is not None:
         k = np.unique(np.asarray(lines))
         if k.dtype.kind not in "iu" or not k.size or k[0] < 1 or k[-1] > most:
-            raise StructureError(f"lines: whole numbers from 1 to {most} are needed for {size} samples a period.")
+            raise StructureError(f"lines: integers from 1 to {most} are needed for {size} samples per period.")
         return k
     everywhere = np.arange(1, most + 1)
     if band is not None:
         frequencies = everywhere / (size * dt)
         everywhere = everywhere[(frequencies >= band[0] - 1e-12) & (frequencies <= band[1] + 1e-12)]
     if not everywhere.size:
-        raise StructureError(
-            f"band = {band}: no line of a period of {size} samples lies in it; lines are multiples of "
-            f"{1 / (size * dt):g} up to {most / (size * dt):g}."
-        )
+        raise StructureError(f"band = {band}: no line of a period of {size} samples lies in it; lines are multiples of "
+                             f"{1 / (size * dt):g} up to {most / (size * dt):g}.")
     return everywhere
 
 

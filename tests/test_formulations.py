@@ -212,7 +212,7 @@ def test_resolve_along_a_path_of_weights():
 
 @pytest.mark.parametrize("change, error, words", [
     ({"nb": 0}, StructureError, "nb of input 'u'.*from 1"),
-    ({"nb": "2"}, StructureError, "nb of input 'u'.*whole number"),
+    ({"nb": "2"}, StructureError, "nb of input 'u' must be a positive integer"),
     ({"nb": [1, 2]}, StructureError, "2 entries for 1 inputs"),
     ({"nk": -1}, StructureError, "nk of input 'u'.*from 0"),
     ({"na": -1}, StructureError, "na is the number of past outputs"),

@@ -7,9 +7,9 @@ from problems import BASIS, dense, plant, raw_problem, record, regression
 from systems import by_hand
 
 import optid
-from formulations import losses
 from optid.bases import Linear
 from optid.errors import DataWarning, StructureError
+from optid.identify.equation_error import reweighting as losses
 
 
 def soiled():

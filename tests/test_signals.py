@@ -136,7 +136,7 @@ def test_steps_go_up_and_down():
         (lambda: signals.multisine(100, periods=3), "whole periods"),
         (lambda: signals.multisine(100, lines=[0, 3]), "from 1 to 49"),
         (lambda: signals.multisine(100, lines=[50]), "from 1 to 49"),
-        (lambda: signals.multisine(100, lines=[1.5]), "whole numbers"),
+        (lambda: signals.multisine(100, lines=[1.5]), "integers"),
         (lambda: signals.multisine(100, lines=[1], band=(0, 1)), "not both"),
         (lambda: signals.multisine(100, band=(0.001, 0.002)), "multiples of 0.01 up to 0.49"),
         (lambda: signals.multisine(100, lines=[1, 2], spectrum=[1.0]), "2 amplitudes"),

@@ -200,7 +200,7 @@ def test_a_study_without_a_title_is_called_as_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("text, line, words", [
-    (SMALL.replace("nb = 1", "nb = -1", 1), 11, "nb of input 'current' must be a whole number from 1"),
+    (SMALL.replace("nb = 1", "nb = -1", 1), 11, "nb of input 'current' must be a positive integer"),
     (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:5,1"', 1), 11, "cannot be posed: "),
     (SMALL.replace("[[data]]", "[data]"), 6, "written as [[data]], with two brackets"),
     (SMALL.replace("[[data]]", "[[datas]]"), 6, "Did you mean 'data'"),

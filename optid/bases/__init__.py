@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.basis import Basis
-from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions, restore
+from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 
@@ -83,6 +83,40 @@ def parse(text: str) -> Basis:
         ) from error
 
 
+def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:
+    """Build the basis that `Basis.to_dict` described.
+
+    Args:
+        description: {"type": name, ...}.
+        functions: the functions of a UserFunctions basis by name, each a callable or (callable, slope).
+
+    Raises:
+        LookupFailed: unknown type.
+        StructureError: arguments that do not fit the type, or functions that are not supplied.
+    """
+    arguments = dict(description)
+    name = str(arguments.pop("type", ""))
+    if arguments.get("interval") is not None:
+        arguments["interval"] = tuple(float(end) for end in arguments["interval"])
+    if name == "userfunctions":
+        names, known = [str(word) for word in arguments.pop("names", [])], functions or {}
+        missing = [word for word in names if word not in known]
+        if missing:
+            raise StructureError(
+                f"The model uses functions that a file does not hold: {', '.join(map(repr, missing))}. "
+                "Supply them: load(path, functions={" + ", ".join(f"{word!r}: ..." for word in missing) + "})."
+            )
+        pairs = [known[word] if isinstance(known[word], tuple) else (known[word], None) for word in names]
+        values, slopes = zip(*pairs) if pairs else ((), ())
+        return UserFunctions(values, tuple(names), None if None in slopes else slopes, **arguments)
+    if name not in _CLASSES:
+        raise LookupFailed(f"No basis {name!r}. {nearest(name, [*_CLASSES, 'userfunctions'])}")
+    try:
+        return _CLASSES[name](**arguments)
+    except TypeError as error:
+        raise StructureError(f"Basis {name!r} cannot be built from {sorted(arguments)}: {error}.") from error
+
+
 def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | str]") -> tuple[Basis, ...]:
     """Return one basis per input; a basis without an interval takes the range of its input.
 
@@ -91,19 +125,11 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
         basis: one basis (or its name, as for `parse`) for all inputs, or one per input.
 
     Raises:
-        StructureError: a wrong number of bases.
+        StructureError: a wrong number of bases, or an entry that is not a basis.
         DataError: an input that is constant or without any sample.
     """
-    inputs = data.inputs
-    several = list(basis) if isinstance(basis, list | tuple) else [basis] * len(inputs)
-    if len(several) != len(inputs):
-        raise StructureError(f"{len(several)} bases for {len(inputs)} inputs ({', '.join(inputs)}): give one each")
     fitted = []
-    for channel, one, lo, hi in zip(inputs, several, *data.ranges()):
-        family: Any = parse(one) if isinstance(one, str) else one
-        if not hasattr(family, "fitted"):
-            raise StructureError(f"the basis of input {channel!r} is {one!r}: give one such as Triangular(10) or "
-                                 "its name, 'triangular:10'")
+    for channel, family, lo, hi in zip(data.inputs, _one_each(basis, data.inputs, "input"), *data.ranges()):
         if lo != lo:
             raise DataError(f"input {channel!r} has no sample at all; choose another column or drop the input")
         if lo == hi:
@@ -121,49 +147,33 @@ def feedback_bases(data: "Data", given: "Basis | str | None | Sequence[Basis | s
         given: one basis (or its name) for all outputs, or one per output; None or "none" where nothing is fed back.
 
     Raises:
-        StructureError: a wrong number of bases, or what is not a basis.
+        StructureError: a wrong number of bases, or an entry that is not a basis.
         DataError: a constant output.
     """
-    several: list[Any] = list(given) if isinstance(given, list | tuple) else [given] * data.l
-    if len(several) != data.l:
-        raise StructureError(f"{len(several)} feedback bases for {data.l} outputs ({', '.join(data.outputs)}): give "
-                             "one each, None for an output that is not fed back.")
     found: list[Basis | None] = []
-    for o, one in enumerate(several):
-        if one is None or one == "none":
-            found.append(None)
-            continue
-        family: Any = parse(one) if isinstance(one, str) else one
-        if not hasattr(family, "fitted"):
-            raise StructureError(f"the feedback basis of output {data.outputs[o]!r} is {one!r}: give one such as "
-                                 "Polynomial(4) or its name, 'polynomial:4'")
-        y = np.concatenate([e.y[:, o] for e in data.experiments])
-        found.append(family.fitted(float(np.nanmin(y)), float(np.nanmax(y))))
+    for o, family in enumerate(_one_each(given, data.outputs, "output", "feedback ")):
+        if family is not None:
+            y = np.concatenate([e.y[:, o] for e in data.experiments])
+            family = family.fitted(float(np.nanmin(y)), float(np.nanmax(y)))
+        found.append(family)
     return found
 
 
-def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:
-    """Build the basis that `Basis.to_dict` described.
-
-    Args:
-        description: {"type": name, ...}.
-        functions: the functions of a UserFunctions basis by name, each a callable or (callable, slope).
-
-    Raises:
-        LookupFailed: unknown type.
-        StructureError: arguments that do not fit the type, or functions that are not supplied.
-    """
-    arguments = dict(description)
-    name = str(arguments.pop("type", ""))
-    if arguments.get("interval") is not None:
-        arguments["interval"] = tuple(float(end) for end in arguments["interval"])
-    if name == "userfunctions":
-        names = [str(word) for word in arguments.pop("names", [])]
-        callables, slopes = restore(names, functions or {})
-        return UserFunctions(callables, tuple(names), slopes, **arguments)
-    if name not in _CLASSES:
-        raise LookupFailed(f"No basis {name!r}. {nearest(name, [*_CLASSES, 'userfunctions'])}")
-    try:
-        return _CLASSES[name](**arguments)
-    except TypeError as error:
-        raise StructureError(f"Basis {name!r} cannot be built from {sorted(arguments)}: {error}.") from error
+def _one_each(given: Any, channels: Sequence[str], channel_kind: str, feedback: str = "") -> list[Any]:
+    """Return one basis per channel; with `feedback`, the word for messages, also None."""
+    several = list(given) if isinstance(given, list | tuple) else [given] * len(channels)
+    if len(several) != len(channels):
+        raise StructureError(f"{len(several)} {feedback}bases for {len(channels)} {channel_kind}s "
+                             f"({', '.join(channels)}): give one each"
+                             + (", None for an output that is not fed back" if feedback else ""))
+    found: list[Basis | None] = []
+    for channel, one in zip(channels, several):
+        if feedback and (one is None or one == "none"):
+            found.append(None)
+            continue
+        family = parse(one) if isinstance(one, str) else one
+        if not isinstance(family, Basis):
+            raise StructureError(f"the {feedback}basis of {channel_kind} {channel!r} is {one!r}: give one such as "
+                                 "Triangular(10) or its name, 'triangular:10'")
+        found.append(family)
+    return found

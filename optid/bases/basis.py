@@ -1,12 +1,11 @@
-"""What every basis of a static nonlinearity offers, and the rules all of them share.
+"""The base class of every basis of a static nonlinearity: the rules all of them share, and the defaults.
 
 A basis spans f(u) = eta(u)^T mu and never contains the constant function: hats and cosines contain it, and then the
 regressor matrix of a model with two or more numerator lags is singular whatever the data. The model carries one offset.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Literal, Protocol, Self, cast
+from dataclasses import fields, replace
+from typing import Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,36 +17,44 @@ Outside = Literal["clamp", "extrapolate", "error"]
 OUTSIDE = ("clamp", "extrapolate", "error")
 
 
-class Basis(Protocol):
+class Basis:
     """A family of P functions eta(u) without the constant, on an interval of the input.
 
-    A frozen dataclass that inherits from it supplies `full_size`, `local`, `slopes`, `penalty` and `to_dict`, and
-    better shape matrices where it has them.
+    A frozen dataclass that inherits from it has the fields `interval` and `outside`, and supplies `full_size`,
+    `_evaluate`, `_derivative` and `_quadrature`, and better shape matrices where it has them.
 
     Attributes:
         interval: (lower, upper) in units of the input; None until `fitted`.
         outside: what happens beyond the interval: "clamp" (f stays at its end value), "extrapolate" or "error".
-        size: number P of functions.
-        full_size: number of functions of the complete family that `local` evaluates.
-        contrast: (full_size, P) matrix T with values(u) = complete(u) @ T.
-        shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient.
+        shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient on
+            the whole interval.
+        dropped: index of the function left out of a complete family that sums to one; None when nothing is redundant.
     """
 
-    @property
-    def interval(self) -> tuple[float, float] | None: ...  # noqa: D102
-    @property
-    def outside(self) -> Outside: ...  # noqa: D102
-    @property
-    def full_size(self) -> int: ...  # noqa: D102
-    @property
-    def shape_exact(self) -> bool:
-        """True when the shape rows are necessary and sufficient on the whole interval."""
-        return False
+    interval: tuple[float, float] | None
+    outside: Outside
+    shape_exact: Any = False
+    dropped: Any = None
+    _sizes: ClassVar[dict[str, tuple[int, str]]] = {}  # integer fields: least value, and what they count
+
+    def __post_init__(self) -> None:
+        for name, (smallest, meaning) in self._sizes.items():
+            p = getattr(self, name)
+            if isinstance(p, bool) or not isinstance(p, (int, np.integer)) or p < smallest:
+                raise StructureError(f"The number of {meaning} must be an integer >= {smallest}; got {p!r}.")
+        if self.outside not in OUTSIDE:
+            raise StructureError(f"outside={self.outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
+        if self.interval is None:
+            return
+        if len(self.interval) != 2 or not np.all(np.isfinite(self.interval)):
+            raise StructureError(f"interval={self.interval!r}: give two finite numbers (lower, upper).")
+        if self.interval[1] <= self.interval[0]:
+            raise StructureError(f"interval={self.interval!r} is empty: the upper end must exceed the lower end.")
 
     @property
-    def dropped(self) -> int | None:
-        """Index of the function left out of a complete family that sums to one; None when nothing is redundant."""
-        return None
+    def full_size(self) -> int:
+        """Number of functions of the complete family that `local` evaluates."""
+        raise NotImplementedError
 
     @property
     def size(self) -> int:
@@ -104,27 +111,38 @@ class Basis(Protocol):
 
         Returns:
             first (N,), weights (N, s): function first[k] + i of the complete family has the value weights[k, i].
-        """
-        ...
-
-    def values(self, u: ArrayLike) -> Array:
-        """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN.
 
         Raises:
             DataError: outside="error" and a sample lies outside the interval.
             StructureError: the basis has no interval yet.
         """
+        x, missing = self._inside(samples(u))
+        first, weights = self._evaluate(x)
+        if missing is not None:
+            weights[missing] = 0.0
+        return first, weights
+
+    def values(self, u: ArrayLike) -> Array:
+        """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN; errors as `local`."""
         u = samples(u)
         first, weights = self.local(u)
-        complete = np.zeros((u.size, self.full_size))
-        columns = first[:, None] + np.arange(weights.shape[1])
-        np.put_along_axis(complete, columns, weights, axis=1)
+        complete = weights
+        if weights.shape[1] < self.full_size:
+            complete = np.zeros((u.size, self.full_size))
+            np.put_along_axis(complete, first[:, None] + np.arange(weights.shape[1]), weights, axis=1)
         complete[np.isnan(u)] = np.nan
         return self._reduced(complete)
 
     def slopes(self, u: ArrayLike) -> Array:
         """Evaluate d eta / du, (N, P); zero where the value is clamped, the slope to the right at kinks."""
-        ...
+        u = samples(u)
+        x, missing = self._inside(u)
+        slopes = self._derivative(x, 1)
+        if self.outside == "clamp" and self.interval is not None:
+            slopes[(u < self.interval[0]) | (u > self.interval[1])] = 0.0
+        if missing is not None:
+            slopes[missing] = np.nan
+        return slopes
 
     def increments(self) -> Array:
         """(r, P): all rows @ mu >= 0 makes f nondecreasing; here the steps of f between points of `grid`."""
@@ -144,19 +162,66 @@ class Basis(Protocol):
 
         Where that derivative does not exist as a function, differences take its place.
         """
-        ...
+        if order not in (1, 2):
+            raise StructureError(f"penalty(order={order!r}): the order is 1 (slope) or 2 (curvature).")
+        edges, nodes = self._quadrature()
+        x, w = np.polynomial.legendre.leggauss(nodes)
+        half = np.diff(edges)[:, None] / 2
+        rows = self._derivative(((edges[:-1] + edges[1:])[:, None] / 2 + half * x).ravel(), order)
+        return rows.T @ ((half * w).ravel()[:, None] * rows)
 
     def grid(self, n: int = 201) -> Array:
         """(n,) points that cover the interval evenly."""
         return np.linspace(*span(self), n)
 
+    def is_outside(self, u: ArrayLike) -> NDArray[np.bool_]:
+        """Mark the samples of u (N,) outside the interval (none when there is no interval).
+
+        A change of units may move an end by a few ulp, which does not count.
+        """
+        lo, hi = self.interval or (-np.inf, np.inf)
+        slack = 1e-12 * max(abs(lo), abs(hi)) if self.interval else 0.0
+        u = samples(u)
+        return (u < lo - slack) | (u > hi + slack)
+
     def n_outside(self, u: ArrayLike) -> int:
         """Count the samples of u (N,) that lie outside the interval (none when there is no interval)."""
-        return 0 if self.interval is None else int(beyond(samples(u), self.interval).sum())
+        return int(self.is_outside(u).sum())
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the basis in JSON types; `optid.bases.from_dict` is the inverse."""
-        ...
+        given = ((field.name, getattr(self, field.name)) for field in fields(cast(Any, self)))
+        return {"type": type(self).__name__.lower(),
+                **{name: value.item() if isinstance(value, np.generic) else value for name, value in given}}
+
+    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
+        """Evaluate the complete family as `local` does, at finite x to which the rule for outside was applied."""
+        raise NotImplementedError
+
+    def _derivative(self, x: Array, order: int) -> Array:
+        """Evaluate the derivatives of eta of order 1 or 2 at finite x, (N, P)."""
+        raise NotImplementedError
+
+    def _quadrature(self) -> tuple[Array, int]:
+        """Ends (c + 1,) of the cells, and Gauss-Legendre points in each, by which `penalty` integrates."""
+        raise NotImplementedError
+
+    def _clipped(self, u: Array) -> Array:
+        """Apply the rule for values outside the interval; NaN stays NaN."""
+        if self.outside == "error" and (out := self.is_outside(u)).any():
+            k, (lo, hi) = int(np.argmax(out)), span(self)
+            raise DataError(f"Sample {k} of the input is {u[k]:g}, outside the interval [{lo:g}, {hi:g}] of the basis "
+                            f"({int(out.sum())} such samples). Use data inside it, or outside='clamp' or "
+                            "'extrapolate'.")
+        return u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
+
+    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """Clip u, put the lower end (or 0) where a sample is missing, and mark them (None: no sample is missing)."""
+        x = self._clipped(u)
+        missing = np.isnan(x)
+        if not missing.any():
+            return x, None
+        return np.where(missing, 0.0 if self.interval is None else self.interval[0], x), missing
 
     def _reduced(self, complete: Array) -> Array:
         """Multiply the complete family by the contrast: remove the column that is redundant."""
@@ -171,24 +236,6 @@ def samples(u: ArrayLike) -> Array:
     return array
 
 
-def check_interval(interval: tuple[float, float] | None, outside: str) -> None:
-    """Refuse an empty interval and an unknown rule for values outside it."""
-    if outside not in OUTSIDE:
-        raise StructureError(f"outside={outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
-    if interval is None:
-        return
-    if len(interval) != 2 or not np.all(np.isfinite(interval)):
-        raise StructureError(f"interval={interval!r}: give two finite numbers (lower, upper).")
-    if interval[1] <= interval[0]:
-        raise StructureError(f"interval={interval!r} is empty: the upper end must exceed the lower end.")
-
-
-def check_count(p: int, smallest: int, meaning: str) -> None:
-    """Refuse a number of functions or cells that is not an integer >= smallest."""
-    if isinstance(p, bool) or not isinstance(p, (int, np.integer)) or p < smallest:
-        raise StructureError(f"The number of {meaning} must be an integer >= {smallest}; got {p!r}.")
-
-
 def span(basis: Basis) -> tuple[float, float]:
     """Return the interval of a basis, or refuse when it has none yet."""
     if basis.interval is None:
@@ -196,54 +243,3 @@ def span(basis: Basis) -> tuple[float, float]:
             f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give interval=(lower, upper)."
         )
     return basis.interval
-
-
-def beyond(u: Array, interval: tuple[float, float]) -> NDArray[np.bool_]:
-    """Mark samples outside the interval; a change of units may move an end by a few ulp, which does not count."""
-    lo, hi = interval
-    slack = 1e-12 * max(abs(lo), abs(hi))
-    return (u < lo - slack) | (u > hi + slack)
-
-
-def brought_inside(u: Array, interval: tuple[float, float], outside: Outside) -> Array:
-    """Apply the rule for values outside the interval; NaN stays NaN."""
-    if outside == "extrapolate":
-        return u
-    if outside == "error":
-        out = beyond(u, interval)
-        if out.any():
-            k = int(np.argmax(out))
-            raise DataError(
-                f"Sample {k} of the input is {u[k]:g}, outside the interval [{interval[0]:g}, {interval[1]:g}] of the "
-                f"basis ({int(out.sum())} such samples). Use data inside it, or outside='clamp' or 'extrapolate'."
-            )
-    return np.clip(u, *interval)
-
-
-def frozen_outside(slopes: Array, u: Array, interval: tuple[float, float], outside: Outside) -> Array:
-    """Set the slopes of clamped samples to zero; NaN rows for missing samples."""
-    if outside == "clamp":
-        slopes[(u < interval[0]) | (u > interval[1])] = 0.0
-    slopes[np.isnan(u)] = np.nan
-    return slopes
-
-
-def integral_of_squares(derivative: Callable[[Array], Array], edges: Array, nodes: int) -> Array:
-    """Integrate derivative(u)^T derivative(u) over the cells between edges by Gauss-Legendre quadrature.
-
-    Args:
-        derivative: maps points (n,) to rows (n, P).
-        edges: (c + 1,) increasing ends of the cells.
-        nodes: points per cell; exact for products of degree 2 nodes - 1.
-    """
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    half = np.diff(edges)[:, None] / 2
-    points = ((edges[:-1] + edges[1:])[:, None] / 2 + half * x).ravel()
-    rows = derivative(points)
-    return rows.T @ ((half * w).ravel()[:, None] * rows)
-
-
-def check_order(order: int) -> None:
-    """Refuse a penalty order other than 1 or 2."""
-    if order not in (1, 2):
-        raise StructureError(f"penalty(order={order!r}): the order is 1 (slope) or 2 (curvature).")

@@ -3,9 +3,8 @@
 Each takes an input, a seed and the sizes of its noises, and returns a record (`optid.Data`).
 """
 
-from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem
+from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem, two_mode_plant
 from optid.plants.physical import ReactionWheelPendulum, pendulum, pendulum_input, van_der_pol
-from optid.plants.two_modes import two_mode_plant
 
 __all__ = [
     "EXAMPLE1",

@@ -2,13 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.plants.sampling import as_input, as_state, check_bounded, gaussian
+from optid.plants.sampling import as_input, as_state, check_bounded, check_nonnegative, check_positive, gaussian
+
+if TYPE_CHECKING:
+    from optid.models.hammerstein_ss import HammersteinSS
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +91,6 @@ def _tanh(u: Array) -> Array:
     return np.tanh(2 * u)
 
 
-def _identity(u: Array) -> Array:
-    return u
-
-
 def rotation(radius: float, angle: float) -> Array:
     """Return the (2, 2) matrix with the poles radius exp(+- i angle)."""
     cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
@@ -114,7 +114,7 @@ TWO_MODES = FeedbackSystem(
     c=np.array([[1.0, 0.0, 0.5, 0.0], [0.0, 0.7, 0.0, 1.0]]),
     d=np.diag([0.1, 0.2]),
     e=np.zeros((4, 2)),
-    f=(_identity, _identity),
+    f=(np.positive, np.positive),
     name="two_modes",
 )
 """Order 4, linear: modes of radius 0.9 and 0.75 at 0.5 and 1.4 rad per sample."""
@@ -126,3 +126,31 @@ NOISE_CASES: dict[str, tuple[float, float]] = {
     "strong": (0.2, 0.5),
 }
 """(process, measurement) noise of the order-estimation examples on `TWO_MODES`."""
+
+
+def two_mode_plant(coupled: bool = False, process: float = 0.0, measurement: float = 0.1) -> "HammersteinSS":
+    """Return a linear plant of order 4 without feedthrough, poles of radius 0.9 and 0.8, with white noise.
+
+    Args:
+        coupled: False: input i, mode i, output i, so that a loss hides a mode; True: every channel sees both modes.
+        process: standard deviation of the process noise on every state.
+        measurement: standard deviation of the measurement noise on every output.
+
+    Raises:
+        StructureError: a negative deviation, or no measurement noise.
+    """
+    from optid.models.hammerstein_ss import HammersteinSS
+    from optid.models.kalman import kalman_gain
+    from optid.models.noise_covariances import NoiseCovariances
+
+    check_nonnegative(process=process)
+    check_positive(measurement=measurement)
+    nothing = np.zeros((2, 2))
+    a = np.block([[rotation(0.9, 0.5), nothing], [nothing, rotation(0.8, 1.3)]])
+    if coupled:
+        b, c = TWO_MODES.b, TWO_MODES.c
+    else:
+        b, c = np.array([[1.0, 0], [0.5, 0], [0, 1], [0, -0.6]]), np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
+    q, r, s = process**2 * np.eye(4), measurement**2 * np.eye(2), np.zeros((4, 2))
+    found = kalman_gain(a, c, q, r, s)
+    return HammersteinSS(a, b, c, K=found.K, noise=NoiseCovariances(q, r, s, found.innovation))

@@ -5,82 +5,62 @@ from numba import njit
 
 from optid.arrays import Array
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _pendulum_rates(x: Array, torque: float, p: Array, out: Array) -> None:
-    """Write the time derivative of (angle, rate, wheel speed); p as `ReactionWheelPendulum.coefficients`."""
-    inertia, weight, wheel, damping, viscous, coulomb, threshold = p
-    friction = viscous * x[2] + coulomb * np.tanh(x[2] / threshold)
-    acceleration = (-weight * np.sin(x[0]) - torque + friction - damping * x[1]) / inertia
-    out[0] = x[1]
-    out[1] = acceleration
-    out[2] = (torque - friction) / wheel - acceleration
+PENDULUM, VAN_DER_POL = 0, 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pendulum(torque: Array, x0: Array, p: Array, dt: float, substeps: int) -> Array:
-    """Return the states (N, 3) at the sampling instants, the motor torque (N,) held in between; classical RK4."""
-    states = np.empty((torque.size, 3))
-    h = dt / substeps
-    x, at = np.empty(3), np.empty(3)
-    a, b, c, d = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
+def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -> None:
+    """Write the time derivative of the state; p as `ReactionWheelPendulum.coefficients`, or (eps,)."""
+    if plant == PENDULUM:  # angle, rate, wheel speed, driven by a torque
+        inertia, weight, wheel, damping, viscous, coulomb, threshold = p
+        friction = viscous * x[2] + coulomb * np.tanh(x[2] / threshold)
+        out[0] = x[1]
+        out[1] = (-weight * np.sin(x[0]) - drive + friction - damping * x[1]) / inertia
+        out[2] = (drive - friction) / wheel - out[1]
+    else:  # the measured output x1 + v is fed back
+        out[0] = x[1] + p[0] * (x[0] - (x[0] + v) ** 3 / 3)
+        out[1] = drive - x[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, dt: float, substeps: int,
+              stages: int) -> Array:
+    """Return the states (N, n) at the sampling instants by the classical Runge-Kutta method, or by Euler's.
+
+    Args:
+        plant: `PENDULUM` or `VAN_DER_POL`.
+        drive: (N,) held between samples.
+        v: (N,) measurement noise that is fed back, held between samples.
+        w: (N, n) process noise, added at the end of each sample.
+        x0: (n,).
+        p: parameters, see `_rates`.
+        dt: sampling time.
+        substeps: steps per sample.
+        stages: 4, or 1 for Euler's method.
+    """
+    n, h = x0.size, dt / substeps
+    states = np.empty((drive.size, n))
+    x, at, rate, step = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
+    for i in range(n):
         x[i] = x0[i]
-    for k in range(torque.size):
-        for i in range(3):
+    for k in range(drive.size):
+        for i in range(n):
             states[k, i] = x[i]
         for _ in range(substeps):
-            _pendulum_rates(x, torque[k], p, a)
-            for i in range(3):
-                at[i] = x[i] + 0.5 * h * a[i]
-            _pendulum_rates(at, torque[k], p, b)
-            for i in range(3):
-                at[i] = x[i] + 0.5 * h * b[i]
-            _pendulum_rates(at, torque[k], p, c)
-            for i in range(3):
-                at[i] = x[i] + h * c[i]
-            _pendulum_rates(at, torque[k], p, d)
-            for i in range(3):
-                x[i] = x[i] + h / 6 * (a[i] + 2 * b[i] + 2 * c[i] + d[i])
-    return states
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def van_der_pol_euler(drive: Array, w: Array, v: Array, x0: Array, eps: float, dt: float) -> Array:
-    """Return the states (N, 2) of the difference equation; the measured output x1 + v is what is fed back."""
-    states = np.empty((drive.size, 2))
-    x1, x2 = x0[0], x0[1]
-    for k in range(drive.size):
-        states[k, 0], states[k, 1] = x1, x2
-        y = x1 + v[k]
-        x1, x2 = (
-            x1 + dt * (x2 + eps * (x1 - y**3 / 3)) + w[k, 0],
-            x2 + dt * (drive[k] - x1) + w[k, 1],
-        )
-    return states
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def van_der_pol_rk4(drive: Array, w: Array, v: Array, x0: Array, eps: float, dt: float, substeps: int) -> Array:
-    """Return the states (N, 2) of the differential equation; the feedback is continuous, v held between samples."""
-    states = np.empty((drive.size, 2))
-    h = dt / substeps
-    x1, x2 = x0[0], x0[1]
-    weights = (1.0, 2.0, 2.0, 1.0)
-    reach = (0.0, 0.5, 0.5, 1.0)
-    for k in range(drive.size):
-        states[k, 0], states[k, 1] = x1, x2
-        for _ in range(substeps):
-            s1 = s2 = r1 = r2 = 0.0
-            for stage in range(4):
-                z1, z2 = x1 + reach[stage] * h * r1, x2 + reach[stage] * h * r2
-                r1, r2 = z2 + eps * (z1 - (z1 + v[k]) ** 3 / 3), drive[k] - z1
-                s1 += weights[stage] * r1
-                s2 += weights[stage] * r2
-            x1 += h / 6 * s1
-            x2 += h / 6 * s2
-        x1 += w[k, 0]
-        x2 += w[k, 1]
+            for i in range(n):
+                step[i] = 0.0
+            for stage in range(stages):
+                reach = h if stage == 3 else 0.0 if stage == 0 else 0.5 * h
+                weight = 1.0 if stage % 3 == 0 else 2.0
+                for i in range(n):
+                    at[i] = x[i] + reach * rate[i]
+                _rates(plant, at, drive[k], v[k], p, rate)
+                for i in range(n):
+                    step[i] += weight * rate[i]
+            for i in range(n):
+                x[i] += h / (6.0 if stages == 4 else 1.0) * step[i]
+        for i in range(n):
+            x[i] += w[k, i]
     return states
 
 

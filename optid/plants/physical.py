@@ -9,9 +9,10 @@ from optid import signals
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import StructureError, nearest
-from optid.plants.sampling import as_input, as_state, check_bounded, check_positive, gaussian
+from optid.plants.sampling import as_input, as_state, check_bounded, check_nonnegative, check_positive, gaussian
 
-METHODS = ("euler", "rk4")
+STAGES = {"euler": 1, "rk4": 4}
+"""Stages of the methods of integration."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,10 @@ class ReactionWheelPendulum:
     threshold: float = 3.0
 
     def __post_init__(self) -> None:
-        for name in ("pendulum_mass", "wheel_inertia", "pendulum_length", "gravity", "saturation", "threshold"):
-            check_positive(**{name: getattr(self, name)})
-        for name in ("wheel_mass", "pendulum_inertia", "wheel_length", "dead_zone", "damping", "viscous", "coulomb"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise StructureError(f"{name} = {getattr(self, name)}: a finite number that is not negative is needed.")
+        values = vars(self)
+        strict = ("pendulum_mass", "wheel_inertia", "pendulum_length", "gravity", "saturation", "threshold")
+        check_positive(**{name: values[name] for name in strict})
+        check_nonnegative(**{name: value for name, value in values.items() if name != "torque_gain"})
 
     @property
     def inertia(self) -> float:
@@ -112,11 +112,13 @@ class ReactionWheelPendulum:
             DataError: a missing command, a wrong shape, or a run that leaves all bounds.
             StructureError: dt or substeps not positive.
         """
-        from optid.plants.kernels import pendulum as run
+        from optid.plants.kernels import PENDULUM, integrate
 
         check_positive(dt=dt, substeps=substeps)
         torque = self.torque(as_input(u, 1)[:, 0])
-        states = run(torque, as_state(x0, 3), self.coefficients, float(dt), int(substeps))
+        quiet = np.zeros((len(torque), 3))
+        states = integrate(PENDULUM, torque, quiet[:, 0], quiet, as_state(x0, 3), self.coefficients, float(dt),
+                           int(substeps), 4)
         check_bounded(states, "pendulum")
         return states
 
@@ -141,8 +143,7 @@ def pendulum(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: 
         StructureError: a parameter out of its range.
     """
     u = as_input(u, 1)
-    if not (np.isfinite(quantum) and quantum >= 0):
-        raise StructureError(f"quantum = {quantum}: the resolution is finite and not negative.")
+    check_nonnegative(quantum=quantum)
     states = (plant or ReactionWheelPendulum()).states(u, dt=dt, substeps=substeps, x0=x0)
     angle = np.round(states[:, 0] / quantum) * quantum if quantum else states[:, 0]
     speed = states[:, 2] + gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
@@ -201,20 +202,17 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
         DataError: a missing input, a wrong shape, or a run that leaves all bounds.
         StructureError: a parameter out of its range.
     """
-    from optid.plants.kernels import van_der_pol_euler, van_der_pol_rk4
+    from optid.plants.kernels import VAN_DER_POL, integrate
 
     u = as_input(u, 1)
     check_positive(dt=dt, substeps=substeps)
-    if method not in METHODS:
-        raise StructureError(f"method = {method!r}. {nearest(method, METHODS)}")
+    if method not in STAGES:
+        raise StructureError(f"method = {method!r}. {nearest(method, STAGES)}")
     rng = np.random.default_rng(seed)
     w = gaussian(rng, len(u), 2, process, 0.0, "process")
     v = gaussian(rng, len(u), 1, measurement, colour, "measurement")[:, 0]
     drive = u[:, 0] + 0.5 * u[:, 0] * np.abs(u[:, 0])
-    start = as_state(x0, 2)
-    if method == "euler":
-        states = van_der_pol_euler(drive, w, v, start, float(eps), float(dt))
-    else:
-        states = van_der_pol_rk4(drive, w, v, start, float(eps), float(dt), int(substeps))
+    states = integrate(VAN_DER_POL, drive, v, w, as_state(x0, 2), np.array([float(eps)]), float(dt),
+                       int(substeps) if method == "rk4" else 1, STAGES[method])
     check_bounded(states, "Van der Pol oscillator")
     return Data(u, states[:, 0] + v, dt, name="vanderpol")

@@ -1,4 +1,4 @@
-"""What every simulated plant does alike: check the input, draw the noise, refuse a run that leaves all bounds."""
+"""Checks of inputs and parameters of the simulated plants, their noise, and the refusal of a run without bounds."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,10 +35,9 @@ def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colou
     Raises:
         StructureError: a negative size, or a pole that is not inside the unit circle.
     """
-    if not (np.isfinite(size) and size >= 0):
-        raise StructureError(f"{what} = {size}: the standard deviation of a noise is finite and not negative.")
+    check_nonnegative(**{what: size})
     if not abs(colour) < 1:
-        raise StructureError(f"colour = {colour}: the pole of the noise lies strictly between -1 and 1.")
+        raise StructureError(f"colour = {colour}: the pole of the noise must lie strictly between -1 and 1.")
     # Drawn even when the size is zero, so that a seed gives the same numbers to the other noises.
     white = rng.standard_normal((n, channels))
     if size == 0 or colour == 0:
@@ -77,4 +76,11 @@ def check_positive(**values: float) -> None:
     """Refuse parameters that are not positive and finite, by name."""
     for name, value in values.items():
         if not (np.isfinite(value) and value > 0):
-            raise StructureError(f"{name} = {value}: a positive number is needed.")
+            raise StructureError(f"{name} = {value}: it must be positive.")
+
+
+def check_nonnegative(**values: float) -> None:
+    """Refuse parameters that are negative or not finite, by name."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value >= 0):
+            raise StructureError(f"{name} = {value}: it must be finite and not negative.")

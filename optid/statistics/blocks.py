@@ -60,9 +60,8 @@ def _block_size(layout: Layout, chunk: int) -> int:
     return max(chunk - layout.first_row, 32 * layout.first_row, 1)
 
 
-def _records(
-    data: Any, layout: Layout, weights: Sequence[Array] | None
-) -> Iterator[tuple[str, Iterable[Sequence[Array]]]]:
+def _records(data: Any, layout: Layout, weights: Sequence[Array] | None
+             ) -> Iterator[tuple[str, Iterable[Sequence[Array]]]]:
     """Yield the name and the chunks (u, y) or (u, y, weights) of every experiment."""
     check_channels(data, layout)
     if not hasattr(data, "experiments"):
@@ -85,10 +84,8 @@ def _records(
 
 def too_short(name: str, count: int, layout: Layout) -> RankError:
     """Return the refusal of an experiment without a complete row."""
-    return RankError(
-        f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. Leave it out, or use "
-        "fewer lags."
-    )
+    return RankError(f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. Leave it "
+                     "out, or use fewer lags.")
 
 
 def _checked_weights(weights: Any, count: int, name: str) -> Array:
@@ -110,17 +107,14 @@ def check_channels(data: Any, layout: Layout) -> None:
     """
     for kind, given, wanted in (("inputs", data.inputs, layout.inputs), ("outputs", data.outputs, layout.outputs)):
         if len(given) != len(wanted):
-            raise DataError(
-                f"The data have {len(given)} {kind} ({', '.join(given)}), the model {len(wanted)} "
-                f"({', '.join(wanted)})."
-            )
+            raise DataError(f"The data have {len(given)} {kind} ({', '.join(given)}), the model {len(wanted)} "
+                            f"({', '.join(wanted)}).")
 
 
 def _check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
     for c, basis in enumerate(layout.bases):
-        if basis.outside == "error" and basis.n_outside(u[:, c]):
-            k = next(k for k in range(len(u)) if basis.n_outside(u[k : k + 1, c]))
-            raise DataError(
-                f"{name}input {layout.inputs[c]!r}, sample {position + k}: {u[k, c]:g} is outside the interval "
-                f"{basis.interval} of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
-            )
+        if basis.outside == "error" and (out := basis.is_outside(u[:, c])).any():
+            k = int(np.argmax(out))
+            raise DataError(f"{name}input {layout.inputs[c]!r}, sample {position + k}: {u[k, c]:g} is outside the "
+                            f"interval {basis.interval} of the basis. Use data inside it, or outside='clamp' or "
+                            "'extrapolate'.")

@@ -55,7 +55,7 @@ class Feedback:
 
     def values(self, y: Array) -> Array:
         """Evaluate zeta_r, (T, r), at outputs y (T, l)."""
-        return _values(self.basis, y[:, self.output]) @ self.vectors - self.intercept - y @ self.slope.T
+        return self.basis.values(y[:, self.output]) @ self.vectors - self.intercept - y @ self.slope.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class Expansion:
         """Evaluate the signals of samples (T, m + l) or (T, m + 2 l)."""
         m, l = self.m, self.l  # noqa: E741
         y = raw[:, m : m + l]
-        parts = [_values(basis, raw[:, c]) for c, basis in enumerate(self.inputs)]
+        parts = [basis.values(raw[:, c]) for c, basis in enumerate(self.inputs)]
         parts += [family.values(y) for family in self.feedback]
         parts.append(y)
         if self.simulated:
@@ -190,19 +190,6 @@ def expand(
         if basis is not None:
             families.append(_orthogonalised([record[:, m : m + l] for record in records], output, basis, output_names))
     return Expansion(tuple(inputs), tuple(families), tuple(input_names), tuple(output_names))
-
-
-def _values(basis: Basis, u: Array) -> Array:
-    """Evaluate a basis as `Basis.values`; a family without a redundant or local function as it comes."""
-    if basis.dropped is not None:
-        return basis.values(u)
-    _, weights = basis.local(u)
-    if weights.shape[1] < basis.full_size:
-        return basis.values(u)
-    missing = np.isnan(u)
-    if missing.any():
-        weights = np.where(missing[:, None], np.nan, weights)
-    return weights
 
 
 def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: Sequence[str]) -> Feedback:

@@ -3,8 +3,6 @@
 import numpy as np
 
 from optid.arrays import Array
-from optid.models.layout import Layout
-from optid.statistics.sums import FORMED, Block, dense_rows
 
 ROUNDING = {"qr": 1e-12, "gram": 1e-7}
 """Part of a column outside the span of those before it, relative to the column, that is rounding, not information."""
@@ -69,36 +67,3 @@ def conditioning(root: Array) -> float:
         return float("inf")
     reciprocal, _ = dtrcon(np.asfortranarray(root / norms))
     return 1 / reciprocal if reciprocal > 0 else float("inf")
-
-
-class Factor:
-    """Running triangular factor of the rows of [Phi | Y], by tall and skinny QR decomposition.
-
-    Attributes:
-        root: (n + l, n + l) upper triangular.
-        rows: rows used so far.
-        candidates: rows that would have been used, had no sample been missing.
-    """
-
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
-        self.rows = self.candidates = 0
-        self.root = np.zeros((layout.n_columns + layout.l,) * 2)
-
-    def add(self, block: Block) -> None:
-        """Add the valid rows of a block."""
-        used = np.flatnonzero(block.valid)
-        self.rows += used.size
-        self.candidates += block.candidates
-        for start in range(0, used.size, FORMED):
-            part = used[start : start + FORMED]
-            formed = self.layout.contrasted(dense_rows(block, part, self.layout.n_complete))
-            if block.weights is not None:
-                formed *= np.sqrt(block.weights[part])[:, None]
-            self.root = add_to_root(self.root, formed)
-
-    def merge(self, other: "Factor") -> None:
-        """Add the factor of other rows, of the same layout."""
-        self.rows += other.rows
-        self.candidates += other.candidates
-        self.root = add_to_root(self.root, other.root)

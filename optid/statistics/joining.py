@@ -1,4 +1,4 @@
-"""Sums over the parts of a record that are read apart.
+"""Sums over the parts of a record that are read separately.
 
 A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is
 associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter than the
@@ -10,7 +10,7 @@ in practice by far less, and a tree over parts by less than one pass.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,24 +19,14 @@ from optid.data.reading.chunks import Chunk
 from optid.data.reading.parts import Part
 from optid.models.layout import Layout
 from optid.statistics.blocks import Stretch, blocks_of, check_channels, length_of_stretches, too_short
-from optid.statistics.sums import Block, make_block, stretches
+from optid.statistics.sums import Total, make_block, stretches
 
-
-class Total(Protocol):
-    """Running sums: `Sums` or `Factor`."""
-
-    def add(self, block: Block) -> None:
-        """Add the valid rows of a block."""
-        ...
-
-    def merge(self, other: Any) -> None:
-        """Add the sums of other blocks."""
-        ...
+Ends = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Neighbouring parts: their sums, and the samples that joining them to what is around takes.
+    """Neighbouring parts: their sums, and the samples at their ends that joining them takes.
 
     Attributes:
         total: sums over the rows inside.
@@ -46,14 +36,15 @@ class Run:
         tail: u and y of the last samples of its last experiment likewise.
     """
 
-    total: Any
+    total: Total
     first: int
     last: int
-    head: tuple[Array, Array]
-    tail: tuple[Array, Array]
+    head: Ends
+    tail: Ends
 
 
-def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Any], chunk: int, threads: int) -> Any:
+def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int
+                   ) -> Any:
     """Return the sums over all parts of a stream, each added up where it is read.
 
     Args:
@@ -73,7 +64,7 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Any], chunk:
     return stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, layout, start), threads).total
 
 
-def _run_of(layout: Layout, start: Callable[[], Any], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
+def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
     reach = layout.first_row
     nothing = np.empty((0, layout.m)), np.empty((0, layout.l))
     head, tail = nothing, nothing
@@ -91,7 +82,7 @@ def _run_of(layout: Layout, start: Callable[[], Any], chunk: int, part: Part, ch
     return Run(total, part.experiment, part.experiment, head, tail)
 
 
-def _joined(layout: Layout, start: Callable[[], Any], runs: Sequence[Run]) -> Run:
+def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> Run:
     total, reach = start(), layout.first_row
     total.merge(runs[0].total)
     whole = replace(runs[0], total=total)
@@ -110,16 +101,13 @@ def _joined(layout: Layout, start: Callable[[], Any], runs: Sequence[Run]) -> Ru
     return whole
 
 
-def _first(before: tuple[Array, Array], behind: tuple[Array, Array], count: int) -> tuple[Array, Array]:
-    if len(before[0]) >= count:
-        return before
-    u, y = (np.concatenate(pair)[:count] for pair in zip(before, behind))
+def _first(before: Ends, behind: Ends, count: int) -> Ends:
+    u, y = (np.concatenate([a, b[:count]])[:count] for a, b in zip(before, behind))
     return u, y
 
 
-def _last(before: tuple[Array, Array], behind: tuple[Array, Array], count: int) -> tuple[Array, Array]:
-    if len(behind[0]) >= count:  # copies: a view would keep the whole chunk in memory
-        u, y = (samples[len(samples) - count :].copy() for samples in behind)
-    else:
-        u, y = (joint[max(len(joint) - count, 0) :] for joint in map(np.concatenate, zip(before, behind)))
+def _last(before: Ends, behind: Ends, count: int) -> Ends:
+    # copies: a view would keep the whole chunk in memory
+    joints = (np.concatenate([a, b[max(len(b) - count, 0) :]]) for a, b in zip(before, behind))
+    u, y = (joint[max(len(joint) - count, 0) :] for joint in joints)
     return u, y

@@ -1,4 +1,4 @@
-"""Compiled inner loops: lagged products of families of functions of which few differ from zero, and sparse rows.
+"""Compiled inner loops: lagged products of families of functions of which few differ from zero, sparse outer products.
 
 Compiled at the first call and cached on disk. Every function is single threaded, so that the answer does not depend on
 the machine. Indices are unsigned: signed ones are tested for counting from the end, which takes half of the time.
@@ -13,33 +13,6 @@ from optid.arrays import Array
 Indices = NDArray[np.int32]
 unsigned = np.uintp
 ONE = unsigned(1)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def hats(u: Array, lo: float, scale: float, cells: int) -> tuple[Indices, Array]:
-    """Evaluate the two hats of the cell of each sample.
-
-    Args:
-        u: (T,) samples, brought inside where that is wanted; NaN = missing.
-        lo: lower end of the first cell.
-        scale: cells per unit of u.
-        cells: number of cells.
-
-    Returns:
-        first (T,), weights (T, 2): zeros where a sample is missing.
-    """
-    first, weights = np.empty(u.size, dtype=np.int32), np.empty((u.size, 2))
-    for t in range(unsigned(u.size)):
-        x = (u[t] - lo) * scale
-        if np.isnan(x):
-            first[t] = 0
-            weights[t, 0] = weights[t, 1] = 0.0
-        else:
-            cell = int(min(max(x, 0.0), cells - 1.0))
-            first[t] = cell
-            weights[t, 1] = x - cell
-            weights[t, 0] = 1.0 - weights[t, 1]
-    return first, weights
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -108,24 +81,6 @@ def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: 
                 out[row, d] += weight * flat[start + d]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def dense_by_dense(signals: Array, flat: Array, step: int, out: Array) -> None:
-    """Add sum_t g(t) * flat[t * step : t * step + width]^T to out: a few dense signals g, in one thread.
-
-    Args:
-        signals: (T, s) values of g.
-        flat: samples of the other signals, one after the other.
-        step: number of the other signals.
-        out: (s, width).
-    """
-    for i in range(unsigned(signals.shape[1])):
-        for d in range(unsigned(out.shape[1])):
-            total = 0.0
-            for t in range(unsigned(signals.shape[0])):
-                total += signals[t, i] * flat[t * unsigned(step) + d]
-            out[i, d] += total
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> None:
     """Add scale[k] * x_k x_k^T to the upper triangle of gram for sparse rows x_k.
@@ -146,44 +101,6 @@ def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> Non
 @njit(cache=True, nogil=True, error_model="numpy")
 def local_total(first: Indices, weights: Array, out: Array) -> None:
     """Add the sum of a local family over time, first (T,) and weights (T, s), to out (functions,)."""
-    if weights.shape[1] == 2:
+    for i in range(unsigned(weights.shape[1])):
         for t in range(unsigned(first.size)):
-            row = unsigned(first[t])
-            out[row] += weights[t, 0]
-            out[row + ONE] += weights[t, 1]
-        return
-    for t in range(unsigned(first.size)):
-        for i in range(unsigned(weights.shape[1])):
             out[unsigned(first[t]) + i] += weights[t, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def list_entries(
-    first: Indices,
-    weights: Array,
-    samples: NDArray[np.int64],
-    lags: int,
-    start: int,
-    size: int,
-    columns: Indices,
-    values: Array,
-) -> None:
-    """List the entries of rows that one group of signals contributes, lag by lag.
-
-    Args:
-        first: (T,) position of the first function.
-        weights: (T, s) values from there on.
-        samples: (K,) sample of each row at the smallest lag.
-        lags: number of lags.
-        start: column of the first function at the smallest lag.
-        size: columns from one lag to the next.
-        columns: (K, lags * s) column numbers, written.
-        values: (K, lags * s) values there, written.
-    """
-    width = weights.shape[1]
-    for k in range(samples.size):
-        for lag in range(lags):
-            t = unsigned(samples[k] - lag)
-            for i in range(width):
-                columns[k, lag * width + i] = start + lag * size + first[t] + i
-                values[k, lag * width + i] = weights[t, i]

@@ -18,8 +18,8 @@ from optid.data.workers import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
-from optid.statistics.factors import Factor, add_to_root, conditioning, dependent_column, root_of_gram
-from optid.statistics.sums import Sums, rows_present, stretches
+from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.sums import Factor, Sums, Total, rows_present, stretches
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -65,9 +65,8 @@ class Statistics:
         factor = None  # digits that one Gram matrix has lost do not come back
         if self.factor is not None and other.factor is not None:
             factor = add_to_root(self.factor, other.factor)
-        return Statistics(
-            self.layout, self.gram + other.gram, self.rows + other.rows, self.candidates + other.candidates, factor
-        )
+        return Statistics(self.layout, self.gram + other.gram, self.rows + other.rows,
+                          self.candidates + other.candidates, factor)
 
     @property
     def method(self) -> Literal["gram", "qr"]:
@@ -117,10 +116,8 @@ class Statistics:
         if self.rows < ROWS_PER_COLUMN * n:
             needed = int(np.ceil(ROWS_PER_COLUMN * n))
             missing = f"Missing samples cost {100 * lost:.0f} % of {self.candidates} rows. " if lost > 0 else ""
-            raise RankError(
-                f"{self.rows} rows for {n} parameters: at least {needed} are needed. {missing}"
-                "Use a longer record, fewer lags or fewer basis functions."
-            )
+            raise RankError(f"{self.rows} rows for {n} parameters: at least {needed} are needed. {missing}"
+                            "Use a longer record, fewer lags or fewer basis functions.")
         energy = np.diag(self.gram)[:n]
         silent = np.flatnonzero(energy[: self.layout.na * self.layout.l] == 0)
         if silent.size:
@@ -131,22 +128,14 @@ class Statistics:
             if functions.size:
                 raise RankError(_explain_silence(basis, channel, int(functions[0]), self.layout.lags[c][lags[0]]))
         if lost > KEPT:
-            warnings.warn(
-                f"Missing samples leave {self.rows} of {self.candidates} rows ({100 * (1 - lost):.0f} %): a row is "
-                f"lost with any sample among its {self.layout.first_row} lags. Fewer lags keep more.",
-                DataWarning,
-                stacklevel=3,
-            )
+            warnings.warn(f"Missing samples leave {self.rows} of {self.candidates} rows ({100 * (1 - lost):.0f} %): a "
+                          f"row is lost with any sample among its {self.layout.first_row} lags. Fewer lags keep more.",
+                          DataWarning, stacklevel=3)
 
 
-def collect(
-    data: "Data | Stream",
-    layout: Layout,
-    weights: Sequence[Array] | None = None,
-    method: Literal["auto", "gram", "qr"] = "auto",
-    chunk: int = CHUNK,
-    threads: int | None = None,
-) -> Statistics:
+def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None,
+            method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK, threads: int | None = None
+            ) -> Statistics:
     """Take the statistics of a record that determines the parameters.
 
     A row is used when every sample it touches is present, in all inputs and outputs.
@@ -156,8 +145,8 @@ def collect(
         layout: the columns.
         weights: one array (N,) per experiment, weight >= 0 of the row of each sample; None for ones. Not for streams.
         method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next rows, slower and
-            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or what no
-            parameter explains is a share of the outputs that rounding reaches.
+            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or the
+            unexplained share of an output is so small that rounding reaches it.
             `Statistics.method` says which it was.
         chunk: samples evaluated at a time.
         threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
@@ -185,13 +174,8 @@ def collect(
     return statistics
 
 
-def accumulate(
-    data: "Data | Stream",
-    layout: Layout,
-    weights: Sequence[Array] | None = None,
-    chunk: int = CHUNK,
-    threads: int | None = None,
-) -> Statistics:
+def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK,
+               threads: int | None = None) -> Statistics:
     """Take the Gram matrix in one pass, without asking whether the record determines the parameters.
 
     This is for parts of a record that are to be added; arguments and errors as `collect`.
@@ -206,9 +190,8 @@ def accumulate(
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 
-def factorise(
-    data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
-) -> Statistics:
+def factorise(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK
+              ) -> Statistics:
     """Take the triangular factor in one pass, by tall and skinny QR decomposition.
 
     Arguments and errors as `collect`, without its checks of rank.
@@ -239,10 +222,8 @@ def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) ->
 def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) -> Array:
     reach, outs = layout.first_row, layout.l
     result = np.full(y.shape, np.nan)
-    tables = [
-        np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
-        for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))
-    ]  # (full size, lags, l)
+    tables = [np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
+              for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))]  # (full size, lags, l)
     start = reach
     for part_u, part_y in stretches([(u, y)], reach, max(chunk, reach)):
         count = len(part_y) - reach
@@ -262,9 +243,9 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
 
 
 def _total(
-    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Any]
+    data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int, threads: int, start: Callable[[], Total]
 ) -> Any:
-    """Return the sums, of what `start` begins, over all rows of a record."""
+    """Return the sums over all rows of a record; `start` returns empty ones."""
     np.empty(RETAINED, dtype=np.uint8)  # freed at once
     if getattr(data, "parts", ()):
         from optid.statistics.joining import total_of_parts
@@ -273,7 +254,7 @@ def _total(
             raise DataError(NO_WEIGHTS)
         return total_of_parts(data, layout, start, chunk, threads)
 
-    def sum_part(part: Stretch) -> Any:
+    def sum_part(part: Stretch) -> Total:
         sums = start()
         for block in blocks_of(part, layout, chunk):
             sums.add(block)
@@ -290,11 +271,9 @@ def _explain_silence(basis: Basis, channel: str, function: int, lag: int) -> str
     alive = points[basis.values(points)[:, function] != 0]
     where = f", which lives on [{alive[0]:.4g}, {alive[-1]:.4g}]," if alive.size else ""
     whole = "[{:.4g}, {:.4g}]".format(*basis.interval) if basis.interval else "the real line"
-    return (
-        f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} is "
-        f"never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower interval, "
-        "or data that cover it."
-    )
+    return (f"Function {function + 1} of {basis.size} of {type(basis).__name__} on {whole}, input {channel!r}{where} "
+            f"is never excited at lag {lag}: no sample of a used row reaches it. Use fewer functions, a narrower "
+            "interval, or data that cover it.")
 
 
 def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
@@ -302,8 +281,6 @@ def _explain_dependence(layout: Layout, root: Array, column: int) -> str:
     scale = np.linalg.norm(root[:, : column + 1], axis=0)
     combination = np.linalg.lstsq(root[:column, :column] / scale[:column], root[:column, column] / scale[column])[0]
     partners = [names[j] for j in np.argsort(-np.abs(combination))[:3] if abs(combination[j]) > 1e-3]
-    return (
-        f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
-        "the record does not tell them apart. Use fewer lags or basis functions, or an input with more levels and "
-        "frequencies."
-    )
+    return (f"Column {names[column]} of the regressor depends on {', '.join(partners) or 'the columns before it'}: "
+            "the record does not distinguish them. Use fewer lags or basis functions, or an input with more levels and "
+            "frequencies.")

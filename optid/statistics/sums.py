@@ -9,6 +9,7 @@ rows are added directly.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.errors import StructureError
 from optid.models.layout import Layout
+from optid.statistics.factors import add_to_root
 
 FORMED = 2048
 """Rows that are formed at once where a dense product is the cheapest way."""
@@ -74,7 +76,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of a stretch of time, with zeros before, behind and in place of what is missing.
+    """Samples of a stretch of time, with zeros before, behind and in place of missing ones.
 
     Attributes:
         groups: the outputs, then the functions of each input.
@@ -161,31 +163,19 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
 
 
 def sparse_rows(block: Block, rows: NDArray[np.intp], n: int) -> tuple[NDArray[np.int32], Array]:
-    """List what need not vanish in some rows of length n: increasing column numbers (K, z) and values (K, z)."""
-    from optid.statistics import kernels
-
+    """List the entries of some rows of length n that may differ from zero: columns (K, z), increasing, and values."""
     outputs, *inputs = block.groups
-    entries = 1 + sum(group.weights.shape[1] * len(group.lags) for group in block.groups)
-    columns, values = np.empty((rows.size, entries), dtype=np.int32), np.empty((rows.size, entries))
-    constant, end = entries - 1 - outputs.size, 0
-    columns[:, constant], values[:, constant] = n - 1 - outputs.size, 1.0
-    parts = [(outputs, outputs.lags[1:]), *((group, group.lags) for group in inputs), (outputs, outputs.lags[:1])]
-    for group, lags in parts:
-        if group is outputs and lags.start == 0:
-            end += 1  # the constant
-        begin, end = end, end + group.weights.shape[1] * len(lags)
-        if lags:
-            kernels.list_entries(
-                group.first,
-                group.weights,
-                rows + (block.reach - lags[0]),
-                len(lags),
-                group.columns[lags[0] - group.lags[0], 0],
-                group.size,
-                columns[:, begin:end],
-                values[:, begin:end],
-            )
-    return columns, values
+    constant = np.full((rows.size, 1), n - 1 - outputs.size, dtype=np.int32), np.ones((rows.size, 1))
+    past = [_entries(outputs, rows + (block.reach - lag), lag) for lag in outputs.lags[1:]]
+    present = [_entries(group, rows + (block.reach - lag), lag) for group in inputs for lag in group.lags]
+    columns, values = zip(*past, *present, constant, _entries(outputs, rows + block.reach, 0))
+    return np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
+
+
+def _entries(group: Signals, at: NDArray[np.intp], lag: int) -> tuple[NDArray[np.int32], Array]:
+    """Columns and values (K, s) that a group contributes at one lag, from samples `at`."""
+    width = np.arange(group.weights.shape[1], dtype=np.int32)
+    return group.columns[lag - group.lags[0], 0] + group.first[at, None] + width, group.weights[at]
 
 
 def dense_rows(block: Block, rows: NDArray[np.intp], n: int) -> Array:
@@ -214,30 +204,81 @@ def lagged_products(g: Signals, h: Signals, lags: range, reach: int) -> Array:
     if not g.local and g.size * h.size > NARROW:
         for d, lag in enumerate(lags):
             sums[:, d] = g.weights[start:stop].T @ h.weights[start - lag : stop - lag]
+    elif not g.local:
+        for i, j in np.ndindex(g.size, h.size):
+            ahead = h.weights[start - lags[-1] : stop - lags[0], j]
+            sums[i, :, j] = np.correlate(ahead, g.weights[start:stop, i], "valid")[::-1]
     elif not h.local:  # the values of h at all these lags are neighbours in memory, the oldest first
         windows = h.weights.reshape(-1)[(start - lags[-1]) * h.size :]
-        if g.local:
-            first = g.first[start:stop]
-            kernels.local_by_dense(first, g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
-        else:
-            kernels.dense_by_dense(g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
+        kernels.local_by_dense(g.first[start:stop], g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
         sums = sums[:, ::-1]
     else:
         kernels.local_by_local(g.first, g.weights, h.first, h.weights, start, stop, lags[0], sums)
     return sums
 
 
-class Sums:
-    """Running sums over blocks: the complete Gram matrix of [Phi | Y] with redundant functions, y not negated.
+class Total:
+    """Running sums over blocks of one layout.
 
     Attributes:
         rows: rows used so far.
         candidates: rows that would have been used, had no sample been missing.
     """
 
-    def __init__(self, layout: Layout, direct: bool = False) -> None:
-        self.layout, self.direct = layout, direct
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
         self.rows = self.candidates = 0
+
+    def add(self, block: Block) -> None:
+        """Add the valid rows of a block."""
+        count = int(np.count_nonzero(block.valid))
+        self.rows += count
+        self.candidates += block.candidates
+        self._add(block, count)
+
+    def merge(self, other: Self) -> None:
+        """Add the sums of other blocks, of the same layout."""
+        self.rows += other.rows
+        self.candidates += other.candidates
+        self._merge(other)
+
+    def _add(self, block: Block, count: int) -> None:
+        raise NotImplementedError
+
+    def _merge(self, other: Any) -> None:
+        raise NotImplementedError
+
+
+class Factor(Total):
+    """Running triangular factor of the rows of [Phi | Y], by tall and skinny QR decomposition.
+
+    Attributes:
+        root: (n + l, n + l) upper triangular.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__(layout)
+        self.root = np.zeros((layout.n_columns + layout.l,) * 2)
+
+    def _add(self, block: Block, count: int) -> None:
+        used = np.flatnonzero(block.valid)
+        for start in range(0, used.size, FORMED):
+            part = used[start : start + FORMED]
+            formed = self.layout.contrasted(dense_rows(block, part, self.layout.n_complete))
+            if block.weights is not None:
+                formed *= np.sqrt(block.weights[part])[:, None]
+            self.root = add_to_root(self.root, formed)
+
+    def _merge(self, other: "Factor") -> None:
+        self.root = add_to_root(self.root, other.root)
+
+
+class Sums(Total):
+    """The complete Gram matrix of [Phi | Y] with redundant functions, y not negated."""
+
+    def __init__(self, layout: Layout, direct: bool = False) -> None:
+        super().__init__(layout)
+        self.direct = direct
         n = layout.n_complete
         self._gram = np.zeros((n, n))  # upper triangle
         self._removed = np.zeros(n)  # energy of the rows that were subtracted
@@ -245,25 +286,16 @@ class Sums:
         self._totals = [np.zeros(columns.shape[1]) for columns in layout.complete_columns]
         self._stretched = 0  # rows, with those around the ends, that were added by lag difference
 
-    def add(self, block: Block) -> None:
-        """Add the valid rows of a block."""
-        count = int(np.count_nonzero(block.valid))
-        self.rows += count
-        self.candidates += block.candidates
-        if block.weights is not None:
+    def _add(self, block: Block, count: int) -> None:
+        if block.weights is not None or self.direct or self._is_small(count) or self._direct_is_cheaper(block, count):
             used = np.flatnonzero(block.valid)
-            self._add_rows(block, used, block.weights[used])
-        elif self.direct or self._is_small(count) or self._direct_is_cheaper(block, count):
-            self._add_rows(block, np.flatnonzero(block.valid), np.ones(count))
+            self._add_rows(block, used, np.ones(count) if block.weights is None else block.weights[used])
         else:
             self._add_by_difference(block)
             others = np.flatnonzero(~block.valid)
             self._add_rows(block, others, np.full(others.size, -1.0))
 
-    def merge(self, other: "Sums") -> None:
-        """Add the sums of other blocks, of the same layout."""
-        self.rows += other.rows
-        self.candidates += other.candidates
+    def _merge(self, other: "Sums") -> None:
         self._gram += other._gram
         self._removed += other._removed
         for pair, products in other._products.items():
@@ -302,10 +334,8 @@ class Sums:
     def _direct_is_cheaper(self, block: Block, used: int) -> bool:
         widths = [group.weights.shape[1] for group in block.groups]
         row = sum(width * len(group.lags) for width, group in zip(widths, block.groups)) ** 2 / 2
-        step = sum(
-            widths[g] * widths[h] * len(differences(block.groups[g], block.groups[h]))
-            for g, h in combinations_with_replacement(range(len(widths)), 2)
-        )
+        step = sum(widths[g] * widths[h] * len(differences(block.groups[g], block.groups[h]))
+                   for g, h in combinations_with_replacement(range(len(widths)), 2))
         return used * row < block.valid.size * step + (block.valid.size - used) * row
 
     def _add_by_difference(self, block: Block) -> None:

@@ -6,6 +6,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.errors import StructureError
+from optid.models.gauges import gauge_factor
 
 GAUGES = ("norm", "gain", "b0")
 
@@ -35,3 +36,23 @@ def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np
     if b.ndim > 1:
         raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
     return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
+
+
+def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, channel: str
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mu and b of one input, scaled to satisfy a gauge.
+
+    Args:
+        gauge: one of `GAUGES`.
+        mu: (P,) coefficients of the nonlinearity.
+        b: (nb,) or (nb, l) coefficients of B.
+        a: coefficients of A, None without poles.
+        channel: name of the input, for the message.
+
+    Raises:
+        StructureError: the quantity that the gauge sets to one is zero.
+    """
+    if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
+        return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
+    factor = gauge_factor(gauge, np.zeros(0) if a is None else a, b, channel)
+    return mu * factor, b / factor

@@ -4,37 +4,28 @@
 ``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
-from formulations.arguments import per_channel, whole_number
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
+from optid.identify.arguments import per_channel, whole_number
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.gauges import leading_sign
-from optid.program.program import Program
+from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.program.view import View
 from optid.statistics import Layout, Statistics, collect
 from optid.structures.rank_one import RankOne
-
-
-class Compressed(Protocol):
-    """A record compressed to least squares in rank-one blocks."""
-
-    @property
-    def problem(self) -> RankOne: ...  # noqa: D102
-    @property
-    def unit(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -42,17 +33,19 @@ class EquationError:
     """Least squares in z with the names needed to read it.
 
     Attributes:
-        statistics: what one pass over the record left.
+        statistics: of one pass over the record.
         problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
+        columns: (n_columns, l) position in z of every coefficient of the regressor.
         meta: dt, names and units for the model.
         units: from those of the problem (`optid.program.units`) to those of the record.
         bases: one per input, in the units of the record.
-        unit: what one unit of the objective is in units of the record.
+        unit: size of one unit of the objective in units of the record.
         unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
     """
 
     statistics: Statistics
     problem: RankOne
+    columns: np.ndarray
     meta: Mapping[str, Any]
     units: Transform
     bases: tuple[Basis, ...]
@@ -64,48 +57,35 @@ class EquationError:
         """Column layout of the regressor."""
         return self.statistics.layout
 
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return self.layout.inputs
-
-    @property
-    def outputs(self) -> int:
-        """Number of outputs."""
-        return len(self.layout.outputs)
-
-    def key(self, name: str, channel: int) -> str:
-        """Name of a per-channel variable: plain with one input, ``name[input]`` with several."""
-        return name if len(self.channels) == 1 else f"{name}[{self.channels[channel]}]"
+    def keys(self, name: str) -> list[str]:
+        """Names of a per-channel variable: plain with one input, ``name[input]`` with several."""
+        return [name] if self.layout.m == 1 else [f"{name}[{channel}]" for channel in self.layout.inputs]
 
     def linear_variables(self) -> dict[str, cp.Variable]:
         """Return new CVXPY variables ``a`` ((na,) or (l, na l) = [A_1 .. A_na]) and ``offset`` (l,)."""
-        ny, na = self.outputs, self.layout.na
-        found = {}
-        if na:
-            found["a"] = cp.Variable(na if ny == 1 else (ny, na * ny), name="a")
-        found["offset"] = cp.Variable(ny, name="offset")
-        return found
+        ny, na = self.layout.l, self.layout.na
+        a = {"a": cp.Variable(na if ny == 1 else (ny, na * ny), name="a")} if na else {}
+        return {**a, "offset": cp.Variable(ny, name="offset")}
 
     def b_shape(self, channel: int) -> tuple[int, ...]:
         """Shape of b: (nb,) with one output, (nb, l) with several."""
-        nb = self.layout.nb[channel]
-        return (nb,) if self.outputs == 1 else (nb, self.outputs)
+        nb, ny = self.layout.nb[channel], self.layout.l
+        return (nb,) if ny == 1 else (nb, ny)
 
-    def residual(self, linear: Mapping[str, cp.Expression], thetas: Sequence[cp.Expression]) -> cp.Expression:
+    def residual(self, linear: Mapping[str, cp.Expression], thetas: Iterable[cp.Expression]) -> cp.Expression:
         """Return ``R z - s`` for given linear variables and matrices Theta_c (P_c, nb_c l)."""
-        parts = [flat(linear[name]) for name in ("a", "offset") if name in linear] + [flat(t) for t in thetas]
-        return self.problem.root @ cp.hstack(parts) - self.problem.target
+        z = cp.hstack([flat(part) for part in (*linear.values(), *thetas)])
+        return self.problem.root @ z - self.problem.target
 
     def view(self, expressions: Mapping[str, cp.Expression], gauge: str = "") -> View:
-        """Return what constraints may speak about."""
-        full = solve_triangular(self.problem.root, self.problem.target)
-        return View(expressions, channels=self.channels, bases=dict(zip(self.channels, self.bases)),
-                    gauge=gauge, reference=self.linear_part(full[: self.problem.linear]), units=self.units)
+        """Return the expressions that constraints may use."""
+        full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
+        return View(expressions, channels=inputs, bases=dict(zip(inputs, self.bases)), gauge=gauge,
+                    reference=self.linear_part(full[: self.problem.linear]), units=self.units)
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""
-        ny, na = self.outputs, self.layout.na
+        ny, na = self.layout.l, self.layout.na
         found = {"offset": np.array(w[na * ny * ny :])}
         if na:
             found["a"] = np.array(w[:na]) if ny == 1 else np.reshape(w[: na * ny * ny], (ny, na * ny), order="F")
@@ -114,8 +94,8 @@ class EquationError:
     def matrices(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """Return Theta_c (P_c, nb_c l) of every input, whatever variables the formulation uses."""
         found = []
-        for c, shape in enumerate(self.problem.blocks):
-            theta, mu, b = (values.get(self.key(name, c)) for name in ("Theta", "mu", "b"))
+        for shape, *keys in zip(self.problem.blocks, *map(self.keys, ("Theta", "mu", "b"))):
+            theta, mu, b = (values.get(key) for key in keys)
             if theta is None:
                 theta = np.outer(np.ones(1) if mu is None else mu, np.ravel(np.asarray(b), order="F"))
             found.append(np.reshape(theta, shape))
@@ -128,25 +108,17 @@ class EquationError:
 
     def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the coefficients (n_columns, l) of the regressor's columns in the order of the layout."""
-        ny, na = self.outputs, self.layout.na
-        theta = np.zeros((self.layout.n_columns, ny))
-        if na:
-            theta[: na * ny] = np.reshape(values["a"], (ny, na * ny), order="F" if ny > 1 else "C").T
-        for c, matrix in enumerate(self.matrices(values)):
-            theta[self.layout.block(c)] = matrix.reshape(-1, ny, order="F")
-        theta[-1] = values["offset"]
-        return theta
+        return self.lifted(values)[self.columns]
 
     @property
     def energy(self) -> np.ndarray:
-        """Sum of squares of every output about its mean over the rows used, in the units of the problem.
+        """Sum of squares (l,) of every output about its mean over the rows used, in the units of the problem.
 
-        It is what a one-step fit of 0 % leaves.
+        A one-step fit of 0 % leaves this much.
         """
-        statistics = self.unweighted or self.statistics
-        n, root = self.layout.n_columns, statistics.root
-        columns = root[:, n:]
-        return np.sum(columns**2, axis=0) - (root[:n, n - 1] @ columns[:n]) ** 2 / statistics.rows
+        statistics, n = self.unweighted or self.statistics, self.layout.n_columns
+        columns = statistics.root[:, n:]
+        return np.sum(columns**2, axis=0) - (statistics.root[:n, n - 1] @ columns[:n]) ** 2 / statistics.rows
 
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the one-step fit in % of every output over the rows used, from the statistics alone."""
@@ -165,7 +137,7 @@ class EquationError:
             gauge: the gauge to report in.
             flip: make the first non-zero of every b positive.
         """
-        ny, na = self.outputs, self.layout.na
+        ny, na = self.layout.l, self.layout.na
         a = np.asarray(values.get("a", np.zeros(0)))
         if ny > 1:
             a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
@@ -176,16 +148,6 @@ class EquationError:
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),
             nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), gauge=gauge, **self.meta)
         return model.with_transform(self.units)
-
-
-def flat(expression: cp.Expression) -> cp.Expression:
-    """Stack the columns of an expression."""
-    return expression if expression.ndim == 1 else cp.vec(expression, order="F")
-
-
-def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np.ndarray) -> cp.Expression:
-    """Return ``mu bᵀ`` to first order about (mu0, b0)."""
-    return cp.outer(mu, b0) + cp.outer(mu0, b) - np.outer(mu0, b0)
 
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
@@ -225,8 +187,9 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit
-    problem = lifted_problem(statistics, share * ridge, share * curvature, units.u_scale)
-    return EquationError(statistics, problem, model_meta(data), units, bases, unit)
+    columns = _positions(layout)
+    problem = _lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
+    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
 
 
 def model_meta(data: Data | Stream) -> dict[str, Any]:
@@ -236,72 +199,50 @@ def model_meta(data: Data | Stream) -> dict[str, Any]:
             "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
 
 
-def lifted_problem(statistics: Statistics, ridge: float, curvature: float, scales: Sequence[float]) -> RankOne:
+def _positions(layout: Layout) -> np.ndarray:
+    """Return the position (n_columns, l) in z of the coefficient of every column of the regressor in every output."""
+    ny, past = layout.l, layout.na * layout.l
+    found = np.empty((layout.n_columns, ny), dtype=int)
+    found[:past] = np.arange(past * ny).reshape(past, ny)
+    found[-1] = past * ny + np.arange(ny)
+    for c in range(layout.m):
+        block = layout.block(c)
+        start, count = (block.start + 1) * ny, block.stop - block.start
+        found[block] = start + np.arange(count * ny).reshape(ny, count).T
+    return found
+
+
+def _lifted_problem(statistics: Statistics, columns: np.ndarray, ridge: float, curvature: float,
+                    scales: Sequence[float]) -> RankOne:
     """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
 
     Args:
         statistics: of the record.
+        columns: see `EquationError`.
         ridge: weight of ``‖Theta‖²``.
         curvature: weight of the integral of ``f''²``.
         scales: unit of every input: Theta in the units of the record is Theta / scale.
     """
-    layout, ny = statistics.layout, len(statistics.layout.outputs)
-    n, na = layout.n_columns, layout.na
-    sizes = [b.size for b in layout.bases]
-    blocks = tuple((p, q * ny) for p, q in zip(sizes, layout.nb))
-    linear = na * ny * ny + ny
-    total = linear + sum(p * q for p, q in zip(sizes, layout.nb)) * ny
-    where = np.zeros((ny, n), dtype=int)
-    for o in range(ny):
-        where[o, : na * ny] = np.arange(na * ny) * ny + o
-        where[o, n - 1] = na * ny * ny + o
-        position = linear
-        for c, (p, q) in enumerate(zip(sizes, layout.nb)):
-            where[o, layout.block(c)] = position + o * p * q + np.arange(p * q)
-            position += p * q * ny
-    root = statistics.root
-    system = np.zeros((ny * n + (total - linear if ridge else 0), total + 1))
-    remainder = 0.0
-    for o in range(ny):
-        rows = slice(o * n, (o + 1) * n)
-        system[rows, where[o]] = root[:n, :n]
-        system[rows, -1] = root[:n, n + o]
-        remainder += float(np.sum(root[n:, n + o] ** 2))
-    if ridge:
-        each = np.concatenate([np.full(p * q, 1 / scale) for (p, q), scale in zip(blocks, scales)])
-        system[ny * n :, linear:-1] = np.sqrt(ridge) * np.diag(each)
-    if curvature:
-        extra = np.zeros((total - linear, total + 1))
-        position = linear
-        for (p, q), basis in zip(blocks, layout.bases):
-            factor = _square_root(np.asarray(basis.penalty(2)))
-            for _ in range(q):
-                extra[position - linear : position - linear + p, position : position + p] = np.sqrt(curvature) * factor
-                position += p
-        system = np.vstack([system, extra])
+    layout, (n, ny), root = statistics.layout, columns.shape, statistics.root
+    blocks = tuple((basis.size, q * ny) for basis, q in zip(layout.bases, layout.nb))
+    linear, total = (layout.na * ny + 1) * ny, columns.size
+    system = np.zeros((total, total + 1))
+    for o, rows in enumerate(np.split(system, ny)):
+        rows[:, columns[:, o]] = root[:n, :n]
+        rows[:, -1] = root[:n, n + o]
+    remainder = float(np.sum(root[n:, n:] ** 2))
+    if ridge or curvature:
+        penalties = [ridge / scale**2 * np.eye(basis.size) + curvature * np.asarray(basis.penalty(2))
+                     for basis, scale in zip(layout.bases, scales)]
+        roots = [np.kron(np.eye(q), _square_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
+        system = np.vstack([system, np.pad(np.asarray(block_diag(*roots)), ((0, 0), (linear, 1)))])
     triangle = np.triu(np.linalg.qr(system, mode="r"))
     triangle = triangle * np.where(np.diag(triangle[:, : len(triangle)]) < 0, -1.0, 1.0)[:, None]  # one of many signs
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
-    scale = float(sum(np.sum(root[:, n + o] ** 2) for o in range(ny)))
     return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,
-                   blocks=blocks, scale=scale)
+                   blocks=blocks, scale=float(np.sum(root[:, n:] ** 2)))
 
 
 def _square_root(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-
-
-def residual_programme(problem: Compressed, name: str, variables: dict[str, cp.Variable],
-                       residual: cp.Expression, **parts: Any) -> Program:
-    """Assemble a programme ``minimise ‖r‖² + remainder (+ penalty)`` with the residual passed as a variable.
-
-    The remainder is kept in the objective, so that objectives and gaps are in units of the data.
-    """
-    r = cp.Variable(residual.size, name="residual")
-    penalty = parts.pop("penalty", 0.0)
-    constraints = {"residual": (r == residual,), **parts.pop("constraints", {})}
-    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + penalty)
-    return Program(name=name, objective=objective, constraints=constraints, variables={**variables, "residual": r},
-                   structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
-                   compressed=problem, unit=problem.unit, **parts)

@@ -12,25 +12,23 @@ fit show. The fit names all of them among its findings and figures. The loss, it
 of the rows that are left. ``loss="squares"`` leaves nothing out.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from formulations.equation_error import EquationError
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
+from optid.identify.equation_error.compression import EquationError, compress
 from optid.identify.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
 from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, list_samples
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import in_units
 from optid.solving.solve import Evidence, Procedure
-from optid.statistics import Layout, Statistics, residuals
-
-Pose = Callable[[list[np.ndarray] | None], tuple[Program, EquationError]]
+from optid.statistics import Layout, residuals
 
 HUBER = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
 KINK = 1e-6  # half-width at which the rounded kink of l1 ends, in robust standard deviations
@@ -63,12 +61,8 @@ def parse_loss(loss: str) -> tuple[str, float]:
     return kind, threshold
 
 
-def degree(loss: str) -> int:
-    """Return the degree of a loss in the units of the residuals: 1 for "l1", 2 otherwise."""
-    return 1 if parse_loss(loss)[0] == "l1" else 2
-
-
-def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Program | Procedure:
+def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Program], *, convex: bool,
+                   **structure: Any) -> Program | Procedure:
     """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
 
     The other losses leave out the rows that hold a wild reading of an output.
@@ -76,27 +70,38 @@ def with_loss(loss: str, data: Data | Stream, pose: Pose, *, convex: bool) -> Pr
     Args:
         loss: see `parse_loss`.
         data: the record.
-        pose: weights -> (programme, compressed problem).
+        pose: states the programme of a compressed record.
         convex: whether a dual bound exists.
+        structure: arguments of `compress`: na, nb, nk, basis, ridge and curvature.
     """
     kind, threshold = parse_loss(loss)
+    structure["degree"] = 1 if kind == "l1" else 2
     if kind == "squares":
-        return pose(None)[0]
+        return pose(compress(data, **structure))
     if isinstance(data, Stream):
         raise StructureError(f"loss {loss!r} needs row weights, which a stream larger than memory does not keep; "
                              "use loss='squares' or read the record")
-    return _reweighted(data, pose, kind, threshold, convex)
+    return _reweighted(data, pose, structure, kind, threshold, convex)
 
 
-def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: bool) -> Procedure:
-    program, problem = pose(None)
-    used = _Rows(in_units(data, problem.units), problem.layout)
-    if used.weights is not None:
-        program, problem = pose(used.weights)
+def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure: dict[str, Any], kind: str,
+                threshold: float, convex: bool) -> Procedure:
+    whole = compress(data, **structure)
+    used = _Rows(in_units(data, whole.units), whole.layout)
+    problem, base = whole, pose(whole)
+    scale = base.scale  # the weights of a pass are no unit of the data
+
+    def weighted(weights: list[np.ndarray], start: Any) -> Program:
+        """Pose a weighted pass: the answer before is the best start, and no proof belongs to it."""
+        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics)
+        return replace(pose(compressed), start=start, certify=None, scale=scale)
+
     while True:
-        unweighted, scale = problem.statistics, program.scale  # the weights of a pass are no unit of the data
-        weights: list[np.ndarray] = []
-        spread = width = 0.0
+        if used.weights is not None:
+            problem = compress(data, weights=used.weights, **structure)
+            base = pose(problem)
+            scale = base.scale
+        program, weights, spread, width = base, [], 0.0, 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise
             solution: Solution = yield program
             if not solution.has_point:
@@ -104,12 +109,11 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
             errors = used.residuals(problem, solution)
             spread = max(float(np.nanmedian(np.concatenate(_sizes(errors)))) / NORMAL_MEDIAN, 1e-300)
             width = spread * (1.0 if kind == "l1" else threshold)
-            start = dict(solution.values) if weights else program.start
+            start = dict(solution.values) if weights else base.start
             weights = used.only(_weights(r, kind, width) for r in _sizes(errors))
-            program, problem = _weighted(pose, weights, start, scale, unweighted)
+            program = weighted(weights, start)
         if not used.leave_out(errors, problem.regression(solution.values)):
             break
-        program, problem = pose(used.weights)
     best = gap = np.inf
     idle, final = 0, width <= spread * threshold
     for _ in range(PASSES):
@@ -128,16 +132,8 @@ def _reweighted(data: Data, pose: Pose, kind: str, threshold: float, convex: boo
         best, gap = min(best, found.objective) if final else np.inf, now
         final = width <= spread * threshold
         weights = used.only(_weights(r, kind, width) for r in sizes)
-        program, problem = _weighted(pose, weights, dict(solution.values), scale, unweighted)
+        program = weighted(weights, dict(solution.values))
     return replace(found, figures=used.figures(kind, problem.units.y_scale[0] * width))
-
-
-def _weighted(pose: Pose, weights: list[np.ndarray], start: Mapping[str, np.ndarray], scale: float,
-              unweighted: Statistics) -> tuple[Program, EquationError]:
-    """Pose a weighted pass: the answer before is the best start, and no proof belongs to it."""
-    program, problem = pose(weights)
-    compressed = replace(problem, unweighted=unweighted)
-    return replace(program, start=start, certify=None, scale=scale, compressed=compressed), problem
 
 
 class _Rows:
@@ -169,9 +165,7 @@ class _Rows:
 
     def _touched(self, wild: np.ndarray) -> np.ndarray:
         """Tell the rows whose output, or one of its past outputs, is wild."""
-        rows = np.any(wild, axis=1, keepdims=True)[:, 0]
-        return np.any([np.concatenate([np.zeros(i, dtype=bool), rows[: rows.size - i]])
-                       for i in range(min(self._layout.na, rows.size) + 1)], axis=0)
+        return np.convolve(np.any(wild, axis=1), np.ones(self._layout.na + 1))[: len(wild)] > 0
 
     def residuals(self, problem: EquationError, solution: Solution) -> list[np.ndarray]:
         """Return the one-step residuals (N, l), NaN in rows that do not count."""
@@ -194,7 +188,7 @@ class _Rows:
         return True
 
     def figures(self, kind: str, width: float) -> dict[str, Any]:
-        """Return what the fit prints: the threshold of the loss, and the readings left out by where they were found."""
+        """Return the figures that the fit prints: the threshold of the loss, and the readings left out."""
         found: dict[str, Any] = {"threshold of the loss": width} if kind == "huber" else {}
         by_residuals = [wild & ~known for wild, known in zip(self._wild, self._examined)]
         for o, name in enumerate(self._layout.outputs):
@@ -226,19 +220,20 @@ def _weights(sizes: np.ndarray, kind: str, width: float) -> np.ndarray:
     return width / safe if kind == "huber" else 0.5 / safe
 
 
-def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], weights: list[np.ndarray] | None,
+def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], weights: list[np.ndarray],
               kind: str, width: float, convex: bool) -> Evidence:
     """Objective in the loss itself, and the bound that the weighted residuals of the pass give."""
-    pooled, w = np.concatenate(sizes), np.concatenate(weights or [np.ones_like(r) for r in sizes])
+    pooled, w = np.concatenate(sizes), np.concatenate(weights)
     keep = ~np.isnan(pooled)
     pooled, w = pooled[keep], w[keep]
     unit = program.unit
     penalty = max(0.0, solution.objective / unit - float(np.sum(w * pooled**2)))
     objective = _loss(pooled, kind, width) + penalty
     model = program.recover(solution.values)
+    status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     if not convex:
         bound = Bound.none(f"the exact form with the {kind} loss has no proof")
-        return Evidence(model, unit * objective, bound, _settled(solution), bound.reason)
+        return Evidence(model, unit * objective, bound, status, bound.reason)
     limit = 2 * width if kind == "huber" else 1.0
     dual = 2 * w * pooled  # satisfies the stationarity of the weighted pass, hence of the dual, exactly
     shrink = min(1.0, limit / max(float(np.max(dual, initial=0.0)), 1e-300))
@@ -247,9 +242,5 @@ def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], wei
     gap = relative_gap(objective, value, program.scale)
     proved = gap < 1e-6
     bound = Bound(unit * value, proved, f"{kind} dual", f"dual point of the last pass, gap {gap:.1e}")
-    status = Status.OPTIMAL if proved and _settled(solution) is Status.LOCAL else _settled(solution)
+    status = Status.OPTIMAL if proved and status is Status.LOCAL else status
     return Evidence(model, unit * objective, bound, status, bound.reason)
-
-
-def _settled(solution: Solution) -> Status:
-    return Status.LOCAL if solution.status in (Status.OPTIMAL, Status.LOCAL) else solution.status

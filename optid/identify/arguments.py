@@ -25,18 +25,19 @@ def whole_number(name: str, value: Any, low: int = 0, what: str = "") -> int:
         name: of the argument.
         value: of the argument.
         low: least value.
-        what: what it is, for the message.
+        what: its meaning, for the message.
 
     Raises:
-        StructureError: not a whole number from ``low``.
+        StructureError: not an integer, or below ``low``.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-        raise StructureError(f"{name} {f'is {what},' if what else 'must be'} a whole number from {low}; got {value!r}")
+        kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
+        raise StructureError(f"{name}{what and f' ({what})'} must be {kind}; got {value!r}")
     return int(value)
 
 
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
-    """Expand a scalar to one whole number per input and check it."""
+    """Expand a scalar to one integer per input and check it."""
     values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
     if len(values) != len(inputs):
         raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
@@ -48,7 +49,7 @@ def in_memory(data: Any, errors: str) -> Data:
 
     Args:
         data: the record.
-        errors: what the fit minimises, for the message.
+        errors: the residuals that the fit minimises, for the message.
 
     Raises:
         StructureError: naming the remedy.
@@ -64,7 +65,7 @@ def one_output(data: Any, errors: str) -> Data:
 
     Args:
         data: the record.
-        errors: what the fit minimises, for the message.
+        errors: the residuals that the fit minimises, for the message.
 
     Raises:
         StructureError: naming the remedy.
@@ -85,9 +86,9 @@ def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
 
     Args:
         rows: number of them.
-        what: what they are.
+        what: their name.
         unknowns: their number, initial states included.
-        remedy: what a user could have fewer of, basis functions apart.
+        remedy: the lags or states that a user could have fewer of, besides basis functions.
 
     Raises:
         RankError: naming the numbers.

@@ -1,0 +1,14 @@
+"""Expressions that several programmes are written with."""
+
+import cvxpy as cp
+import numpy as np
+
+
+def flat(expression: cp.Expression) -> cp.Expression:
+    """Stack the columns of an expression."""
+    return expression if expression.ndim == 1 else cp.vec(expression, order="F")
+
+
+def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np.ndarray) -> cp.Expression:
+    """Return ``mu bᵀ`` to first order about (mu0, b0)."""
+    return cp.outer(mu, b0) + cp.outer(mu0, b) - np.outer(mu0, b0)
