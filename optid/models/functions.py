@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.bases.expansions import Linear
 from optid.data.record import Data
 from optid.models.nonlinearity import Nonlinearity
 
@@ -34,7 +33,7 @@ class StaticFunction:
     @property
     def is_linear(self) -> bool:
         """Whether there is nothing to draw."""
-        return isinstance(self.nonlinearity.basis, Linear)
+        return self.nonlinearity.is_linear
 
     def samples(self, data: Data) -> Array:
         """Samples (N,) of its argument in a record, all experiments; NaN = missing."""

@@ -198,7 +198,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     """
     compressed, found = fit.program.compressed, {}
     heights = fit.program.view.units
-    if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
+    if fit.model.structure != "arx" or compressed is None or not fit.solution.has_point:
         return found
     if fit.program.view.kind == "exact":
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
