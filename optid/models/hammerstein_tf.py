@@ -12,21 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.data.record import Data
-from optid.data.stretches import runs_of
-from optid.errors import DataError, StructureError
+from optid.errors import DataError
 from optid.models import export, noise_filter, roots
-from optid.models.experiments import (
-    Record,
-    check_inputs,
-    checked_horizon,
-    one_or_all,
-    records_of,
-    samples_of,
-    scaled_least_squares,
-    signal_units,
-    states_of,
-)
+from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
 from optid.models.files import KINDS
 from optid.models.recursions import autoregression
 from optid.models.transfer_function import TransferFunction
@@ -38,61 +26,23 @@ FORGOTTEN = 1e-12
 class HammersteinTF(TransferFunction):
     """A transfer-function model that predicts and simulates records; its arguments are those of `TransferFunction`."""
 
-    def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
-        """Predict one or several steps ahead.
+    SIMULATORS = ("predict", "free")
 
-        Args:
-            data: the record; detrended or scaled data are taken back to raw units first.
-            horizon: how many samples ahead: the outputs are known up to so many samples before, the inputs always.
-            x0: initial state of the plant for output-error and Box-Jenkins models: "fit" (least squares of the
-                one-step prediction errors), "zero", or the state, one for each experiment. ARX and ARMAX models
-                need none.
-
-        Returns:
-            (N, l) in raw units; a tuple of such arrays for several experiments. For ARX NaN in the first `memory` +
-            horizon - 1 samples and where a sample needed is missing. In the others a missing output counts as an
-            innovation of zero. NaN where a missing input leaves no prediction: in the samples that it reaches (ARMAX),
-            or in it (the others, whose state is estimated anew after the gap; also in stretches between gaps too short
-            for that). ARMAX: NaN in the first `memory` + horizon - 1 samples, and on until so many outputs follow one
-            another without a gap (ten times `memory` samples where they never do).
-
-        Raises:
-            DataError: other channels or another sampling time than the model's.
-            StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
-        """
-        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
-        fit = isinstance(x0, str) and x0 == "fit"
-        states = [None] * len(records) if fit else self._states("predict", records, x0)
-        return one_or_all([
-            self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)
-        ])
+    @property
+    def _state_shape(self) -> tuple[int, int]:
+        return self.largest_lag, self.l
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
-        """Predict one record in raw units; see `predict`.
-
-        Args:
-            u: (N, m) inputs, NaN = missing.
-            y: (N, l) outputs, NaN = missing.
-            horizon: how many samples ahead, from 1.
-            x0: (n, l) state; None for that of the smallest one-step prediction errors.
-            label: words that name the experiment in a message.
-        """
+        """Predict one record in raw units; see `predict`. The arguments are those of `Model.predict_record`."""
         if self.structure == "arx":
             return self._regression(u, y, horizon)
-        if self.shares_poles:
+        if self.structure == "armax":
             return self._noise_predicted(y, self.driven(u), horizon, self.memory)
-        prediction = np.full((len(y), 1), np.nan)
-        known = np.isfinite(u).all(axis=1)
-        for first, last in runs_of(known):
-            inputs, outputs = u[first:last], y[first:last]
-            state = x0 if first == 0 else None
-            if state is None:
-                if not known.all() and np.isfinite(outputs).sum() <= 2 * self.largest_lag:
-                    continue  # the estimated state would repeat the outputs
-                state = self._fitted("predict", inputs, outputs, label)
-            x = self._simulated(inputs, state, label)
-            prediction[first:last] = x + self._noise_predicted(outputs - x, None, horizon, 0)
-        return prediction
+        return super().predict_record(u, y, horizon, x0, label)
+
+    def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
+        x = self._simulated(u, state, label)
+        return x + self._noise_predicted(y - x, None, horizon, 0)
 
     def _noise_predicted(self, s: Array, drive: Array | None, horizon: int, start: int) -> Array:
         """Predict s = drive + (C/D) e, (N, 1)."""
@@ -149,11 +99,6 @@ class HammersteinTF(TransferFunction):
                 f"radius {self.radius:.6g}. Identify the model with a stability constraint, or simulate fewer samples."
             )
         return y
-
-    def _states(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
-        if simulator not in ("predict", "free"):
-            raise StructureError(f"simulator={simulator!r}: use 'predict' or 'free'.")
-        return states_of(records, x0, (self.largest_lag, self.l), lambda i: self._fitted(simulator, *records[i]))
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         """Estimate the initial state (n, l) by least squares of a simulator's errors, where outputs are present.

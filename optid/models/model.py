@@ -1,7 +1,7 @@
 """What every model shares: channels, units, gauge, stability, responses, running over records, text and files."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.channels import Transform, numbered_names
 from optid.data.record import Data
-from optid.errors import DataWarning, StructureError, nearest
+from optid.data.stretches import runs_of
+from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.models import files, roots
-from optid.models.experiments import Record, one_or_all, records_of
+from optid.models.experiments import Record, checked_horizon, one_or_all, records_of, states_of
 from optid.models.nonlinearity import Nonlinearity
 
 NAMES = ("inputs", "outputs", "input_units", "output_units")
@@ -45,6 +46,7 @@ class Model:
         gauge: how the scale between f and B is fixed; see `regauge`.
         poles: complex, largest first.
         memory: samples at the start of a record that cannot be predicted.
+        structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
@@ -56,7 +58,17 @@ class Model:
     gauge: str
     poles: Any
     memory: int
+    structure: Any
     GAUGES: ClassVar[tuple[str, ...]]
+    SIMULATORS: ClassVar[tuple[str, ...]]
+    equation: Callable[..., str]
+    impulse_response: Callable[..., Array]
+    _state_shape: Any
+    _predicted: Callable[[Array, Array, int, Array, str], Array]
+    _run: Callable[[str, Sequence[Record], Any], list[Array]]
+    _fitted: Callable[[str, Array, Any, str], Array]
+    _regauged: Callable[[str, bool], Self]
+    _in_raw_units: Callable[[Transform], Self]
 
     def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
         """Set the fields of a new model, with default names and units for m inputs and l outputs.
@@ -96,11 +108,6 @@ class Model:
         return type(self).__name__
 
     @property
-    def structure(self) -> str:
-        """The kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss"."""
-        raise NotImplementedError
-
-    @property
     def _family(self) -> str:
         """The first word of the title."""
         return "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
@@ -114,10 +121,6 @@ class Model:
     def is_stable(self) -> bool:
         """Whether all poles lie inside the unit circle."""
         return self.radius < 1
-
-    def impulse_response(self, n: int = 100) -> Array:
-        """Return the response of the linear part to a unit impulse of every f, (n, l, r), in the gauge of the model."""
-        raise NotImplementedError
 
     def step_response(self, n: int = 100) -> Array:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
@@ -134,27 +137,74 @@ class Model:
             raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
         return points
 
-    def equation(self, digits: int = 4) -> str:
-        """Write the model as equations, with coefficients of so many significant digits."""
-        raise NotImplementedError
-
     def __str__(self) -> str:
         """Return the equations and the poles."""
         return self.equation() + (f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else "")
 
     # -- running over records ------------------------------------------------------------------------------------
 
-    def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
-        """Simulate records, (N, l) each."""
-        raise NotImplementedError
-
-    def _states(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
-        """Return the initial state of every record for a simulator."""
-        raise NotImplementedError
-
     def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
-        """Predict one or several steps ahead, (N, l) in raw units; a tuple for several experiments."""
-        raise NotImplementedError
+        """Predict one or several steps ahead: every output up to `horizon` samples before is known, and all inputs.
+
+        An ARX model predicts where every sample it needs is present. In the others a missing output counts as an
+        innovation of zero: it corrects nothing, and feedback sees the prediction instead. A missing input leaves no
+        prediction: with ARMAX where it reaches, with the others in the sample, after which the state is estimated anew;
+        stretches too short for that are not predicted.
+
+        Args:
+            data: the record; detrended or scaled data are taken back to raw units first.
+            horizon: how many samples ahead.
+            x0: state at the first sample: "fit" (least squares of the one-step prediction errors), "zero", or the
+                state, one for each experiment. ARX and ARMAX models need none.
+
+        Returns:
+            (N, l) in raw units, NaN where there is no prediction and in the first `memory` + horizon - 1 samples; a
+            tuple of such arrays for several experiments. ARMAX: NaN on until so many outputs follow one another without
+            a gap (ten times `memory` samples where they never do).
+
+        Raises:
+            DataError: no stretch with every input, other channels or sampling time than the model's, predictions that
+                leave the range of numbers.
+            StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
+        """
+        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
+        fit = isinstance(x0, str) and x0 == "fit"
+        states = [None] * len(records) if fit else self._states("predict", records, x0)
+        predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
+        if self.structure not in ("arx", "armax") and all(np.isnan(p).all() for p in predicted) and any(
+            np.isnan(u).any() for u, _, _ in records
+        ):
+            raise DataError(
+                f"no stretch of {2 * self._state_shape[0] + 1} samples has every input: interpolate them, or leave an "
+                "input out"
+            )
+        return one_or_all(predicted)
+
+    def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
+        """Predict one record in raw units; see `predict`.
+
+        Args:
+            u: (N, m) inputs, NaN = missing.
+            y: (N, l) outputs, NaN = missing.
+            horizon: how many samples ahead, from 1.
+            x0: state at the first sample; None for that of the smallest one-step prediction errors.
+            label: words that name the experiment in a message.
+
+        Returns:
+            (N, l), NaN where there is no prediction.
+
+        Raises:
+            DataError: as `predict`.
+        """
+        known, prediction = np.isfinite(u).all(axis=1), np.full(y.shape, np.nan)
+        for first, last in runs_of(known):
+            inputs, outputs, state = u[first:last], y[first:last], x0 if first == 0 else None
+            if state is None:
+                if not known.all() and np.isfinite(outputs).sum(axis=0).min() <= 2 * self._state_shape[0]:
+                    continue  # the estimated state would repeat the outputs
+                state = self._fitted("predict", inputs, outputs, label)
+            prediction[first:last] = self._predicted(inputs, outputs, horizon, state, label)
+        return prediction
 
     def simulate(self, data: Any, x0: Any = "zero") -> Any:
         """Compute the outputs from the inputs alone; nonlinear feedback sees the model's own outputs (P3).
@@ -205,6 +255,18 @@ class Model:
         """
         return one_or_all(self._states(simulator, records_of(self, data)[0], "fit"))
 
+    def _states(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
+        """Return the state of every record at its first sample.
+
+        Raises:
+            StructureError: an unknown simulator, one that needs the outputs, or an x0 that cannot be read.
+        """
+        if simulator not in self.SIMULATORS:
+            raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
+        if simulator != "free" and any(y is None for _, y, _ in records):
+            raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
+        return states_of(records, x0, self._state_shape, lambda i: self._fitted(simulator, *records[i]))
+
     def _warn_unstable(self) -> None:
         if not self.is_stable:
             warnings.warn(
@@ -234,9 +296,6 @@ class Model:
             raise StructureError("gauge 'gain' is defined for one output; use 'norm'.")
         return self._regauged(gauge, signs)
 
-    def _regauged(self, gauge: str, signs: bool) -> Self:
-        raise NotImplementedError
-
     def with_transform(self, transform: Transform) -> Self:
         """Return the model in raw units, given that this one was identified on data changed by `transform`.
 
@@ -254,9 +313,6 @@ class Model:
             )
         # units do not turn signs: what a constraint decided about them stays
         return self._in_raw_units(transform).regauge(self.gauge, signs=False)
-
-    def _in_raw_units(self, transform: Transform) -> Self:
-        raise NotImplementedError
 
     # -- files ---------------------------------------------------------------------------------------------------
 
