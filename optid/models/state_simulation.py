@@ -125,10 +125,11 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
         _march(job, first, begun, x, none[0], y, none[1], states)
         for i in range(1, horizon):
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
-            states = states @ model.A.T + stretch.drive[i - 1 : i - 1 + len(states)] + y @ model.L.T
-            for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
-                states += g(y[:, o])[:, None] * model.E[:, j]
-            y = states @ model.C.T + stretch.direct[i : i + len(states)]
+            with np.errstate(all="ignore"):
+                states = states @ model.A.T + stretch.drive[i - 1 : i - 1 + len(states)] + y @ model.L.T
+                for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
+                    states += g(y[:, o])[:, None] * model.E[:, j]
+                y = states @ model.C.T + stretch.direct[i : i + len(states)]
             wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
             if wild.any():
                 raise _left(job, first + i + int(np.argmax(wild)))
