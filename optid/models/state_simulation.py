@@ -51,6 +51,10 @@ class Stretch(NamedTuple):
     low: Array
     high: Array
 
+    def part(self, samples: slice) -> "Stretch":
+        """Return the stretch cut to some samples."""
+        return Stretch._make([*(signal[samples] for signal in self[:4]), *self[4:]])
+
 
 class Run(NamedTuple):
     """One record under one simulator.
@@ -121,8 +125,7 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
         starts = min(STRETCH, last - first)
         states = np.empty((starts if horizon > 1 else 0, x.size))
         y = np.empty((starts, model.l))
-        begun = Stretch._make([*(part[:starts] for part in stretch[:4]), *stretch[4:]])
-        _march(job, first, begun, x, none[0], y, none[1], states)
+        _march(job, first, stretch.part(slice(starts)), x, none[0], y, none[1], states)
         for i in range(1, horizon):
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
             with np.errstate(all="ignore"):
@@ -260,7 +263,7 @@ def _march(job: Run, first: int, stretch: Stretch, x: Array, turn: Array, output
 
     parts = job.model.parts._replace(K=job.gain)
     if not parts.tables.compiled and np.isnan(stretch.feedback).any():
-        ended, at = _march_in_python(job.model, parts, stretch, x, turn, outputs, jacobian, states)
+        ended, at = _march_by_steps(job.model, parts, stretch, x, turn, outputs, jacobian, states)
     else:
         ended, at = march(parts, stretch, x, turn, outputs, jacobian, states)
     if ended == REFUSED:
@@ -283,28 +286,25 @@ def _left(job: Run, sample: int) -> DataError:
     )
 
 
-def _march_in_python(
+def _march_by_steps(
     model: StateSpace, parts: Parts, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array,
     states: Array,
 ) -> tuple[int, int]:
-    """Run the recursion of `optid.models.state_kernels.march` for functions that cannot be compiled."""
-    from optid.models.state_kernels import INSIDE, LEFT
+    """Run the kernel sample by sample, with the tangents of functions that it cannot evaluate as feedback."""
+    from optid.models.state_kernels import INSIDE, march
 
     where = np.array(model.output_of, dtype=int)
-    for k, given in enumerate(stretch.y):
-        states[k : k + 1] = x
+    for k in range(len(stretch.y)):
         y = stretch.direct[k] + parts.C @ x
-        if not np.all((stretch.low <= y) & (y <= stretch.high)):
-            return LEFT, k
-        outputs[k] = y
-        moved = parts.C @ turn
-        jacobian[k] = moved
-        free = np.isnan(given)
-        error = np.where(free, 0.0, given - y)
         g, slopes = stretch.feedback[k].copy(), np.zeros(where.size)
-        for j in np.flatnonzero(np.isnan(g)):
-            g[j], slopes[j] = model.feedback[j](y[where[j]]), model.feedback[j].slope(y[where[j]])
-        pulled = parts.L * free - parts.K * ~free
-        turn[:] = parts.A @ turn + pulled @ moved + (parts.E * slopes) @ moved[where]
-        x[:] = parts.A @ x + stretch.drive[k] + parts.E @ g + parts.L @ np.where(free, y, given) + parts.K @ error
+        for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():
+            slopes[j] = model.feedback[j].slope(y[where[j]])
+            g[j] = model.feedback[j](y[where[j]]) - slopes[j] * y[where[j]]
+        tangents = np.array(parts.L)
+        np.add.at(tangents, (slice(None), where), parts.E * slopes)
+        here = slice(k, k + 1)
+        one = stretch.part(here)._replace(feedback=g[None])
+        ended, _ = march(parts._replace(L=tangents), one, x, turn, outputs[here], jacobian[here], states[here])
+        if ended != INSIDE:
+            return ended, k
     return INSIDE, len(stretch.y)

@@ -16,8 +16,7 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.functions import has_feedback, static_functions
-from optid.models.responses import response_pairs, step_length
+from optid.models.functions import has_feedback, response_pairs, static_functions, step_length
 from optid.show import panels, summary
 from optid.show.estimates import uncertainty
 from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
