@@ -300,8 +300,7 @@ def _march_by_steps(
         for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():
             slopes[j] = model.feedback[j].slope(y[where[j]])
             g[j] = model.feedback[j](y[where[j]]) - slopes[j] * y[where[j]]
-        tangents = np.array(parts.L)
-        np.add.at(tangents, (slice(None), where), parts.E * slopes)
+        tangents = parts.L + (parts.E * slopes) @ np.eye(model.l)[where]
         here = slice(k, k + 1)
         one = stretch.part(here)._replace(feedback=g[None])
         ended, _ = march(parts._replace(L=tangents), one, x, turn, outputs[here], jacobian[here], states[here])
