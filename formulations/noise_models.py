@@ -66,7 +66,7 @@ class PredictionErrors(OutputError):
     def with_noise(self, plant: HammersteinARX, values: Values) -> HammersteinTF:
         """Give a plant the noise model of the programme's values."""
         c, d = (np.asarray(values.get(name, np.zeros(0)), dtype=float) for name in ("c", "d"))
-        return HammersteinTF(plant, c, d if self.unknowns.apart else plant.a)
+        return replace(plant, c=c, d=d if self.unknowns.apart else None)
 
     def innovations(self, x: Array) -> list[Array]:
         """Return the innovations (N,) of every experiment, NaN where there is none."""

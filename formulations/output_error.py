@@ -1,6 +1,6 @@
 """The sum of squared simulation errors of a Hammerstein or linear model as a function of its unknowns."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -85,7 +85,7 @@ class OutputError:
 
     def with_noise(self, plant: HammersteinARX, values: Values) -> HammersteinTF:
         """Give a plant the noise model of the programme's values: none."""
-        return HammersteinTF(plant)
+        return replace(plant, d=())
 
     def gauge_rows(self, x: Array) -> Array:
         """Gradients (inputs, p) of the gauge: directions that a step does not take."""

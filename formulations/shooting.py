@@ -34,7 +34,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import one_output
 from optid.identify.equation_error.compression import model_meta
 from optid.identify.gauges import check_gauge, scale_fixed
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.models.roots import contained
 from optid.program.program import Program, Values
@@ -216,9 +216,9 @@ class _Shooting:
         """Build the model."""
         pairs = [(np.asarray(values[self.key("mu", c)]), np.asarray(values[self.key("b", c)]))
                  for c in range(self.layout.m)]
-        plant = HammersteinARX(
+        model = HammersteinTF(
             a=np.asarray(values.get("a", np.zeros(0)), dtype=float), b=tuple(b for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(self.layout.bases, pairs)),
-            nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
+            nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float), d=(),
             gauge=self.criterion.gauge, **model_meta(self.data))
-        return HammersteinTF(plant).with_transform(self.criterion.units)
+        return model.with_transform(self.criterion.units)

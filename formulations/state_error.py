@@ -16,8 +16,8 @@ from optid.bases import Linear
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models import HammersteinSS
+from optid.models.balancing import balancing
 from optid.models.roots import spectral_radius
-from optid.models.state_forms import balancing
 from optid.statistics.linearised import Linearised
 from optid.statistics.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
 

@@ -172,8 +172,9 @@ def test_missing_input_is_named():
     with pytest.raises(DataError, match="'u2' is missing at sample 7"):
         model.simulate(u)
     data = Data(u, data.y, dt=0.5)
-    with pytest.raises(StructureError, match="no state is known"):
-        model.predict(data, x0=np.zeros(model.nx))
+    given, first = model.predict(data, x0=X0), Data(u[:7], data.y[:7], dt=0.5)  # the state holds up to the gap
+    assert given[:7] == pytest.approx(model.predict(first, x0=X0)) and np.isnan(given[7]).all()
+    assert given[8:] == pytest.approx(model.predict(data)[8:])
     u[::4] = np.nan
     with pytest.raises(DataError, match="no stretch"):
         model.predict(Data(u, data.y, dt=0.5))

@@ -1,6 +1,8 @@
 """The transfer-function model: predictions against brute force, the four noise models, units, files, refusals."""
 
+import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,10 +26,9 @@ def two_inputs():
 
 def models():
     plant = siso(nk=1)
-    return {"oe": HammersteinTF(plant), "arx": HammersteinTF(plant, (), plant.a),
-            "armax": HammersteinTF(plant, C, plant.a), "bj": HammersteinTF(plant, C, D),
-            "ma": HammersteinTF(plant, C), "ar": HammersteinTF(plant, (), D),
-            "fir": HammersteinTF(siso(a=[]), C), "two": HammersteinTF(two_inputs(), C, D)}
+    return {"oe": replace(plant, d=()), "arx": plant, "armax": replace(plant, c=C), "bj": replace(plant, c=C, d=D),
+            "ma": replace(plant, c=C, d=()), "ar": replace(plant, d=D), "fir": replace(siso(a=[]), c=C, d=()),
+            "two": replace(two_inputs(), c=C, d=D)}
 
 
 MODELS = models()
@@ -37,7 +38,7 @@ def noisy(model, count=300, size=0.3, seed=5):
     rng = np.random.default_rng(seed)
     u = inputs(model, count, seed)
     e = size * rng.standard_normal(count)
-    v = lfilter(np.r_[1, model.c], np.r_[1, model.d], e)
+    v = lfilter(np.r_[1, model.c], np.r_[1, model.noise_denominator], e)
     return Data(u, model.simulate(u) + v[:, None], dt=model.dt), e[:, None]
 
 
@@ -63,7 +64,7 @@ def test_k_steps_ahead_is_the_mean_over_the_future_noise(name, horizon):
     predicted = model.predict(data, horizon, x0="zero")
     found = np.nan_to_num(model.innovations(data, x0="zero"))[:, 0]
     x = model.simulate(data.u)[:, 0]
-    v = lfilter(np.r_[1, model.c], np.r_[1, model.d], found)
+    v = lfilter(np.r_[1, model.c], np.r_[1, model.noise_denominator], found)
     for k in (30, 41, 79):
         future = found.copy()
         future[k - horizon + 1 :] = 0.0
@@ -76,23 +77,23 @@ def test_k_steps_ahead_is_the_mean_over_the_future_noise(name, horizon):
                 y[j] += sum(c * future[j - i] for i, c in enumerate(model.c, 1))
             expected = y[k]
         else:
-            expected = x[k] + lfilter(np.r_[1, model.c], np.r_[1, model.d], future)[k]
+            expected = x[k] + lfilter(np.r_[1, model.c], np.r_[1, model.noise_denominator], future)[k]
             assert x + v == pytest.approx(data.y[:, 0], abs=1e-10)
         assert predicted[k, 0] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 5])
-def test_arx_as_transfer_function_predicts_as_the_arx_model_does(horizon):
+def test_arx_predicts_as_an_armax_model_without_moving_average_does(horizon):
     model = MODELS["arx"]
     data, _ = noisy(model)
-    expected = model.plant.predict(data, horizon)
-    assert np.array_equal(np.isnan(model.predict(data, horizon)), np.isnan(expected))
-    assert model.predict(data, horizon) == pytest.approx(expected, abs=1e-10, nan_ok=True)
+    found, expected = model.predict(data, horizon), replace(model, c=[0.0]).predict(data, horizon)
+    assert np.array_equal(np.isnan(found), np.isnan(expected))
+    assert found == pytest.approx(expected, abs=1e-10, nan_ok=True)
 
 
 def test_armax_equals_box_jenkins_with_the_denominator_of_the_plant():
     armax, data = MODELS["armax"], noisy(MODELS["armax"])[0]
-    apart = HammersteinTF(armax.plant, C, np.r_[armax.a, 0.0])
+    apart = replace(armax, d=np.r_[armax.a, 0.0])
     assert apart.structure == "bj" and armax.structure == "armax"
     for horizon in (1, 4):
         assert apart.predict(data, horizon)[100:] == pytest.approx(armax.predict(data, horizon)[100:], abs=1e-8)
@@ -104,19 +105,17 @@ def test_fitted_state_minimises_the_prediction_errors(name):
     rng = np.random.default_rng(2)
     u = inputs(model, 120)
     e = 0.2 * rng.standard_normal(120)
-    start = rng.normal(size=(model.plant.memory, 1))
-    y = model.simulate(u, start) + lfilter(np.r_[1, model.c], np.r_[1, model.d], e)[:, None]
+    start = rng.normal(size=(model.largest_lag, 1))
+    y = model.simulate(u, start) + lfilter(np.r_[1, model.c], np.r_[1, model.noise_denominator], e)[:, None]
     y[rng.uniform(size=120) < 0.2] = np.nan
     data = Data(u, y, dt=model.dt)
     fitted = np.nansum(model.innovations(data) ** 2)
-    from optid.models.noise_prediction import fitted_state
-
-    x0 = fitted_state(model, u, y)
+    x0 = model.initial_state(data, "predict")
     assert np.nansum(model.innovations(data, x0) ** 2) == pytest.approx(fitted, rel=1e-9)
     for _ in range(20):
         assert fitted <= np.nansum(model.innovations(data, x0 + 0.05 * rng.normal(size=x0.shape)) ** 2) + 1e-10
     exact = Data(u, model.simulate(u, start), dt=model.dt)
-    assert fitted_state(model, exact.u, exact.y) == pytest.approx(start, abs=1e-8)
+    assert model.initial_state(exact, "predict") == pytest.approx(start, abs=1e-8)
     assert model.predict(exact) == pytest.approx(exact.y, abs=1e-8)
 
 
@@ -205,17 +204,28 @@ def test_round_trip_through_a_file(name, tmp_path):
     assert (again.structure, again.title) == (model.structure, model.title)
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_files_with_the_plant_apart_or_without_noise_load(name, tmp_path):
+    model = MODELS[name]
+    plant = {key: value for key, value in model.to_dict().items() if key not in ("c", "d")} | {"kind": "HammersteinARX"}
+    content = {"kind": "HammersteinTF", "plant": plant, "c": model.c.tolist(), "d": model.noise_denominator.tolist()}
+    for old in (content, plant) if name == "arx" else (content,):
+        path = tmp_path / "model.json"
+        path.write_text(json.dumps({"format": "optid model", "version": 1, **old}))
+        assert optid.load(path).to_dict() == model.to_dict()
+
+
 def test_words():
     titles = {name: model.title for name, model in MODELS.items()}
     assert titles["oe"] == "Hammerstein output-error model" and titles["armax"] == "Hammerstein ARMAX model"
     assert titles["bj"] == titles["ma"] == titles["ar"] == "Hammerstein Box-Jenkins model"
     linear = HammersteinARX([-0.5], ([1.0],), (Nonlinearity(Linear(), [1.0]),), (1,), 0.0)
-    assert HammersteinTF(linear).title == "Linear output-error model"
-    assert HammersteinTF(linear).equation() == "x(k) = 0.5 x(k-1) + 1 u(k-1)\ny(k) = x(k) + e(k)"
-    armax = HammersteinTF(linear, [0.2], [-0.5])
+    assert replace(linear, d=()).title == "Linear output-error model"
+    assert replace(linear, d=()).equation() == "x(k) = 0.5 x(k-1) + 1 u(k-1)\ny(k) = x(k) + e(k)"
+    armax = replace(linear, c=[0.2], d=[-0.5])
     assert armax.equation() == "y(k) = 0.5 y(k-1) + 1 u(k-1) + e(k) + 0.2 e(k-1)"
     assert armax.coefficients()[-1] == ("c1", 0.2) and armax.orders["nc"] == 1 and armax.noise.startswith("C = 1 + 0.2")
-    bj = HammersteinTF(linear, [0.2], [0.0, -0.3])
+    bj = replace(linear, c=[0.2], d=[0.0, -0.3])
     assert "v(k) = e(k) + 0.2 e(k-1) + 0.3 v(k-2)" in bj.equation()
     assert bj.coefficients()[-2:] == [("d1", 0.0), ("d2", -0.3)] and bj.orders["nd"] == 2
     assert "poles of the noise" in str(bj) and "poles of the noise" not in str(armax)
@@ -227,20 +237,20 @@ def test_words():
 def test_refusals():
     plant = siso()
     with pytest.raises(StructureError, match="one output"):
-        HammersteinTF(mimo())
+        replace(mimo(), d=())
     with pytest.raises(StructureError, match="not invertible.*modulus 1.25.*Reflect"):
-        HammersteinTF(plant, [-1.25])
+        replace(plant, c=[-1.25])
     with pytest.raises(StructureError, match="not invertible"):
-        HammersteinTF(plant, [1.0])
+        replace(plant, c=[1.0])
     with pytest.raises(StructureError, match="not finite"):
-        HammersteinTF(plant, [np.nan])
+        replace(plant, c=[np.nan])
     with pytest.raises(StructureError, match=r"\(nd,\)"):
-        HammersteinTF(plant, d=[[0.1]])
-    model = HammersteinTF(plant)
+        replace(plant, d=[[0.1]])
+    model = replace(plant, d=())
     data, _ = noisy(model, 30)
     with pytest.raises(StructureError, match="horizon"):
         model.predict(data, 0)
-    with pytest.raises(StructureError, match="'fit', 'zero'"):
+    with pytest.raises(StructureError, match="'zero', 'fit'"):
         model.predict(data, x0="steady")
     with pytest.raises(DataError, match="sampled every"):
         model.predict(Data(data.u, data.y, dt=7.0))
@@ -258,7 +268,7 @@ def test_reflection_keeps_the_spectrum():
 
 def test_unstable_armax_predicts():
     plant = siso(a=[-2.2, 1.1])
-    model = HammersteinTF(plant, C, plant.a)
+    model = replace(plant, c=C)
     rng = np.random.default_rng(0)
     u, e = inputs(model, 60), 0.1 * rng.standard_normal(60)
     with warnings.catch_warnings():
@@ -272,7 +282,7 @@ def test_the_plant_leaves_for_other_tools():
     model = MODELS["bj"]
     one = model.to_dlti()
     assert one.den == pytest.approx(np.r_[1, model.a]) and one.dt == model.dt
-    x, y = np.zeros(model.plant.memory), []
+    x, y = np.zeros(model.largest_lag), []
     step, u = model.to_casadi(), inputs(model, 20)
     for sample in u:
         x, out = step(x, sample)

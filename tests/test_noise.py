@@ -19,8 +19,7 @@ from optid.models.innovation_gain import (
     refined,
 )
 from optid.models.innovation_kernels import innovate
-from optid.models.kalman import kalman_gain
-from optid.models.noise_covariances import NoiseCovariances
+from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])

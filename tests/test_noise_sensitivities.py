@@ -7,7 +7,7 @@ from systems import inputs, nonlinearity
 
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
-from optid.models import HammersteinARX, HammersteinTF
+from optid.models import HammersteinTF
 from optid.statistics import sensitivities
 from optid.statistics.noise_sensitivities import NoisePoint, NoiseUnknowns, blocks, linearise, predict
 from optid.statistics.sensitivities import PlantPoint, Unknowns
@@ -15,18 +15,18 @@ from optid.statistics.sensitivities import PlantPoint, Unknowns
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
 
-def plant(a=(-1.2, 0.5)):
+def plant(a=(-1.2, 0.5), **noise):
     functions = nonlinearity(Triangular(4), 1), nonlinearity(Polynomial(3), 2)
-    return HammersteinARX(a, ([1.0, 0.4], [0.3, -0.2, 0.1]), functions, (0, 2), 0.4)
+    return HammersteinTF(a, ([1.0, 0.4], [0.3, -0.2, 0.1]), functions, (0, 2), 0.4, **noise)
 
 
 def records(model, counts=(90, 60), gaps="", seed=0):
     rng = np.random.default_rng(seed)
     us, ys = [], []
     for count in counts:
-        u = inputs(model.plant, count, seed + count)
-        v = lfilter(np.r_[1, model.c], np.r_[1, model.d], 0.3 * rng.standard_normal(count))
-        y = model.simulate(u, rng.normal(size=model.plant.memory)) + v[:, None]
+        u = inputs(model, count, seed + count)
+        v = lfilter(np.r_[1, model.c], np.r_[1, model.noise_denominator], 0.3 * rng.standard_normal(count))
+        y = model.simulate(u, rng.normal(size=model.largest_lag)) + v[:, None]
         if "y" in gaps:
             y[rng.uniform(size=count) < 0.15] = np.nan
         if "u" in gaps:
@@ -39,20 +39,19 @@ def records(model, counts=(90, 60), gaps="", seed=0):
 def point_of(model, data, apart, seed=3):
     """A point off the truth, with its unknowns."""
     rng = np.random.default_rng(seed)
-    layout = model.plant.layout
+    layout = model.layout
     unknowns = Unknowns(layout, data.n_experiments, tuple(not isinstance(b, Linear) for b in layout.bases))
-    noise = NoiseUnknowns(unknowns, len(model.c), len(model.d) if apart else None)
+    noise = NoiseUnknowns(unknowns, len(model.c), len(model.noise_denominator) if apart else None)
     x0 = rng.normal(size=(data.n_experiments, layout.first_row))
     mus = tuple(f.mu for f in model.nonlinearities)
-    point = NoisePoint(PlantPoint(model.a, mus, model.b, float(model.offset[0]), x0), model.c, model.d)
+    point = NoisePoint(PlantPoint(model.a, mus, model.b, float(model.offset[0]), x0), model.c,
+                      model.noise_denominator)
     return noise, noise.pack(point) + 0.02 * rng.standard_normal(noise.size)
 
 
-CASES = {"armax": (HammersteinTF(plant(), C, plant().a), False), "arx": (HammersteinTF(plant(), (), plant().a), False),
-         "long": (HammersteinTF(plant(), [0.2, 0.0, 0.1, -0.3, 0.2], plant().a), False),
-         "bj": (HammersteinTF(plant(), C, D), True), "oe": (HammersteinTF(plant()), True),
-         "ma": (HammersteinTF(plant(), C), True), "ar": (HammersteinTF(plant(), (), D), True),
-         "fir": (HammersteinTF(plant(()), C), True)}
+CASES = {"armax": (plant(c=C), False), "arx": (plant(), False), "long": (plant(c=[0.2, 0.0, 0.1, -0.3, 0.2]), False),
+         "bj": (plant(c=C, d=D), True), "oe": (plant(d=()), True), "ma": (plant(c=C, d=()), True),
+         "ar": (plant(d=D), True), "fir": (plant((), c=C, d=()), True)}
 
 
 def errors(data, unknowns, x):
@@ -131,9 +130,9 @@ def test_errors_are_those_of_the_models_predictor():
         data = records(model, gaps=gaps)
         unknowns, x = point_of(model, data, apart)
         point = unknowns.unpack(x)
-        truth = HammersteinTF(HammersteinARX(point.plant.a, point.plant.bs, tuple(
+        truth = HammersteinTF(point.plant.a, point.plant.bs, tuple(
             type(f)(f.basis, mu) for f, mu in zip(model.nonlinearities, point.plant.mus)), (0, 2),
-            point.plant.offset, inputs=data.inputs), point.c, point.d)
+            point.plant.offset, inputs=data.inputs, c=point.c, d=point.d)
         expected = truth.innovations(data, list(point.plant.x0) if apart else "fit")
         for i, e in enumerate(data.experiments):
             found = predict(e.u, e.y[:, 0], unknowns, point, i)

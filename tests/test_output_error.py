@@ -424,7 +424,7 @@ def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
     fit = optid.fit(record, "hammerstein_oe.exact", na=3, nb=2, basis="triangular:6", constraints=["stable:0.95"])
     assert fit.solution.status is Status.LOCAL and np.max(np.abs(fit.model.poles)) <= 0.95
     # no model with its poles inside the same circle, nearby, has smaller errors by more than the boundary's curvature
-    plant = fit.model.plant
+    plant = fit.model
     unknowns = Unknowns(plant_layout(record, 3, 2, 0, (plant.f.basis,)), 1, (True,))
     criterion = OutputError(record, unknowns, "norm")
     at_rest = np.zeros((1, unknowns.memory))

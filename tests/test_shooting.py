@@ -70,7 +70,7 @@ def test_two_inputs_without_a_constant_and_the_gauges():
 
 
 def test_no_poles():
-    data = record(HammersteinTF(HammersteinARX([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3)), (200,))
+    data = record(HammersteinTF([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3, d=()), (200,))
     ours = optid.fit(data, shooting.exact, na=0, nb=2, nk=1, basis=BASIS, solver="ipopt")
     theirs = optid.fit(data, "hammerstein_oe.exact", na=0, nb=2, nk=1, basis=BASIS)
     assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-8)

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.faults import ADDITIVE, Fault, channel_of, place_of
-from optid.models.experiments import one_or_all, records_of
-from optid.models.noise_covariances import NoiseCovariances
-from optid.models.state_simulation import check_inputs, state_like
+from optid.models.experiments import check_inputs, one_or_all, records_of, state_like
+from optid.models.kalman import NoiseCovariances
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -296,7 +295,7 @@ def _added(fault: Fault, where: Array, present: Array | None) -> Array:
 
 def _started(model: "HammersteinSS", x0: Any, u: Array) -> Array:
     if not isinstance(x0, str):
-        return np.array(state_like(model, x0))
+        return np.array(state_like(x0, (model.nx,)))
     if x0 == "zero":
         return np.zeros(model.nx)
     if x0 != "rest":

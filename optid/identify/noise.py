@@ -33,8 +33,7 @@ from optid.models.innovation_gain import (
     refined,
     whitened,
 )
-from optid.models.kalman import kalman_gain
-from optid.models.noise_covariances import NoiseCovariances
+from optid.models.kalman import NoiseCovariances, kalman_gain
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS

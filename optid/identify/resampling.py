@@ -20,7 +20,7 @@ from optid.data.streams import Stream
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.uncertainty import Quantity, Uncertainty, aligned
-from optid.models import simulation
+from optid.models.recursions import autoregression
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -107,7 +107,7 @@ def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, s
         raise StructureError("a stream cannot be simulated again; read the record, or use fit.uncertainty")
     if fit.model is None:
         raise StructureError(f"this fit has no model to resample: {fit.solution.reason or fit.solution.status}")
-    if fit.model.kind != "HammersteinARX":
+    if fit.model.structure != "arx":
         raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
     if runs < 40 or not 0 < level < 1:
         raise StructureError(f"runs={runs}, level={level}: at least 40 runs and a level between 0 and 1 are needed")
@@ -147,7 +147,7 @@ def _records(fit: "Fit", runs: int, seed: int) -> Iterator[Data]:
 
 def _residuals(model: "HammersteinARX", data: Data) -> Array:
     """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
-    rows = np.vstack([e.y - simulation.predict_record(model, e.u, e.y) for e in data.experiments])
+    rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
     rows = rows[~np.isnan(rows).any(axis=1)]
     l = model.l  # noqa: E741
     parameters = model.na * l * l + l + sum(f.mu.size + b.size - 1 for f, b in zip(model.nonlinearities, model.b))
@@ -158,11 +158,11 @@ def _simulated(model: "HammersteinARX", u: Array, y: Array, errors: Array) -> Ar
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.memory
     u, start = interpolated(u), interpolated(y)[:n]
-    right = simulation.driven(model, u[n:]) + errors[n:]
-    state = simulation.following_state(model, u[:n], start)
+    right = model.driven(u[n:]) + errors[n:]
+    state = model.state(u[:n], start)
     count = min(n, len(right))
     right[:count] += state[:count]
-    outputs = np.vstack([start, simulation.filtered(model, right)])
+    outputs = np.vstack([start, autoregression(model.matrices, right)])
     if not np.isfinite(outputs).all():
         raise DataError("the simulation of the fitted model leaves the range of numbers, so it cannot be resampled; "
                         "identify it with a stability constraint")

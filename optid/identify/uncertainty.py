@@ -269,7 +269,7 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = DRAWS, seed: int =
         RankError: parameters without effect on the predictions.
     """
     if not hasattr(fit.program.compressed, "lifted"):
-        advice = "; use optid.bootstrap" if fit.model is not None and fit.model.kind == "HammersteinARX" else ""
+        advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
         raise StructureError("they follow from compressed least squares, which "
                              f"{fit.formulation!r} does not keep{advice}")
     return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
@@ -277,8 +277,6 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = DRAWS, seed: int =
 
 def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
-    if hasattr(model, "plant"):  # transfer-function models keep their noise
-        return replace(model, plant=aligned(model.plant, reference.plant))
     signs = [-1.0 if float(np.sum(b * other)) < 0 else 1.0 for b, other in zip(model.b, reference.b)]
     if all(sign > 0 for sign in signs):
         return model

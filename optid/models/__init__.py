@@ -1,8 +1,11 @@
 """The models: what they say, what they predict, their gauges, units and exports."""
 
-from optid.models.hammerstein_arx import HammersteinARX, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.hammerstein_tf import HammersteinTF
-from optid.models.noise_covariances import NoiseCovariances
+from optid.models.kalman import NoiseCovariances
+from optid.models.nonlinearity import Nonlinearity
+
+HammersteinARX = HammersteinTF
+"""The name of a transfer-function model with the noise it has by default: D = A, C = 1."""
 
 __all__ = ["HammersteinARX", "HammersteinSS", "HammersteinTF", "NoiseCovariances", "Nonlinearity"]

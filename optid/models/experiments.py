@@ -1,5 +1,6 @@
-"""What every model does with the records it is given: check the channels, undo changes of units, one array each."""
+"""Records given to a model: channels and units, missing inputs, horizons and initial states are checked here."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, as_samples, is_scalar_list
 from optid.data.record import Data
-from optid.errors import DataError
+from optid.errors import DataError, StructureError
 
 
 class Channels(Protocol):
@@ -80,3 +81,89 @@ def samples_of(values: ArrayLike, what: str, count: int) -> Array:
 def one_or_all(arrays: list[Array]) -> Any:
     """Return the array of the only experiment, or a tuple with one array for each."""
     return arrays[0] if len(arrays) == 1 else tuple(arrays)
+
+
+def checked_horizon(horizon: Any) -> int:
+    """Return a prediction horizon as an int.
+
+    Raises:
+        StructureError: not a positive integer.
+    """
+    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+        raise StructureError(f"horizon = {horizon!r}: a positive integer number of samples.")
+    return int(horizon)
+
+
+def check_inputs(model: Channels, u: Array, label: str) -> None:
+    """Refuse missing and infinite inputs, beyond which no state is known.
+
+    Raises:
+        DataError: naming the input and the first such sample.
+    """
+    bad = ~np.isfinite(u)
+    if bad.any():
+        k, c = np.argwhere(bad)[0]
+        raise DataError(
+            f"{label}Input {model.inputs[c]!r} is missing at sample {k} ({int(bad[:, c].sum())} in all): a simulation "
+            "needs every input. Interpolate it, or split the record there."
+        )
+
+
+def state_like(x0: Any, shape: tuple[int, ...]) -> Array:
+    """Read an initial state given by the user; with a last dimension of one that may be left out.
+
+    Raises:
+        StructureError: another shape.
+        DataError: a value that is not finite.
+    """
+    state = np.atleast_1d(np.asarray(x0, dtype=float))
+    if shape[1:] == (1,) and state.ndim == 1:
+        state = state[:, None]
+    if state.shape != shape:
+        raise StructureError(f"x0 has shape {np.shape(x0)}; the state of this model is {shape}.")
+    if not np.all(np.isfinite(state)):
+        raise DataError("x0 contains a value that is not finite.")
+    return state
+
+
+def states_of(
+    records: Sequence[Record], x0: Any, shape: tuple[int, ...], fitted: Callable[[int], Array]
+) -> list[Array]:
+    """Return the initial state of every record.
+
+    Args:
+        records: the records.
+        x0: "zero", "fit", or a state for each record.
+        shape: of a state.
+        fitted: returns the state that fits best, by the index of the record.
+
+    Raises:
+        StructureError: an x0 that cannot be read.
+        DataError: a state that is not finite.
+    """
+    if isinstance(x0, str):
+        if x0 == "zero":
+            return [np.zeros(shape)] * len(records)
+        if x0 != "fit":
+            raise StructureError(f"x0={x0!r}: use 'zero', 'fit' or an array {shape}.")
+        if any(y is None for _, y, _ in records):
+            raise StructureError("x0='fit' needs the outputs: pass Data, or x0='zero' or a state.")
+        return [fitted(i) for i in range(len(records))]
+    states = list(x0) if len(records) > 1 else [x0]
+    if len(states) != len(records):
+        raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
+    return [state_like(state, shape) for state in states]
+
+
+def signal_units(y: Array) -> Array:
+    """Standard deviation (l,) of every output, missing samples aside; one where it is zero or unknown."""
+    units = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
+    units[units == 0] = 1.0
+    return units
+
+
+def scaled_least_squares(design: Array, target: Array) -> Array:
+    """Solve least squares in columns of equal norm; directions without information stay at zero."""
+    sizes = np.linalg.norm(design, axis=0)
+    sizes[sizes == 0] = 1.0
+    return np.linalg.lstsq(design / sizes, target)[0] / sizes

@@ -1,23 +1,18 @@
 """Models for other tools: SciPy, python-control, and CasADi for predictive control."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.bases.basis import Basis, span
-from optid.bases.expansions import Linear, Polynomial, Trigonometric
-from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.errors import OptidError, StructureError, nearest
-from optid.models import simulation
+from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, USER, tabulated
 from optid.models.nonlinearity import Nonlinearity
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_arx import HammersteinARX
-    from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.state_space import StateSpace
+from optid.models.transfer_function import TransferFunction
 
 
-def to_dlti(model: "HammersteinARX", output: int | str = 0, input: int | str = 0) -> Any:
+def to_dlti(model: TransferFunction, output: int | str = 0, input: int | str = 0) -> Any:
     """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
 
     The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
@@ -40,7 +35,7 @@ def to_dlti(model: "HammersteinARX", output: int | str = 0, input: int | str = 0
     return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
 
 
-def to_control(model: "HammersteinARX") -> Any:
+def to_control(model: TransferFunction) -> Any:
     """Return the linear part, from every f to every output, as a python-control system.
 
     Its inputs are the values of the nonlinearities; the constant is not part of it. With one output it is a transfer
@@ -69,11 +64,11 @@ def control_package() -> Any:
     return control
 
 
-def to_casadi(model: "HammersteinARX") -> Any:
+def to_casadi(model: TransferFunction) -> Any:
     """Return the model as a `casadi.Function` (x, u) -> (x_next, y) without noise.
 
-    x has n l entries, n = `model.memory`: the rows of the state (n, l) one after the other, row i being what the past
-    adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The
+    x has n l entries, n = `model.largest_lag`: the rows of the state (n, l) one after the other, row i being what the
+    past adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The
     constant is part of y. Outside the interval of its basis f is clamped or extrapolated as chosen (outside="error"
     clamps, since a symbolic function cannot raise). Iterating equals `model.simulate`.
 
@@ -82,22 +77,22 @@ def to_casadi(model: "HammersteinARX") -> Any:
     """
     import casadi as ca
 
-    n, outputs = model.memory, model.l
+    n, outputs = model.largest_lag, model.l
     x, u = ca.MX.sym("x", n * outputs), ca.MX.sym("u", model.m)
     received = [ca.MX(model.offset if i == 0 else np.zeros(outputs)) for i in range(n + 1)]
     for c, nonlinearity in enumerate(model.nonlinearities):
         f = symbolic(nonlinearity, u[c])
-        for lag, row in simulation.lagged(model, c):
+        for lag, row in model.terms(c):
             received[lag] += ca.DM(row) * f
     rows = [x[i * outputs : (i + 1) * outputs] for i in range(n)] + [ca.MX.zeros(outputs)]
     y = rows[0] + received[0]
     following = [rows[i] + received[i] for i in range(1, n + 1)]
-    for i, a in enumerate(simulation.matrices_of(model)):
+    for i, a in enumerate(model.matrices):
         following[i] -= ca.DM(a) @ y
-    return ca.Function("hammerstein_arx", [x, u], [ca.vertcat(*following), y], ["x", "u"], ["x_next", "y"])
+    return ca.Function("hammerstein_tf", [x, u], [ca.vertcat(*following), y], ["x", "u"], ["x_next", "y"])
 
 
-def state_space_to_casadi(model: "HammersteinSS") -> Any:
+def state_space_to_casadi(model: StateSpace) -> Any:
     """Return a state-space model as a `casadi.Function` (x, u) -> (x_next, y), the free run without noise.
 
     Raises:
@@ -114,15 +109,15 @@ def state_space_to_casadi(model: "HammersteinSS") -> Any:
     return ca.Function("hammerstein_ss", [x, u], [following, y], ["x", "u"], ["x_next", "y"])
 
 
-def state_space(model: "HammersteinARX") -> tuple[Array, Array, Array, Array]:
+def state_space(model: TransferFunction) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C, D of the linear part in observer form, with n l states."""
-    n, outputs = model.memory, model.l
+    n, outputs = model.largest_lag, model.l
     rows = np.zeros((n + 1, outputs, model.m))
     for c in range(model.m):
-        for lag, row in simulation.lagged(model, c):
+        for lag, row in model.terms(c):
             rows[lag, :, c] = row
     a, b = np.eye(n * outputs, k=outputs), rows[1:].reshape(n * outputs, model.m)
-    for i, matrix in enumerate(simulation.matrices_of(model)):
+    for i, matrix in enumerate(model.matrices):
         at = slice(i * outputs, (i + 1) * outputs)
         a[at, :outputs] -= matrix
         b[at] -= matrix @ rows[0]
@@ -137,37 +132,37 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
     """
     import casadi as ca
 
-    basis, mu = nonlinearity.basis, nonlinearity.mu
-    if basis.interval is not None and basis.outside != "extrapolate":
-        u = ca.fmin(ca.fmax(u, basis.interval[0]), basis.interval[1])
-    if isinstance(basis, Linear):
-        f = float(mu[0]) * u
-    elif isinstance(basis, (Triangular, PiecewiseConstant, BSpline)):
-        f = _piecewise(basis, mu, u)
-    elif isinstance(basis, Polynomial):
-        f = _legendre(basis, mu, u)
-    elif isinstance(basis, Trigonometric):
-        lo, hi = span(basis)
-        angle = np.pi * (u - (lo + hi) / 2) / (basis.half_range * (hi - lo) / 2)
-        f = sum(mu[2 * j] * ca.cos((j + 1) * angle) + mu[2 * j + 1] * ca.sin((j + 1) * angle) for j in range(basis.p))
-    else:
+    tables = tabulated([nonlinearity])
+    kind, low, high, numbers = tables.kind[0], float(tables.low[0]), float(tables.high[0]), tables.numbers[0]
+    if kind == USER:
         raise StructureError(
-            f"{type(basis).__name__} has no symbolic form for CasADi: fit the model again with BSpline or Triangular."
+            f"{type(nonlinearity.basis).__name__} has no symbolic form for CasADi: fit the model again with BSpline or "
+            "Triangular."
         )
-    return f + (nonlinearity.offset or 0.0)
+    if tables.outside[0] != FREE:
+        u = ca.fmin(ca.fmax(u, low), high)
+    f: Any = nonlinearity.offset or 0.0
+    if nonlinearity.is_linear:
+        return float(nonlinearity.mu[0]) * u + f
+    if kind == CELLS:
+        return _piecewise(numbers, (u - low) * (len(numbers) / (high - low))) + f
+    if kind == LEGENDRE:
+        v = (2 * u - low - high) / (high - low)
+        previous, current = 1.0, v
+        for k, weight in enumerate(numbers[:, 0], start=1):
+            f = f + float(weight) * current
+            previous, current = current, ((2 * k + 1) * v * current - k * previous) / (k + 1)
+        return f
+    angle = float(tables.rate[0]) * (u - (low + high) / 2)
+    for k, (cosine, sine) in enumerate(numbers, start=1):
+        f = f + float(cosine) * ca.cos(k * angle) + float(sine) * ca.sin(k * angle)
+    return f
 
 
-def _piecewise(basis: Triangular | PiecewiseConstant | BSpline, mu: Array, u: Any) -> Any:
+def _piecewise(pieces: Array, x: Any) -> Any:
     """One polynomial per cell in the position within the cell; the end cells reach outwards."""
     import casadi as ca
 
-    lo, hi = span(basis)
-    degree = {Triangular: 1, PiecewiseConstant: 0}.get(type(basis), getattr(basis, "degree", 0))
-    x = (u - lo) * (basis.p / (hi - lo))
-    inside = (np.arange(degree + 1) + 0.5) / (degree + 1)
-    points = lo + (np.arange(basis.p)[:, None] + inside) * (hi - lo) / basis.p
-    values = (basis.values(points.ravel()) @ mu).reshape(points.shape)
-    pieces = np.linalg.solve(np.vander(inside), values.T).T
     f = None
     for cell, coefficients in enumerate(pieces):
         piece = float(coefficients[0])
@@ -177,19 +172,9 @@ def _piecewise(basis: Triangular | PiecewiseConstant | BSpline, mu: Array, u: An
     return f
 
 
-def _legendre(basis: Basis, mu: Array, u: Any) -> Any:
-    lo, hi = span(basis)
-    v = (2 * u - lo - hi) / (hi - lo)
-    previous, current, f = 1.0, v, mu[0] * v
-    for k in range(1, len(mu)):
-        previous, current = current, ((2 * k + 1) * v * current - k * previous) / (k + 1)
-        f = f + mu[k] * current
-    return f
-
-
-def _polynomials(model: "HammersteinARX", c: int) -> tuple[Array, Array]:
+def _polynomials(model: TransferFunction, c: int) -> tuple[Array, Array]:
     """Numerator without leading zeros and denominator in powers of z, for one output."""
-    n = model.memory
+    n = model.largest_lag
     numerator, denominator = np.zeros(n + 1), np.zeros(n + 1)
     denominator[: model.na + 1] = np.concatenate([[1.0], model.a])
     numerator[model.nk[c] : model.nk[c] + model.nb[c]] = model.b[c]

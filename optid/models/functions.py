@@ -1,4 +1,4 @@
-"""The static functions of a model, of its inputs and of the outputs it feeds back, as tables and figures name them."""
+"""The static functions and the responses of a model, as tables and figures name them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.bases.expansions import Linear
 from optid.data.record import Data
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
+
+LONGEST_STEP, SETTLED = 400, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class StaticFunction:
     @property
     def is_linear(self) -> bool:
         """Whether there is nothing to draw."""
-        return isinstance(self.nonlinearity.basis, Linear)
+        return self.nonlinearity.is_linear
 
     def samples(self, data: Data) -> Array:
         """Samples (N,) of its argument in a record, all experiments; NaN = missing."""
@@ -77,3 +79,24 @@ def _words(letter: str, places: tuple[int, ...], channels: tuple[str, ...], alon
         number = str(count[c]) if places.count(c) > 1 else ""
         words.append(f"{letter}{number}" + ("" if alone else f"_{channels[c]}"))
     return words
+
+
+def step_length(model: Model) -> int:
+    """Return the number of samples after which the step response of the linear part has settled within 2 %.
+
+    At least 20 and at most 400, and 50 for an unstable model, whose response does not settle.
+    """
+    if not model.is_stable:
+        return 50
+    decay = 0 if model.radius == 0 else int(np.ceil(np.log(SETTLED) / np.log(model.radius)))
+    return int(np.clip(1.5 * decay, 20, LONGEST_STEP))
+
+
+def response_pairs(model: Model) -> list[tuple[str, str]]:
+    """Return (input, output) of every column of a response of the linear part, in the order of its last two axes.
+
+    Where an input has several static functions there is one column for each of them, by its word.
+    """
+    words = [function.word for function in static_functions(model) if not function.fed_back]
+    sources = model.inputs if len(words) == model.m else words
+    return [(source, output) for output in model.outputs for source in sources]

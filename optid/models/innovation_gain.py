@@ -87,7 +87,7 @@ def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance:
     """Innovations (N, l) of every experiment under a gain, with the initial state that fits best, see `_initial`."""
     from optid.models.innovation_kernels import innovate
 
-    F, C, gain = np.ascontiguousarray(A - gain @ C), np.ascontiguousarray(C), np.ascontiguousarray(gain)
+    F, C, gain = _predictor(A, C, gain)
     rest = [np.ascontiguousarray(r) for r in rest]
     return [innovate(F, C, gain, r, x0) for r, x0 in zip(rest, _initial(F, C, gain, rest, covariance))]
 
@@ -151,12 +151,16 @@ def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array], covariance:
         covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
     weight = _whitening(covariance)
     settled, found = _settling(F), []
-    F, C, gain = np.ascontiguousarray(F), np.ascontiguousarray(C), np.ascontiguousarray(gain)
     for r in rest:
         part = np.ascontiguousarray(r[:settled])
         normal, right = innovation_moments(F, C, gain, part, np.zeros(len(F)), weight)
         found.append(_solved(normal[gain.size :, gain.size :], right[gain.size :]))
     return found
+
+
+def _predictor(A: Array, C: Array, gain: Array) -> tuple[Array, Array, Array]:
+    """Return A - K C, C and K as the kernels read them."""
+    return np.ascontiguousarray(A - gain @ C), np.ascontiguousarray(C), np.ascontiguousarray(gain)
 
 
 def _whitening(covariance: Array) -> Array:
@@ -176,8 +180,7 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
     from optid.models.innovation_kernels import innovation_slope
 
     sums, pairs = _products(errors)
-    root, F = _whitening(sums / np.maximum(pairs, 1.0)), np.ascontiguousarray(A - gain @ C)
-    C, gain = np.ascontiguousarray(C), np.ascontiguousarray(gain)
+    root, (F, C, gain) = _whitening(sums / np.maximum(pairs, 1.0)), _predictor(A, C, gain)
     weight = root.T @ root * np.mean(np.diag(pairs)) / np.maximum(pairs, 1.0)
     return np.sum([innovation_slope(F, C, gain, e, weight) for e in errors], axis=0).T.ravel()
 
@@ -189,8 +192,7 @@ def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covarianc
     """
     from optid.models.innovation_kernels import innovation_moments
 
-    weight, F, size = _whitening(covariance), np.ascontiguousarray(A - gain @ C), gain.size
-    C, gain = np.ascontiguousarray(C), np.ascontiguousarray(gain)
+    weight, (F, C, gain), size = _whitening(covariance), _predictor(A, C, gain), gain.size
     normal, right = np.zeros((size, size)), np.zeros(size)
     for r, x0 in zip(rest, _initial(F, C, gain, rest)):
         information, pull = innovation_moments(F, C, gain, np.ascontiguousarray(r), x0, weight)

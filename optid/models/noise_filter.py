@@ -9,13 +9,12 @@ is predicted until as many samples follow one another as D reaches back. A recor
 the last sample held in the gaps, and its first innovations count as zero while that is forgotten.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.models.recursions import lfilter
+from optid.models.recursions import late_njit, lfilter
 
 PRESENT, MISSING, DEAD = 0, 1, 2
 
@@ -50,11 +49,11 @@ def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 
         start: number of first samples whose innovation counts as zero and that are not predicted.
     """
     known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
-    samples = np.ascontiguousarray(s, dtype=float)
+    samples, c, d = np.ascontiguousarray(s, dtype=float), np.asarray(c), np.asarray(d)
     with np.errstate(all="ignore"):
-        found = Filtered(*_kernel()(samples, known, np.asarray(c), np.asarray(d), start, -1))
+        found = Filtered(*late_njit(_march)(samples, known, c, d, start, -1))
         if np.all(found.state != PRESENT) and np.isnan(samples).any():
-            found = Filtered(*_kernel()(samples, known, np.asarray(c), np.asarray(d), WARMING * start, start))
+            found = Filtered(*late_njit(_march)(samples, known, c, d, WARMING * start, start))
     return found
 
 
@@ -101,10 +100,3 @@ def _march(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) ->
                 state[k] = 0
         last = filled[k]
     return e, filled, predicted, state
-
-
-@cache
-def _kernel() -> Any:
-    from numba import njit
-
-    return njit(cache=True, nogil=True, error_model="numpy")(_march)

@@ -1,13 +1,14 @@
 """A static nonlinearity: a basis, its coefficients and, where the data determine it, an offset."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.bases.basis import Basis
+from optid.bases import Basis, Linear
+from optid.bases import from_dict as basis_from_dict
 from optid.errors import StructureError
 
 CHUNK = 65536
@@ -61,6 +62,29 @@ class Nonlinearity:
             f[start : start + CHUNK] = sums
         return float(f[0]) if u.ndim == 0 else f.reshape(u.shape)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether f is a straight line through the origin."""
+        return isinstance(self.basis, Linear)
+
+    @property
+    def unit_slope(self) -> float:
+        """The factor that turns a linear f into f(u) = u; one for every other."""
+        return 1 / float(self.mu[0]) if self.is_linear and self.mu[0] != 0 else 1.0
+
+    def scaled(self, factor: float) -> "Nonlinearity":
+        """Return factor times f, the offset as it is."""
+        return replace(self, mu=factor * self.mu)
+
+    def mapped(self, scale: float, offset: float) -> tuple["Nonlinearity", float]:
+        """Express f in the units v = scale u + offset: f(u) = g(v) + c; return g and c.
+
+        Raises:
+            StructureError: a basis of UserFunctions, which keeps its units.
+        """
+        basis, matrix, constant = self.basis.mapped(scale, offset)
+        return Nonlinearity(basis, matrix @ self.mu), float(constant @ self.mu)
+
     def to_dict(self) -> dict[str, Any]:
         """Describe basis and coefficients in JSON types; the constant belongs to the model."""
         return {"basis": self.basis.to_dict(), "mu": self.mu.tolist()}
@@ -68,9 +92,7 @@ class Nonlinearity:
     @classmethod
     def from_dict(cls, content: dict[str, Any], functions: dict[str, Any] | None = None) -> "Nonlinearity":
         """Build what `to_dict` described; `functions` are those of a basis of UserFunctions, by name."""
-        from optid.bases import from_dict
-
-        return cls(from_dict(content["basis"], functions), np.array(content["mu"], dtype=float))
+        return cls(basis_from_dict(content["basis"], functions), np.array(content["mu"], dtype=float))
 
     def slope(self, u: ArrayLike) -> Any:
         """Evaluate f'(u), any shape; to the right at kinks, zero where f is clamped."""

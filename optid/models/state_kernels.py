@@ -7,8 +7,8 @@ model's own output where it is NaN; the state is corrected by K times the innova
     P2, measured feedback:   outputs given, K = 0
     P3, free run:            no outputs given
 
-The arguments are the named tuples `Parts` and `Stretch` of `optid.models.state_simulation` and `Tables` of
-`optid.models.feedback_tables`. Compiled at the first call and cached on disk.
+The arguments are the named tuples `Parts` and `Tables` of `optid.models.feedback_tables` and `Stretch` of
+`optid.models.state_simulation`. Compiled at the first call and cached on disk.
 """
 
 import numpy as np
@@ -63,7 +63,7 @@ def value_and_slope(tables, j, v):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def march(parts, stretch, x, turn, outputs, jacobian):
+def march(parts, stretch, x, turn, outputs, jacobian, states):
     """Run over a stretch and leave the state behind.
 
     Args:
@@ -73,6 +73,7 @@ def march(parts, stretch, x, turn, outputs, jacobian):
         turn: (n, q) derivative of the state with respect to q numbers, changed in place; q = 0 for none.
         outputs: (T, l) written.
         jacobian: (T, l, q) derivative of the outputs, written.
+        states: (T, n) state before every sample, written; (0, n) for none.
 
     Returns:
         how the run ended and the sample at which it did.
@@ -82,6 +83,8 @@ def march(parts, stretch, x, turn, outputs, jacobian):
     later, turned = np.empty(n), np.empty((n, q))
     for k in range(stretch.y.shape[0]):
         for i in range(n):
+            if states.shape[0] > 0:
+                states[k, i] = x[i]
             later[i] = stretch.drive[k, i]
             for j in range(n):
                 later[i] += A[i, j] * x[j]
@@ -129,72 +132,3 @@ def march(parts, stretch, x, turn, outputs, jacobian):
             for p in range(q):
                 turn[i, p] = turned[i, p]
     return INSIDE, stretch.y.shape[0]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def look_ahead(parts, stretch, x, horizon, starts, predictions):
-    """Run the innovation form, and from the states on the way march on freely for `horizon` - 1 samples.
-
-    Args:
-        parts: matrices and tables.
-        stretch: what drives them, T samples.
-        x: (n,) state, changed in place: that after `starts` samples.
-        horizon: how many samples ahead.
-        starts: number of samples, from the first, to start from.
-        predictions: (T, l) written, from row `horizon` - 1 on.
-
-    Returns:
-        how the run ended and the sample at which it did.
-    """
-    A, C, E, L, K = parts.A, parts.C, parts.E, parts.L, parts.K
-    n, l, s, count = A.shape[0], C.shape[0], E.shape[1], stretch.y.shape[0]  # noqa: E741
-    state, later, kept, now = np.empty(n), np.empty(n), np.empty(n), np.empty(l)
-    for k in range(starts):
-        for i in range(n):
-            state[i] = x[i]
-        for ahead in range(min(horizon, count - k)):
-            at = k + ahead
-            for o in range(l):
-                now[o] = stretch.direct[at, o]
-                for i in range(n):
-                    now[o] += C[o, i] * state[i]
-                if ahead == horizon - 1:
-                    if not (stretch.low[o] <= now[o] <= stretch.high[o]):
-                        return LEFT, at
-                    predictions[at, o] = now[o]
-            if ahead == horizon - 1 and ahead > 0:
-                break
-            for i in range(n):
-                later[i] = stretch.drive[at, i]
-                for j in range(n):
-                    later[i] += A[i, j] * state[j]
-            if ahead == 0:  # the step that the next sample starts from sees this sample
-                for i in range(n):
-                    kept[i] = later[i]
-                    for o in range(l):
-                        given = stretch.y[k, o]
-                        kept[i] += L[i, o] * now[o] if np.isnan(given) else L[i, o] * given + K[i, o] * (given - now[o])
-                for j in range(s):
-                    fed = stretch.feedback[k, j]
-                    if np.isnan(fed):
-                        fed, slope, refused = value_and_slope(parts.tables, j, now[parts.output_of[j]])
-                        if refused:
-                            return REFUSED, k
-                    for i in range(n):
-                        kept[i] += E[i, j] * fed
-                if horizon == 1:
-                    break
-            for o in range(l):
-                for i in range(n):
-                    later[i] += L[i, o] * now[o]
-            for j in range(s):
-                fed, slope, refused = value_and_slope(parts.tables, j, now[parts.output_of[j]])
-                if refused:
-                    return REFUSED, at
-                for i in range(n):
-                    later[i] += E[i, j] * fed
-            for i in range(n):
-                state[i] = later[i]
-        for i in range(n):
-            x[i] = kept[i]
-    return INSIDE, count

@@ -4,18 +4,16 @@ P1 predicts with the innovation form, P2 feeds the measured outputs to g without
 Inputs are expanded stretch by stretch, so nothing of the size samples x functions is formed for the whole record.
 """
 
-import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import DataError, DataWarning, StructureError
-from optid.models.feedback_tables import Tables
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
+from optid.errors import DataError
+from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
+from optid.models.feedback_tables import Parts
+from optid.models.state_space import StateSpace
 
 STRETCH = 16384
 """Samples expanded at a time."""
@@ -32,18 +30,6 @@ SETTLED = 1e-20
 
 ROUNDING = 1e-14
 SIMULATORS = ("predict", "measured_feedback", "free")
-
-
-class Parts(NamedTuple):
-    """Matrices of x+ = A x + ... + E g(y) + L y + K e, y = C x + ... as the kernels read them."""
-
-    A: Array
-    C: Array
-    E: Array
-    L: Array
-    K: Array
-    output_of: np.ndarray
-    tables: Tables
 
 
 class Stretch(NamedTuple):
@@ -65,6 +51,10 @@ class Stretch(NamedTuple):
     low: Array
     high: Array
 
+    def part(self, samples: slice) -> "Stretch":
+        """Return the stretch cut to some samples."""
+        return Stretch._make([*(signal[samples] for signal in self[:4]), *self[4:]])
+
 
 class Run(NamedTuple):
     """One record under one simulator.
@@ -79,7 +69,7 @@ class Run(NamedTuple):
         label: words that name the experiment in a message.
     """
 
-    model: "HammersteinSS"
+    model: StateSpace
     u: Array
     known: Array | None
     gain: Array
@@ -88,7 +78,7 @@ class Run(NamedTuple):
     label: str
 
 
-def prepared(model: "HammersteinSS", simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
+def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
     """Return what a simulator runs over.
 
     Args:
@@ -116,31 +106,38 @@ def run(job: Run, x0: Array) -> Array:
     Raises:
         DataError: an output that leaves the range allowed, named by channel and sample.
     """
-    outputs = np.empty((len(job.u), job.model.l))
-    x = np.array(x0, dtype=float)
-    for first, last, stretch in _stretches(job):
-        none = np.zeros((x.size, 0)), np.zeros((last - first, job.model.l, 0))
-        _checked(job, first, *_march(job, stretch, x, none[0], outputs[first:last], none[1]))
-    return outputs
+    return ahead(job, x0, 1)
 
 
 def ahead(job: Run, x0: Array, horizon: int) -> Array:
-    """Predict (N, l) several samples ahead with the innovation form; NaN in the first horizon - 1 samples.
+    """Run freely for `horizon` - 1 samples from the state before every sample; the outputs (N, l) at the end.
+
+    Returns:
+        NaN in the first `horizon` - 1 samples.
 
     Raises:
-        DataError: a prediction that leaves the range of numbers, named by channel and sample.
+        DataError: an output that leaves the range allowed, named by channel and sample.
     """
-    if horizon == 1:
-        return run(job, x0)
-    predictions = np.full((len(job.u), job.model.l), np.nan)
+    model, outputs = job.model, np.full((len(job.u), job.model.l), np.nan)
     x = np.array(x0, dtype=float)
+    none = np.zeros((x.size, 0)), np.zeros((STRETCH, model.l, 0))
     for first, last, stretch in _stretches(job, overlap=horizon - 1):
         starts = min(STRETCH, last - first)
-        target = np.full((last - first, job.model.l), np.nan)
-        _checked(job, first, *_ahead(job, stretch, x, horizon, starts, target))
-        begin = min(first + horizon - 1, last)
-        predictions[begin:last] = target[begin - first :]
-    return predictions
+        states = np.empty((starts if horizon > 1 else 0, x.size))
+        y = np.empty((starts, model.l))
+        _march(job, first, stretch.part(slice(starts)), x, none[0], y, none[1], states)
+        for i in range(1, horizon):
+            states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
+            with np.errstate(all="ignore"):
+                states = states @ model.A.T + stretch.drive[i - 1 : i - 1 + len(states)] + y @ model.L.T
+                for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
+                    states += g(y[:, o])[:, None] * model.E[:, j]
+                y = states @ model.C.T + stretch.direct[i : i + len(states)]
+            wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
+            if wild.any():
+                raise _left(job, first + i + int(np.argmax(wild)))
+        outputs[first + horizon - 1 : first + horizon - 1 + len(y)] = y
+    return outputs
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
@@ -162,14 +159,11 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
     if n == 0 or not np.isfinite(y).any():
         return x
-    unit = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
-    unit[unit == 0] = 1.0
+    unit = signal_units(y)
     affine = not job.model.feedback or (job.known is not None and not np.isnan(job.known).any())
     root, cost = _linearised(job, y, unit, x, whole=not affine)
     for _ in range(STEPS):
-        sizes = np.linalg.norm(root[:, :n], axis=0)
-        sizes[sizes == 0] = 1.0
-        step = np.linalg.lstsq(root[:, :n] / sizes, root[:, n])[0] / sizes
+        step = scaled_least_squares(root[:, :n], root[:, n])
         if affine:
             return x + step
         expected = float(np.sum((root[:, :n] @ step) ** 2))
@@ -209,7 +203,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
         if not informs:
             turn = np.zeros((n, 0))
         jacobian = np.empty((last - first, outputs, turn.shape[1]))
-        _checked(job, first, *_march(job, stretch, x, turn, simulated, jacobian))
+        _march(job, first, stretch, x, turn, simulated, jacobian, np.zeros((0, n)))
         error = (y[first:last] - simulated) / unit
         present = ~np.isnan(error)
         cost += float(np.sum(error[present] ** 2))
@@ -217,7 +211,8 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not np.all(np.isfinite(rows)):
                 raise DataError(
-                    f"{job.label}The effect of the initial state leaves the range of numbers: {radius(job.model)}"
+                    f"{job.label}The effect of the initial state leaves the range of numbers: the largest pole has "
+                    f"radius {job.model.radius:.6g}."
                 )
             root = np.asarray(np.linalg.qr(np.vstack([root, rows]), mode="r"))
             largest = max(largest, float(np.abs(turn).max()))
@@ -242,47 +237,6 @@ def allowed_range(data: Any) -> Any:
     return middle - reach, middle + reach
 
 
-def check_inputs(model: "HammersteinSS", u: Array, label: str) -> None:
-    """Refuse missing and infinite inputs, which a state cannot pass over."""
-    bad = ~np.isfinite(u)
-    if bad.any():
-        k, c = np.argwhere(bad)[0]
-        raise DataError(
-            f"{label}Input {model.inputs[c]!r} is missing at sample {k} ({int(bad[:, c].sum())} in all): the state "
-            "needs every input. Interpolate it, or split the record there."
-        )
-
-
-def warn_unstable(model: "HammersteinSS") -> None:
-    """Say that a simulation without feedback will grow without bound.
-
-    Warns:
-        DataWarning: with the pole radius.
-    """
-    if not model.is_stable and not model.feedback and not np.any(model.L):
-        warnings.warn(
-            f"The model is unstable: {radius(model)} Its simulation grows and tells little about the fit; "
-            "use one-step prediction, or identify with a stability constraint.",
-            DataWarning,
-            stacklevel=3,
-        )
-
-
-def state_like(model: "HammersteinSS", x0: Any) -> Array:
-    """Read an initial state (n,) given by the user."""
-    state = np.atleast_1d(np.asarray(x0, dtype=float))
-    if state.shape != (model.nx,):
-        raise StructureError(f"x0 has shape {np.shape(x0)}; the state of this model is ({model.nx},).")
-    if not np.all(np.isfinite(state)):
-        raise DataError("x0 contains a value that is not finite.")
-    return state
-
-
-def radius(model: "HammersteinSS") -> str:
-    """Say where the largest pole is."""
-    return f"its largest pole has radius {np.max(np.abs(model.poles), initial=0.0):.6g}."
-
-
 def _stretches(job: Run, length: int = 0, overlap: int = 0) -> Iterator[tuple[int, int, Stretch]]:
     model, length = job.model, length or STRETCH
     for first in range(0, len(job.u), length):
@@ -298,77 +252,58 @@ def _stretches(job: Run, length: int = 0, overlap: int = 0) -> Iterator[tuple[in
         )
 
 
-def _march(job: Run, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array) -> tuple[int, int]:
+def _march(job: Run, first: int, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array,
+           states: Array) -> None:
+    """Run over a stretch that begins at sample `first`; see `optid.models.state_kernels.march`.
+
+    Raises:
+        DataError: an output that leaves the range allowed, or the interval of a basis that refuses.
+    """
+    from optid.models.state_kernels import LEFT, REFUSED, march
+
     parts = job.model.parts._replace(K=job.gain)
     if not parts.tables.compiled and np.isnan(stretch.feedback).any():
-        return _march_in_python(job.model, parts, stretch, x, turn, outputs, jacobian)
-    from optid.models.state_kernels import march
-
-    return march(parts, stretch, x, turn, outputs, jacobian)
-
-
-def _ahead(job: Run, stretch: Stretch, x: Array, horizon: int, starts: int, target: Array) -> tuple[int, int]:
-    parts = job.model.parts
-    if parts.tables.compiled:
-        from optid.models.state_kernels import look_ahead
-
-        return look_ahead(parts, stretch, x, horizon, starts, target)
-    from optid.models.state_kernels import INSIDE
-
-    nothing = np.zeros((x.size, 0)), np.zeros((horizon, job.model.l, 0))
-    for k in range(starts):
-        state, count = x.copy(), min(horizon, len(stretch.y) - k)
-        one = Stretch._make([*(part[k : k + 1] for part in stretch[:4]), *stretch[4:]])
-        _march_in_python(job.model, parts, one, x, nothing[0], np.empty((1, job.model.l)), nothing[1])
-        free = Stretch._make([*(part[k : k + count] for part in stretch[:4]), *stretch[4:]])
-        free = free._replace(feedback=np.full_like(free.feedback, np.nan), y=np.full_like(free.y, np.nan))
-        found = np.empty((count, job.model.l))
-        ended, at = _march_in_python(job.model, parts, free, state, nothing[0], found, nothing[1])
-        if ended != INSIDE:
-            return ended, k + at
-        if count == horizon:
-            target[k + horizon - 1] = found[-1]
-    return INSIDE, len(stretch.y)
-
-
-def _march_in_python(
-    model: "HammersteinSS", parts: Parts, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array
-) -> tuple[int, int]:
-    """Run the recursion of `optid.models.state_kernels.march` for functions that cannot be compiled."""
-    from optid.models.state_kernels import INSIDE, LEFT
-
-    where = np.array(model.output_of, dtype=int)
-    for k, given in enumerate(stretch.y):
-        y = stretch.direct[k] + parts.C @ x
-        if not np.all((stretch.low <= y) & (y <= stretch.high)):
-            return LEFT, k
-        outputs[k] = y
-        moved = parts.C @ turn
-        jacobian[k] = moved
-        free = np.isnan(given)
-        error = np.where(free, 0.0, given - y)
-        g, slopes = stretch.feedback[k].copy(), np.zeros(where.size)
-        for j in np.flatnonzero(np.isnan(g)):
-            g[j], slopes[j] = model.feedback[j](y[where[j]]), model.feedback[j].slope(y[where[j]])
-        pulled = parts.L * free - parts.K * ~free
-        turn[:] = parts.A @ turn + pulled @ moved + (parts.E * slopes) @ moved[where]
-        x[:] = parts.A @ x + stretch.drive[k] + parts.E @ g + parts.L @ np.where(free, y, given) + parts.K @ error
-    return INSIDE, len(stretch.y)
-
-
-def _checked(job: Run, first: int, ended: int, at: int) -> None:
-    from optid.models.state_kernels import INSIDE, REFUSED
-
-    if ended == INSIDE:
-        return
+        ended, at = _march_by_steps(job.model, parts, stretch, x, turn, outputs, jacobian, states)
+    else:
+        ended, at = march(parts, stretch, x, turn, outputs, jacobian, states)
     if ended == REFUSED:
         raise DataError(
             f"{job.label}At sample {first + at} the simulated output leaves the interval of a feedback basis with "
             "outside='error'. Use outside='clamp' or 'extrapolate', or a longer interval."
         )
+    if ended == LEFT:
+        raise _left(job, first + at)
+
+
+def _left(job: Run, sample: int) -> DataError:
+    """The error that says at which sample a run left the range allowed."""
     finite = bool(np.all(job.high < np.finfo(float).max))
     what = f"{FAR:g} times the range of the data" if finite else "the range of numbers"
-    raise DataError(
-        f"{job.label}The simulated output leaves {what} at sample {first + at}: {radius(job.model)} Identify the model "
-        "with a stability constraint, predict one step ahead, or simulate fewer samples."
+    return DataError(
+        f"{job.label}The simulated output leaves {what} at sample {sample}: the largest pole has radius "
+        f"{job.model.radius:.6g}. Identify the model with a stability constraint, predict one step ahead, or simulate "
+        "fewer samples."
     )
+
+
+def _march_by_steps(
+    model: StateSpace, parts: Parts, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array,
+    states: Array,
+) -> tuple[int, int]:
+    """Run the kernel sample by sample, with the tangents of functions that it cannot evaluate as feedback."""
+    from optid.models.state_kernels import INSIDE, march
+
+    where = np.array(model.output_of, dtype=int)
+    for k in range(len(stretch.y)):
+        y = stretch.direct[k] + parts.C @ x
+        g, slopes = stretch.feedback[k].copy(), np.zeros(where.size)
+        for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():
+            slopes[j] = model.feedback[j].slope(y[where[j]])
+            g[j] = model.feedback[j](y[where[j]]) - slopes[j] * y[where[j]]
+        tangents = parts.L + (parts.E * slopes) @ np.eye(model.l)[where]
+        here = slice(k, k + 1)
+        one = stretch.part(here)._replace(feedback=g[None])
+        ended, _ = march(parts._replace(L=tangents), one, x, turn, outputs[here], jacobian[here], states[here])
+        if ended != INSIDE:
+            return ended, k
+    return INSIDE, len(stretch.y)

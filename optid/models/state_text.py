@@ -1,24 +1,24 @@
 """A state-space model as text: equations for few states, a summary beyond."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.models.functions import static_functions
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.state_space import StateSpace
+from optid.models.text import signed_sum
 
 READABLE = 4
 """Most states whose equations are written out."""
 
 
-def written(model: "HammersteinSS", digits: int = 4) -> str:
+def written(model: StateSpace, digits: int = 4) -> str:
     """Write the equations with coefficients of so many significant digits; see `HammersteinSS.equation`."""
     return _equations(model, digits) if model.nx <= READABLE else _summary(model)
 
 
-def listed(model: "HammersteinSS") -> list[tuple[str, float]]:
+def listed(model: StateSpace) -> list[tuple[str, float]]:
     """Names and values of all matrices, one line each; see `HammersteinSS.coefficients`."""
     functions, fed = _function_names(model), _feedback_names(model)
     states = [f"x{i + 1}" for i in range(model.nx)]
@@ -37,7 +37,7 @@ def listed(model: "HammersteinSS") -> list[tuple[str, float]]:
     return found
 
 
-def _function_names(model: "HammersteinSS") -> list[str]:
+def _function_names(model: StateSpace) -> list[str]:
     """Words of the functions of the inputs; the input itself where it is linear and has no other."""
     found = [function for function in static_functions(model) if not function.fed_back]
     several = [model.input_of.count(function.channel) > 1 for function in found]
@@ -46,11 +46,11 @@ def _function_names(model: "HammersteinSS") -> list[str]:
     ]
 
 
-def _feedback_names(model: "HammersteinSS") -> list[str]:
+def _feedback_names(model: StateSpace) -> list[str]:
     return [function.word for function in static_functions(model) if function.fed_back]
 
 
-def _equations(model: "HammersteinSS", digits: int) -> str:
+def _equations(model: StateSpace, digits: int) -> str:
     functions = []
     for (f, c), name in zip(zip(model.nonlinearities, model.input_of), _function_names(model)):
         sample = f"{model.inputs[c]}(k)"
@@ -75,19 +75,13 @@ def _equations(model: "HammersteinSS", digits: int) -> str:
     return "\n".join(lines)
 
 
-def _sum(rows: list, digits: int) -> str:
-    text = ""
-    for values, terms in rows:
-        for value, (scale, name) in zip(values, terms):
-            number = float(value) * scale
-            if number:
-                text += (" - " if number < 0 else " + ") + f"{abs(number):.{digits}g}" + (f" {name}" if name else "")
-    text = text.removeprefix(" + ")
-    text = "-" + text.removeprefix(" - ") if text.startswith(" - ") else text
-    return text or "0"
+def _sum(rows: Sequence[tuple[Array, Sequence[tuple[float, str]]]], digits: int) -> str:
+    """Write the sum of rows of coefficients times (scale, name) of what they multiply."""
+    terms = [(float(v) * scale, name) for values, words in rows for v, (scale, name) in zip(values, words)]
+    return signed_sum(terms, digits)
 
 
-def _summary(model: "HammersteinSS") -> str:
+def _summary(model: StateSpace) -> str:
     arguments = ", ".join(model.inputs)
     state = f"x(k+1) = A x(k) + B f({arguments})"
     if model.feedback:

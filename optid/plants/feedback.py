@@ -140,8 +140,7 @@ def two_mode_plant(coupled: bool = False, process: float = 0.0, measurement: flo
         StructureError: a negative deviation, or no measurement noise.
     """
     from optid.models.hammerstein_ss import HammersteinSS
-    from optid.models.kalman import kalman_gain
-    from optid.models.noise_covariances import NoiseCovariances
+    from optid.models.kalman import NoiseCovariances, kalman_gain
 
     check_nonnegative(process=process)
     check_positive(measurement=measurement)

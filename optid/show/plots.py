@@ -16,8 +16,7 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.functions import has_feedback, static_functions
-from optid.models.responses import response_pairs, step_length
+from optid.models.functions import has_feedback, response_pairs, static_functions, step_length
 from optid.show import panels, summary
 from optid.show.estimates import uncertainty
 from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
@@ -199,7 +198,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     """
     compressed, found = fit.program.compressed, {}
     heights = fit.program.view.units
-    if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
+    if fit.model.structure != "arx" or compressed is None or not fit.solution.has_point:
         return found
     if rank_one_of(fit.program) is not None:
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear

@@ -8,7 +8,7 @@ import numpy as np
 from optid.data.record import Data
 from optid.identify.validation.predictions import predictors
 from optid.models.functions import has_feedback, static_functions
-from optid.models.noise_covariances import NoiseCovariances
+from optid.models.kalman import NoiseCovariances
 from optid.program.solution import Status
 from optid.show.wording import Table, gap_text, number, percent, seconds
 
@@ -212,8 +212,8 @@ def model_facts(fit: "Fit") -> Facts:
         ("Orders", ", ".join(f"{name} {_order(value)}" for name, value in model.orders.items())),
         ("Poles", ", ".join(_complex(p) for p in model.poles) or "none"),
     ]
-    if isinstance(getattr(model, "noise", None), str):
-        facts.append(("Noise", model.noise))
+    if isinstance(noise := getattr(model, "noise", None), str) and noise:
+        facts.append(("Noise", noise))
     if gauge := _gauge(model):
         facts.append(("Gauge", gauge))
     functions = [function for function in static_functions(model) if not function.is_linear]

@@ -22,8 +22,8 @@ from optid.faults.monitor.tables import blank, monitored, tables, with_threshold
 from optid.faults.signatures import Dictionary, dictionary
 from optid.faults.whitening import health, whiten
 from optid.identify.recursive.intake import as_block
+from optid.models.experiments import state_like
 from optid.models.feedback_tables import tabulated
-from optid.models.state_simulation import state_like
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -141,7 +141,7 @@ class Monitor:
 
             lose_state(self._tables, self._state)
         elif not (isinstance(x0, str) and x0 == "zero"):
-            self._state.v[at.X, : model.nx] = state_like(model, x0)
+            self._state.v[at.X, : model.nx] = state_like(x0, (model.nx,))
 
     def _of(self, found: Dictionary, window: int, seed: int | None) -> None:
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None

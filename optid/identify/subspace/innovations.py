@@ -15,8 +15,7 @@ from optid.arrays import Array
 from optid.data.stretches import runs_of
 from optid.errors import DataError, StructureError
 from optid.identify.subspace.observer import observer_gain
-from optid.models.kalman import kalman_gain
-from optid.models.noise_covariances import NoiseCovariances
+from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.roots import spectral_radius
 from optid.statistics.factors import add_to_root
 

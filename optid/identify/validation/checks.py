@@ -20,7 +20,7 @@ from optid.identify.validation.correlations import (
 from optid.identify.validation.measures import Measures, measured, measured_each
 from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, predictors, simulated
 from optid.identify.validation.structure import Structure, structure_test
-from optid.models.coefficients import checked_horizon
+from optid.models.experiments import checked_horizon
 from optid.models.functions import has_feedback, static_functions
 
 LAGS = 25

@@ -11,7 +11,7 @@ from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation.measures import fit_percent
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.coefficients import checked_horizon
+from optid.models.experiments import checked_horizon
 
 HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 """Samples ahead at which the fit is evaluated, as far as the record reaches."""

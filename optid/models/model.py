@@ -1,0 +1,341 @@
+"""What every model shares: channels, units, gauge, stability, responses, running over records, text and files."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.data.channels import Transform, numbered_names
+from optid.data.record import Data
+from optid.data.stretches import runs_of
+from optid.errors import DataError, DataWarning, StructureError, nearest
+from optid.models import files, roots
+from optid.models.experiments import Record, checked_horizon, one_or_all, records_of, states_of
+from optid.models.nonlinearity import Nonlinearity
+
+NAMES = ("inputs", "outputs", "input_units", "output_units")
+
+
+def finite(values: Any, name: str) -> Array:
+    """Copy coefficients into a read-only float64 array.
+
+    Raises:
+        StructureError: a value that is not finite.
+    """
+    array = np.array(values, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise StructureError(f"{name} contains a value that is not finite.")
+    array.flags.writeable = False
+    return array
+
+
+class Model:
+    """A linear part between static functions, with named channels; the fields are those of its dataclasses.
+
+    Attributes:
+        nonlinearities: functions of the inputs.
+        dt: sampling time.
+        inputs: names of the m inputs; u or u1, u2, ... by default.
+        outputs: names of the l outputs; y or y1, y2, ... by default.
+        input_units: one per input, "" where unknown.
+        output_units: one per output, "" where unknown.
+        gauge: how the scale between f and B is fixed; see `regauge`.
+        poles: complex, largest first.
+        memory: samples at the start of a record that cannot be predicted.
+        structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
+    """
+
+    nonlinearities: tuple[Nonlinearity, ...]
+    dt: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    gauge: str
+    poles: Any
+    memory: int
+    structure: Any
+    GAUGES: ClassVar[tuple[str, ...]]
+    SIMULATORS: ClassVar[tuple[str, ...]]
+    equation: Callable[..., str]
+    impulse_response: Callable[..., Array]
+    _state_shape: Any
+    _predicted: Callable[[Array, Array, int, Array, str], Array]
+    _run: Callable[[str, Sequence[Record], Any], list[Array]]
+    _fitted: Callable[[str, Array, Any, str], Array]
+    _regauged: Callable[[str, bool], Self]
+    _in_raw_units: Callable[[Transform], Self]
+
+    def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
+        """Set the fields of a new model, with default names and units for m inputs and l outputs.
+
+        Raises:
+            StructureError: an impossible sampling time, an unknown gauge.
+        """
+        fixed = {
+            **fields,
+            "nonlinearities": tuple(fields.get("nonlinearities", self.nonlinearities)),
+            "dt": float(self.dt),
+            "inputs": tuple(self.inputs) or numbered_names("u", m),
+            "outputs": tuple(self.outputs) or numbered_names("y", l),
+        }
+        for kind in ("input", "output"):
+            fixed[f"{kind}_units"] = tuple(getattr(self, f"{kind}_units")) or ("",) * len(fixed[f"{kind}s"])
+        for name, value in fixed.items():
+            object.__setattr__(self, name, value)
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise StructureError(f"dt = {self.dt!r}: a positive number.")
+        if self.gauge not in self.GAUGES:
+            raise StructureError(f"Unknown gauge {self.gauge!r}: use one of {', '.join(self.GAUGES)}.")
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def kind(self) -> str:
+        """The word for this class in model files."""
+        return type(self).__name__
+
+    @property
+    def _family(self) -> str:
+        """The first word of the title."""
+        return "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
+
+    @property
+    def radius(self) -> float:
+        """Modulus of the largest pole; zero without poles."""
+        return float(np.max(np.abs(self.poles), initial=0.0))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all poles lie inside the unit circle."""
+        return self.radius < 1
+
+    def step_response(self, n: int = 100) -> Array:
+        """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
+        return np.cumsum(self.impulse_response(n), axis=0)
+
+    def _operating_point(self, u0: ArrayLike) -> Array:
+        """Read constant inputs (m,).
+
+        Raises:
+            StructureError: another number of them.
+        """
+        points = np.atleast_1d(np.asarray(u0, dtype=float))
+        if points.shape != (self.m,):
+            raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
+        return points
+
+    def __str__(self) -> str:
+        """Return the equations and the poles."""
+        return self.equation() + (f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else "")
+
+    # -- running over records ------------------------------------------------------------------------------------
+
+    def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
+        """Predict one or several steps ahead: every output up to `horizon` samples before is known, and all inputs.
+
+        An ARX model predicts where every sample it needs is present. In the others a missing output counts as an
+        innovation of zero: it corrects nothing, and feedback sees the prediction instead. A missing input leaves no
+        prediction: with ARMAX where it reaches, with the others in the sample, after which the state is estimated anew;
+        stretches too short for that are not predicted.
+
+        Args:
+            data: the record; detrended or scaled data are taken back to raw units first.
+            horizon: how many samples ahead.
+            x0: state at the first sample: "fit" (least squares of the one-step prediction errors), "zero", or the
+                state, one for each experiment. ARX and ARMAX models need none.
+
+        Returns:
+            (N, l) in raw units, NaN where there is no prediction and in the first `memory` + horizon - 1 samples; a
+            tuple of such arrays for several experiments. ARMAX: NaN on until so many outputs follow one another without
+            a gap (ten times `memory` samples where they never do).
+
+        Raises:
+            DataError: no stretch with every input, other channels or sampling time than the model's, predictions that
+                leave the range of numbers.
+            StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
+        """
+        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
+        fit = isinstance(x0, str) and x0 == "fit"
+        states = [None] * len(records) if fit else self._states("predict", records, x0)
+        predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
+        if self.structure not in ("arx", "armax") and all(np.isnan(p).all() for p in predicted) and any(
+            np.isnan(u).any() for u, _, _ in records
+        ):
+            raise DataError(
+                f"no stretch of {2 * self._state_shape[0] + 1} samples has every input: interpolate them, or leave an "
+                "input out"
+            )
+        return one_or_all(predicted)
+
+    def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
+        """Predict one record in raw units; see `predict`.
+
+        Args:
+            u: (N, m) inputs, NaN = missing.
+            y: (N, l) outputs, NaN = missing.
+            horizon: how many samples ahead, from 1.
+            x0: state at the first sample; None for that of the smallest one-step prediction errors.
+            label: words that name the experiment in a message.
+
+        Returns:
+            (N, l), NaN where there is no prediction.
+
+        Raises:
+            DataError: as `predict`.
+        """
+        known, prediction = np.isfinite(u).all(axis=1), np.full(y.shape, np.nan)
+        for first, last in runs_of(known):
+            inputs, outputs, state = u[first:last], y[first:last], x0 if first == 0 else None
+            if state is None:
+                if not known.all() and np.isfinite(outputs).sum(axis=0).min() <= 2 * self._state_shape[0]:
+                    continue  # the estimated state would repeat the outputs
+                state = self._fitted("predict", inputs, outputs, label)
+            prediction[first:last] = self._predicted(inputs, outputs, horizon, state, label)
+        return prediction
+
+    def simulate(self, data: Any, x0: Any = "zero") -> Any:
+        """Compute the outputs from the inputs alone; nonlinear feedback sees the model's own outputs (P3).
+
+        Args:
+            data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
+            x0: "zero" (nothing before the record), "fit" (least squares on the outputs present; needs Data), or the
+                state, one for each experiment; see `initial_state`.
+
+        Returns:
+            (N, l) in raw units, or (N,) for u given as (N,) and one output; a tuple of such arrays for several
+            experiments.
+
+        Raises:
+            DataError: a missing input, other channels or sampling time, or an output that leaves the range of numbers
+                (with nonlinear feedback and Data: 100 times the range of the data), with the sample at which it does.
+            StructureError: an x0 that cannot be read.
+
+        Warns:
+            DataWarning: the model is unstable.
+        """
+        records, flat = records_of(self, data)
+        outputs = self._run("free", records, x0)
+        return one_or_all([y[:, 0] for y in outputs] if flat and self.l == 1 else outputs)
+
+    def innovations(self, data: Data, x0: Any = "fit") -> Any:
+        """Return the one-step prediction errors (N, l), NaN where there is none; a tuple for several experiments.
+
+        Args:
+            data: as `predict`.
+            x0: as `predict`.
+        """
+        predicted = self.predict(data, 1, x0)
+        several = predicted if isinstance(predicted, tuple) else (predicted,)
+        return one_or_all([e.y - p for e, p in zip(data.raw().experiments, several)])
+
+    def initial_state(self, data: Data, simulator: str = "free") -> Any:
+        """Estimate the state at the first sample by least squares; a tuple for several experiments.
+
+        Args:
+            data: the record.
+            simulator: the one whose errors are minimised: "free", "predict" or, with nonlinear feedback,
+                "measured_feedback".
+
+        Raises:
+            DataError: as `simulate`.
+            StructureError: an unknown simulator.
+        """
+        return one_or_all(self._states(simulator, records_of(self, data)[0], "fit"))
+
+    def _states(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
+        """Return the state of every record at its first sample.
+
+        Raises:
+            StructureError: an unknown simulator, one that needs the outputs, or an x0 that cannot be read.
+        """
+        if simulator not in self.SIMULATORS:
+            raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
+        if simulator != "free" and any(y is None for _, y, _ in records):
+            raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
+        return states_of(records, x0, self._state_shape, lambda i: self._fitted(simulator, *records[i]))
+
+    def _warn_unstable(self) -> None:
+        if not self.is_stable:
+            warnings.warn(
+                f"The model is unstable: its largest pole has radius {self.radius:.6g}. Its simulation grows and tells "
+                "little about the fit; use one-step prediction, or identify with a stability constraint.",
+                DataWarning,
+                stacklevel=4,
+            )
+
+    # -- gauge and units -----------------------------------------------------------------------------------------
+
+    def regauge(self, gauge: str, signs: bool = True) -> Self:
+        """Fix the scale between f and B of every function, and of nonlinear feedback; predictions do not change.
+
+        Args:
+            gauge: "norm" (norm of B one, its first coefficient that is not zero positive; in a state-space model of
+                [B; D] and the first Markov parameter), "gain" (unit static gain of the linear part; one output), "b0"
+                (first coefficient of B one; transfer functions only), "none" (as it is; linear channels get f(u) = u).
+            signs: with False the gauge "norm" leaves the signs as they are.
+
+        Raises:
+            StructureError: unknown gauge, or one that this model cannot take.
+        """
+        if gauge not in self.GAUGES:
+            raise StructureError(f"Unknown gauge {gauge!r}. {nearest(gauge, self.GAUGES)}")
+        if gauge == "gain" and self.l > 1:
+            raise StructureError("gauge 'gain' is defined for one output; use 'norm'.")
+        return self._regauged(gauge, signs)
+
+    def with_transform(self, transform: Transform) -> Self:
+        """Return the model in raw units, given that this one was identified on data changed by `transform`.
+
+        Every basis but UserFunctions follows a change of units exactly, so the predictions are the same.
+
+        Raises:
+            StructureError: a basis of UserFunctions, or other numbers of channels.
+        """
+        if transform.is_identity:
+            return self
+        if len(transform.u_scale) != self.m or len(transform.y_scale) != self.l:
+            raise StructureError(
+                f"The transform has {len(transform.u_scale)} inputs and {len(transform.y_scale)} outputs, "
+                f"the model {self.m} and {self.l}."
+            )
+        # units do not turn signs: what a constraint decided about them stays
+        return self._in_raw_units(transform).regauge(self.gauge, signs=False)
+
+    # -- files ---------------------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return {
+            "kind": self.kind,
+            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
+            "dt": self.dt,
+            **{name: list(getattr(self, name)) for name in NAMES},
+            "gauge": self.gauge,
+        }
+
+    @staticmethod
+    def _shared_fields(content: Mapping[str, Any], functions: dict[str, Any] | None) -> dict[str, Any]:
+        """Read the fields that `Model.to_dict` described."""
+        return {
+            "nonlinearities": tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
+            "dt": content["dt"],
+            **{name: tuple(content[name]) for name in NAMES},
+            "gauge": content["gauge"],
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model to a JSON file, from which `optid.load` restores it exactly."""
+        return files.save(self, path)

@@ -1,0 +1,407 @@
+"""The equations of a state-space model: matrices, poles, responses, forms that predict the same, content of files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.bases import Linear
+from optid.data.channels import Transform
+from optid.errors import StructureError
+from optid.models import roots
+from optid.models.balancing import balancing
+from optid.models.feedback_tables import Parts, tabulated
+from optid.models.gauges import leading_sign
+from optid.models.kalman import NoiseCovariances
+from optid.models.model import Model, finite
+from optid.models.nonlinearity import Nonlinearity
+
+SHAPES = {
+    "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
+}
+"""Shapes of the matrices: n states, l outputs, r functions of the inputs and s of the outputs."""
+
+NEWTON_STEPS = 100
+RESTS = 1e-12
+"""A state that moves by less than this share of its size rests."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace(Model):
+    """x(k+1) = A x + B f(u) + E g(y) + L y + offset_x + K e, y(k) = C x + D f(u) + offset_y + e, in raw units.
+
+    With the basis `Linear` and no feedback this is a linear state-space model. The feedback never reaches the output
+    of the same sample: there is no algebraic loop.
+
+    Attributes:
+        A: (n, n).
+        B: (n, r), one column per nonlinearity of the inputs.
+        C: (l, n).
+        D: (l, r); zero by default, like E, L, K and the offsets.
+        nonlinearities: r of them; by default the identity of every input.
+        input_of: the input that each acts on, r indices; by default one per input in order.
+        E: (n, s), one column per nonlinearity of the outputs.
+        feedback: s of them.
+        output_of: the output that each acts on, s indices; by default one per output in order.
+        L: (n, l) linear output injection.
+        K: (n, l) gain of the innovations; zero for an output-error model.
+        offset_x: (n,) constant of the state equation.
+        offset_y: (l,) constant of the output equation.
+        noise: covariances of the noises, or None.
+        dt: sampling time.
+        inputs: names of the m inputs.
+        outputs: names of the l outputs.
+        input_units: one per input, "" where unknown.
+        output_units: one per output, "" where unknown.
+        gauge: how the scale between f and B is fixed: "norm", "gain" or "none"; see `regauge`.
+
+    Raises:
+        StructureError: shapes that do not agree, coefficients that are not finite, an unknown gauge, a direct
+            feedthrough of g.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Any = None
+    nonlinearities: tuple[Nonlinearity, ...] = ()
+    input_of: tuple[int, ...] = ()
+    E: Any = None
+    feedback: tuple[Nonlinearity, ...] = ()
+    output_of: tuple[int, ...] = ()
+    L: Any = None
+    K: Any = None
+    offset_x: Any = None
+    offset_y: Any = None
+    noise: NoiseCovariances | None = None
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    gauge: str = field(default="none", kw_only=True)
+    GAUGES = ("norm", "gain", "none")
+
+    def __post_init__(self) -> None:
+        fixed: dict[str, Any] = {name: finite(np.atleast_2d(getattr(self, name)), name) for name in ("A", "B", "C")}
+        functions = tuple(self.nonlinearities) or (Nonlinearity(Linear(), np.ones(1)),) * fixed["B"].shape[1]
+        fixed |= {"nonlinearities": functions, "feedback": tuple(self.feedback)}
+        shapes = self._shapes(len(fixed["A"]), len(fixed["C"]), len(functions), len(fixed["feedback"]))
+        for name in ("D", "E", "L", "K", "offset_x", "offset_y"):
+            given = getattr(self, name)
+            fixed[name] = finite(np.zeros(shapes[name]) if given is None else given, name)
+        fixed["input_of"] = tuple(int(c) for c in self.input_of) or tuple(range(len(functions)))
+        fixed["output_of"] = tuple(int(o) for o in self.output_of) or tuple(range(len(fixed["feedback"])))
+        self._fix(fixed, 1 + max(fixed["input_of"], default=-1), len(fixed["C"]))
+        self._check(shapes)
+
+    @staticmethod
+    def _shapes(n: int, l: int, r: int, s: int) -> dict[str, tuple[int, ...]]:  # noqa: E741 - the field's letters
+        sizes = {"n": n, "l": l, "r": r, "s": s}
+        return {name: tuple(sizes[letter] for letter in letters) for name, letters in SHAPES.items()}
+
+    def _check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Refuse parts that do not agree, naming the part and the shape that is needed."""
+        n, outputs, (r, s) = self.nx, len(self.C), (len(self.nonlinearities), len(self.feedback))
+        if self.E.shape == (n + outputs, s) and s and outputs:
+            raise StructureError(
+                f"E has {n + outputs} rows for {n} states: its last {outputs} would carry g(y) to the output y of the "
+                "same sample, an algebraic loop. Delay the feedback by one sample: keep the first rows only."
+            )
+        for name, shape in shapes.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise StructureError(
+                    f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs and "
+                    f"{outputs} outputs need {shape}."
+                )
+        for kind, where, count in (("nonlinearities", "input_of", self.m), ("feedback", "output_of", outputs)):
+            functions, channels = getattr(self, kind), getattr(self, where)
+            if len(functions) != len(channels) or any(not 0 <= c < count for c in channels):
+                raise StructureError(
+                    f"{where} = {channels}: one channel from 0 to {count - 1} for each of the {len(functions)} {kind}."
+                )
+            for j, f in enumerate(functions):
+                if f.offset:
+                    raise StructureError(f"{kind}[{j}] has an offset: the constants belong to offset_x and offset_y.")
+        for kind, count in (("inputs", self.m), ("outputs", outputs)):
+            names, units = getattr(self, kind), getattr(self, kind[:-1] + "_units")
+            if len(names) != count or len(units) != count:
+                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}.")
+        if self.noise is not None and self.noise.S.shape != (n, outputs):
+            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {(n, outputs)} is needed.")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.A)
+
+    @property
+    def structure(self) -> str:
+        """State space, "ss"."""
+        return "ss"
+
+    @property
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        return f"{self._family} state-space model" + (" with nonlinear feedback" if self.feedback else "")
+
+    @property
+    def orders(self) -> dict[str, Any]:
+        """The number of states nx."""
+        return {"nx": self.nx}
+
+    @property
+    def memory(self) -> int:
+        """Samples at the start of a record that cannot be predicted: none, the initial state is estimated."""
+        return 0
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Matrices and tables as the compiled recursions read them."""
+        matrices = [np.array(part, order="C") for part in (self.A, self.C, self.E, self.L, self.K)]
+        return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), tabulated(self.feedback)])
+
+    @property
+    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
+        """The nonlinearity of the input; a tuple when there are several."""
+        return self.nonlinearities[0] if len(self.nonlinearities) == 1 else self.nonlinearities
+
+    @property
+    def offset_note(self) -> str:
+        """Why the offsets of f and g are not identifiable."""
+        return "The constants of f and g are part of the constants of the state and output equations."
+
+    def expanded(self, u: Array) -> Array:
+        """Return the values of the r nonlinearities at the inputs u (N, m), (N, r)."""
+        columns = [f(u[:, c]) for f, c in zip(self.nonlinearities, self.input_of)]
+        return np.column_stack(columns) if columns else np.zeros((len(u), 0))
+
+    # -- poles and responses -------------------------------------------------------------------------------------
+
+    @cached_property
+    def poles(self) -> Any:
+        """Eigenvalues of A, complex (n,), largest first: the poles with the feedback g and L taken as given signals."""
+        return roots.largest_first(np.linalg.eigvals(self.A).astype(complex))
+
+    def impulse_response(self, n: int = 100) -> Array:
+        """Return the response of (A, B, C, D) to a unit impulse of every f, (n, l, r), in the gauge of the model."""
+        response = self._markov(self.B, n)
+        response[:1] = self.D
+        return response
+
+    def _markov(self, columns: Array, n: int) -> Array:
+        """Return 0, C B, C A B, ... for columns (n_x, r) of B, (n, l, r)."""
+        response, x = np.zeros((n, self.l, columns.shape[1])), columns
+        with np.errstate(all="ignore"):
+            for k in range(1, n):
+                response[k] = self.C @ x
+                x = self.A @ x
+        return response
+
+    def frequency_response(self, w: ArrayLike) -> Array:
+        """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
+        z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
+        resolvent = np.linalg.solve(z[:, None, None] * np.eye(self.nx) - self.A, self.B.astype(complex))
+        return np.asarray(self.C @ resolvent + self.D)
+
+    def equilibrium(self, u0: ArrayLike) -> tuple[Array, Array]:
+        """Return a state (n,) and outputs (l,) at which the model rests under constant inputs u0 (m,).
+
+        With feedback there may be several; the one that Newton's method finds from x = 0 is returned.
+
+        Raises:
+            StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
+        """
+        points = self._operating_point(u0)
+        f, x = self.expanded(points[None])[0], np.zeros(self.nx)
+        for _ in range(NEWTON_STEPS):
+            y = self.C @ x + self.D @ f + self.offset_y
+            g = np.array([function(y[o]) for function, o in zip(self.feedback, self.output_of)])
+            change = self.A @ x + self.B @ f + self.E @ g + self.L @ y + self.offset_x - x
+            size = np.abs(x).max(initial=0.0) + np.abs(self.B @ f + self.offset_x).max(initial=0.0)
+            if np.abs(change).max(initial=0.0) <= RESTS * size:
+                return x, y
+            x = x - np.linalg.lstsq(self._slope(y), change)[0]
+            if not np.all(np.isfinite(x)):
+                break
+        if not self.feedback:
+            _solved(self._slope(np.zeros(self.l)), self.B)
+        raise StructureError(
+            f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there."
+        )
+
+    def static_gain(self, u0: ArrayLike) -> Any:
+        """Return the slope of the steady-state characteristic at u0, feedback included.
+
+        Args:
+            u0: operating point, a number or (m,).
+
+        Returns:
+            A number for one input and output, otherwise (l, m).
+
+        Raises:
+            StructureError: as `equilibrium`.
+        """
+        _, y = self.equilibrium(u0)
+        points, slopes = self._operating_point(u0), np.zeros((len(self.nonlinearities), self.m))
+        for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
+            slopes[j, c] = f.slope(points[c])
+        driven = self.B + self._feedback_slope(y) @ self.D
+        gain = (self.D - self.C @ _solved(self._slope(y), driven)) @ slopes
+        return float(gain[0, 0]) if gain.size == 1 else gain
+
+    def _feedback_slope(self, y: Array) -> Array:
+        """Derivative (n, l) of the next state with respect to the outputs."""
+        total = np.array(self.L)
+        for j, (g, o) in enumerate(zip(self.feedback, self.output_of)):
+            total[:, o] += self.E[:, j] * g.slope(y[o])
+        return total
+
+    def _slope(self, y: Array) -> Array:
+        """Derivative (n, n) of the change of the state with respect to the state, at the outputs y."""
+        return self.A - np.eye(self.nx) + self._feedback_slope(y) @ self.C
+
+    # -- forms that predict the same -----------------------------------------------------------------------------
+
+    def transformed(self, T: ArrayLike) -> Self:
+        """Return the model in the states T x; predictions do not change.
+
+        Args:
+            T: (n, n), invertible.
+
+        Raises:
+            StructureError: T of another shape, or singular.
+        """
+        turn, n = np.atleast_2d(np.asarray(T, dtype=float)), self.nx
+        turn = turn.reshape(0, 0) if n == 0 and turn.size == 0 else turn
+        if turn.shape != (n, n) or not np.all(np.isfinite(turn)):
+            raise StructureError(f"T has shape {turn.shape}; a finite matrix ({n}, {n}) is needed.")
+        if n and np.linalg.cond(turn) > 1e14:
+            raise StructureError("T is singular: a change of states can be undone.")
+        back = np.linalg.inv(turn)
+        noise = None if self.noise is None else self.noise.mapped(turn, np.eye(self.l))
+        moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "offset_x")}
+        return replace(self, A=turn @ self.A @ back, C=self.C @ back, noise=noise, gauge="none", **moved)
+
+    def balanced(self) -> Self:
+        """Return the model in balanced states: both Gramians of (A, [B E], C) are diagonal and equal.
+
+        Raises:
+            StructureError: an unstable model, or one that is not minimal.
+        """
+        return self if self.nx == 0 else self.transformed(balancing(self.A, np.hstack([self.B, self.E]), self.C))
+
+    def injected(self, gain: ArrayLike) -> Self:
+        """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
+
+        P1 and P3 do not change; P2 does, since it feeds back the measured output. With gain = -L the injection is
+        absorbed into A.
+
+        Args:
+            gain: (n, l).
+
+        Raises:
+            StructureError: a gain of another shape.
+        """
+        moved = np.asarray(gain, dtype=float)
+        if moved.shape != self.L.shape:
+            raise StructureError(f"The gain has shape {moved.shape}; {self.L.shape} is needed.")
+        return replace(
+            self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
+            offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none",
+        )
+
+    def _regauged(self, gauge: str, signs: bool) -> Self:
+        if gauge == "gain":
+            scales = self._gains()
+        elif gauge == "none":
+            scales = np.array([f.unit_slope for f in self.nonlinearities])
+        else:
+            scales = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
+            scales = scales * _signs(self.impulse_response(self.nx + 1)) if signs else scales
+        back = np.ones(self.E.shape[1])
+        if gauge != "none":
+            back = np.linalg.norm(self.E, axis=0)
+            back = back * _signs(self._markov(self.E, self.nx + 1)) if signs else back
+        scales, back = np.where(scales == 0, 1.0, scales), np.where(back == 0, 1.0, back)
+        return replace(
+            self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,
+            nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
+            feedback=tuple(g.scaled(s) for g, s in zip(self.feedback, back)),
+        )
+
+    def _gains(self) -> Array:
+        """Static gains (r,) of the linear part from every f to the output."""
+        left = np.eye(self.nx) - self.A
+        if self.nx and np.linalg.cond(left) > 1e12:
+            raise StructureError("gauge 'gain' cannot be reached: the model has a pole at 1; use 'norm'.")
+        states = np.linalg.solve(left, self.B)
+        gains, sizes = self.C @ states + self.D, np.abs(self.C) @ np.abs(states) + np.abs(self.D)
+        for gain, size, c in zip(gains[0], sizes[0], self.input_of):
+            if not abs(gain) > 1e-9 * size:
+                raise StructureError(
+                    f"gauge 'gain' cannot be reached: the static gain of input {self.inputs[c]!r} is zero; use 'norm'."
+                )
+        return gains[0]
+
+    def _in_raw_units(self, transform: Transform) -> Self:
+        gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
+        functions = [
+            f.mapped(transform.u_scale[c], transform.u_offset[c]) for f, c in zip(self.nonlinearities, self.input_of)
+        ]
+        feedback = [
+            g.mapped(transform.y_scale[o], transform.y_offset[o]) for g, o in zip(self.feedback, self.output_of)
+        ]
+        constants, fed = (np.array([constant for _, constant in moved]) for moved in (functions, feedback))
+        # the states take the unit that all outputs share: C, and with it what a norm of B means, stays as it is then
+        state = gain[0] if np.all(gain == gain[0]) else 1.0
+        injection = state * self.L / gain
+        return replace(
+            self, B=state * self.B, C=gain[:, None] * self.C / state, D=gain[:, None] * self.D, E=state * self.E,
+            L=injection, K=state * self.K / gain,
+            offset_x=state * (self.offset_x + self.B @ constants + self.E @ fed) - injection @ shift,
+            offset_y=gain * (self.offset_y + self.D @ constants) + shift,
+            nonlinearities=tuple(f for f, _ in functions), feedback=tuple(g for g, _ in feedback),
+            noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
+        )
+
+    # -- content of files ----------------------------------------------------------------------------------------
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return super().to_dict() | {
+            **{name: getattr(self, name).tolist() for name in SHAPES},
+            "input_of": list(self.input_of),
+            "feedback": [g.to_dict() for g in self.feedback],
+            "output_of": list(self.output_of),
+            "noise": None if self.noise is None else self.noise.to_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
+        """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
+        sizes = (len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback"))
+        shapes = cls._shapes(*sizes)
+        return cls(
+            **{name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()},
+            input_of=tuple(content["input_of"]), output_of=tuple(content["output_of"]),
+            feedback=tuple(Nonlinearity.from_dict(g, functions) for g in content["feedback"]),
+            noise=None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"]),
+            **cls._shared_fields(content, functions),
+        )
+
+
+def _signs(response: Array) -> Array:
+    """Sign of the first Markov parameter (T, l, r) of every column that is not negligible."""
+    return np.array([leading_sign(response[:, :, j].ravel(), 1e-6) for j in range(response.shape[2])])
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
+        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+    return np.asarray(np.linalg.solve(matrix, right), dtype=float)

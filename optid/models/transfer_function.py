@@ -1,0 +1,446 @@
+"""The equation of a transfer-function model: coefficients, noise, responses, gauge, units, text and file content."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.data.channels import Transform
+from optid.errors import StructureError
+from optid.models import noise_filter, roots
+from optid.models.gauges import GAUGES, gauge_factor
+from optid.models.layout import Layout
+from optid.models.model import Model, finite
+from optid.models.nonlinearity import Nonlinearity
+from optid.models.recursions import autoregression
+from optid.models.text import polynomial, signed_sum, signed_terms
+
+TINY_SUM = 1e-6
+"""Share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured."""
+
+TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins"}
+
+
+@dataclass(frozen=True, eq=False)
+class TransferFunction(Model):
+    """``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + offset``, in raw units.
+
+    The plant is ``x(k) + sum_i A_i x(k-i) = sum_c sum_j b_c[j] f_c(u_c(k - nk_c - j)) + offset``. By default D is A and
+    C is 1: an ARX model, with one or several outputs. With C it is ARMAX, with a D of its own Box-Jenkins, with D = 1
+    and no C output error. With the basis `Linear` the model is a linear one.
+
+    Attributes:
+        a: (na,) for one output, (na, l, l) for several.
+        b: one array per input, (nb_c,) for one output, (nb_c, l) for several.
+        nonlinearities: one per input, their offsets None: the constants together are `offset`. See `f`.
+        nk: delay in samples, one per input.
+        offset: (l,) constant of the equation.
+        dt: sampling time.
+        inputs: names of the m inputs.
+        outputs: names of the l outputs.
+        input_units: one per input, "" where unknown.
+        output_units: one per output, "" where unknown.
+        c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...; one output.
+        d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; one output. None where D is A.
+        gauge: how the scale between f and B is fixed: "norm", "gain", "b0" or "none"; see `regauge`.
+
+    Raises:
+        StructureError: shapes that do not agree, coefficients that are not finite, an unknown gauge, a C or D for
+            several outputs, or a C that is not invertible (a zero on or outside the unit circle): no predictor belongs
+            to it.
+    """
+
+    a: Array
+    b: tuple[Array, ...]
+    nonlinearities: tuple[Nonlinearity, ...]
+    nk: tuple[int, ...]
+    offset: Array
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    c: Any = field(default=(), kw_only=True)
+    d: Any = field(default=None, kw_only=True)
+    gauge: str = field(default="none", kw_only=True)
+    GAUGES = GAUGES
+
+    def __post_init__(self) -> None:
+        fields = {
+            "a": finite(self.a, "a"),
+            "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
+            "nk": tuple(int(delay) for delay in self.nk),
+            "offset": np.atleast_1d(finite(self.offset, "offset")),
+            "c": finite(self.c, "c"),
+            "d": None if self.d is None else finite(self.d, "d"),
+        }
+        if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], fields["a"]):
+            fields["d"] = None
+        self._fix(fields, len(self.b), fields["offset"].size)
+        self._check_plant()
+        self._check_noise()
+
+    def _check_plant(self) -> None:
+        l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
+        if not m:
+            raise StructureError("A model needs at least one input.")
+        if self.offset.ndim != 1 or len(self.outputs) != l or len(self.output_units) != l:
+            raise StructureError(
+                f"offset has shape {self.offset.shape} for {len(self.outputs)} outputs: one each is needed."
+            )
+        for name in ("nonlinearities", "nk", "inputs", "input_units"):
+            if len(getattr(self, name)) != m:
+                raise StructureError(
+                    f"{name} has {len(getattr(self, name))} entries; b has one array for each of {m} inputs."
+                )
+        if self.a.ndim != (1 if l == 1 else 3) or self.a.shape[1:] not in ((), (l, l)):
+            raise StructureError(f"a has shape {self.a.shape}; {'(na,)' if l == 1 else f'(na, {l}, {l})'} is needed.")
+        for c, b in enumerate(self.b):
+            if b.ndim != (1 if l == 1 else 2) or not b.size or b.shape[1:] not in ((), (l,)):
+                raise StructureError(f"b[{c}] has shape {b.shape}; {'(nb,)' if l == 1 else f'(nb, {l})'} is needed.")
+            if self.nk[c] < 0:
+                raise StructureError(f"nk[{c}] = {self.nk[c]}: a delay is not negative.")
+        if any(f.offset is not None for f in self.nonlinearities):
+            raise StructureError(
+                "A nonlinearity of a model has offset None: put the constant of the equation in offset=."
+            )
+
+    def _check_noise(self) -> None:
+        for name, values in (("c", self.c), ("d", self.d)):
+            if values is not None and values.ndim != 1:
+                raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
+        if self.l > 1 and self.structure != "arx":
+            raise StructureError(f"A model with c or d has one output; this one has {self.l}: it can only be ARX.")
+        largest = roots.radius(self.c)
+        if largest >= 1:
+            raise StructureError(
+                f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
+                "(optid.models.roots.reflected): the spectrum of the noise stays what it is."
+            )
+
+    # -- sizes ---------------------------------------------------------------------------------------------------
+
+    @property
+    def na(self) -> int:
+        """Number of past outputs."""
+        return len(self.a)
+
+    @property
+    def nb(self) -> tuple[int, ...]:
+        """Number of numerator coefficients, one per input."""
+        return tuple(len(b) for b in self.b)
+
+    @property
+    def orders(self) -> dict[str, Any]:
+        """The orders na, nb and nk (nb and nk with one entry per input) and, where the noise has them, nc and nd."""
+        noise = {"nc": self.c.size} if self.structure in ("armax", "bj") else {}
+        if self.structure == "bj":
+            noise["nd"] = self.noise_denominator.size
+        return {"na": self.na, "nb": self.nb, "nk": self.nk} | noise
+
+    @property
+    def largest_lag(self) -> int:
+        """Largest lag n: the state of the plant is (n, l)."""
+        return max(self.na, *(delay + nb - 1 for delay, nb in zip(self.nk, self.nb)))
+
+    @property
+    def memory(self) -> int:
+        """Samples at the start of a record that cannot be predicted.
+
+        The largest lag for ARX and ARMAX; none for output error and Box-Jenkins, whose initial state is estimated.
+        """
+        return self.largest_lag if self.shares_poles else 0
+
+    @property
+    def layout(self) -> Layout:
+        """Columns of the regression this model solves."""
+        bases = tuple(f.basis for f in self.nonlinearities)
+        return Layout(self.na, self.nb, self.nk, bases, self.outputs, self.inputs)
+
+    @property
+    def matrices(self) -> Array:
+        """A_1 .. A_na, (na, l, l) whatever the number of outputs."""
+        return self.a.reshape(self.na, self.l, self.l)
+
+    def terms(self, c: int) -> list[tuple[int, Array]]:
+        """Return the numerator of input c as (lag, row (l,))."""
+        return [(self.nk[c] + j, row) for j, row in enumerate(self.b[c].reshape(-1, self.l))]
+
+    # -- noise ---------------------------------------------------------------------------------------------------
+
+    @property
+    def structure(self) -> str:
+        """Which of the four it is: "oe", "arx", "armax" or "bj"."""
+        if self.d is None:
+            return "armax" if self.c.size else "arx"
+        return "bj" if self.c.size or self.d.size else "oe"
+
+    @property
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        return f"{self._family} {TITLES[self.structure]} model"
+
+    @property
+    def shares_poles(self) -> bool:
+        """Whether D is A: the noise enters the equation of the plant (ARX, ARMAX)."""
+        return self.d is None
+
+    @property
+    def noise_denominator(self) -> Array:
+        """Coefficients of D after the leading one: `d`, or `a` where D is A."""
+        return self.a if self.d is None else self.d
+
+    @property
+    def noise(self) -> str:
+        """The noise model in words and numbers; "" for ARX, whose name says it."""
+        c, d = polynomial(self.c), polynomial(() if self.d is None else self.d)
+        return {
+            "arx": "", "armax": f"C = {c}, D = A", "bj": f"C = {c}, D = {d}",
+            "oe": "e is added to the output: C = D = 1",
+        }[self.structure]
+
+    @cached_property
+    def noise_poles(self) -> Any:
+        """Roots of D, complex, largest first."""
+        return self.poles if self.d is None else roots.largest_first(roots.roots_of(self.d))
+
+    @cached_property
+    def noise_zeros(self) -> Any:
+        """Roots of C, complex (nc,), largest first; all inside the unit circle."""
+        return roots.largest_first(roots.roots_of(self.c))
+
+    def noise_impulse_response(self, n: int = 100) -> Array:
+        """Return the response of C/D to a unit impulse of e, (n,); (n, l, l) for several outputs."""
+        if self.l > 1:
+            return self.inverse_impulse(n)
+        return noise_filter.impulse_response(self.c, self.noise_denominator, n)
+
+    def noise_frequency_response(self, w: ArrayLike) -> Any:
+        """Return C/D at the frequencies w (radians per unit of time), complex (len(w),), or (len(w), l, l)."""
+        shift = self._shift(w)
+        if self.l > 1:
+            return np.linalg.inv(self._denominator(shift))
+        above, below = (np.polyval([*reversed(p), 1.0], shift) for p in (self.c, self.noise_denominator))
+        return above / below
+
+    # -- plant ---------------------------------------------------------------------------------------------------
+
+    @property
+    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
+        """The nonlinearity, with its offset where `c0` knows it; a tuple when there are several inputs."""
+        if self.m > 1:
+            return self.nonlinearities
+        return replace(self.nonlinearities[0], offset=self.c0)
+
+    @property
+    def c0(self) -> float | None:
+        """Offset of f, d / sum b; None where the data cannot tell it from the constant: see `offset_note`."""
+        return None if self.offset_note else self._ratio[0]
+
+    @property
+    def offset_note(self) -> str:
+        """Why the offset of f is not identifiable; "" when it is."""
+        if self.m > 1:
+            return "With several inputs one constant cannot be shared out among the nonlinearities."
+        if self.nonlinearities[0].is_linear:
+            return "A linear channel has no offset of its own."
+        total = self.b[0].sum(axis=0)
+        if np.linalg.norm(total) <= TINY_SUM * np.abs(self.b[0]).sum():
+            return "The coefficients of B sum to zero: a constant in f has no effect."
+        if self._ratio[1] > 1e-9:
+            return "The constants of the outputs are not in the proportion of the sums of B."
+        return ""
+
+    @cached_property
+    def _ratio(self) -> tuple[float, float]:
+        total = np.atleast_1d(self.b[0].sum(axis=0))
+        ratio = float(total @ self.offset / (total @ total))
+        return ratio, float(np.linalg.norm(self.offset - ratio * total) / max(np.linalg.norm(self.offset), 1e-300))
+
+    def theta(self, c: int = 0) -> Array:
+        """Return mu b^T of input c, the same in every gauge: (P, nb), or (P, nb l) with the outputs outermost."""
+        return np.outer(self.nonlinearities[c].mu, self.b[c].ravel(order="F"))
+
+    @cached_property
+    def poles(self) -> Any:
+        """Roots of det A(z), complex (na l,), largest first."""
+        n = self.na * self.l
+        companion = np.eye(n, k=-self.l)
+        if n:
+            companion[: self.l] = -np.hstack(list(self.matrices))
+        return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
+
+    def static_gain(self, u0: ArrayLike) -> Any:
+        """Return the slope of the steady-state characteristic at u0, A(1)^-1 sum_j b_j f'(u0).
+
+        Args:
+            u0: operating point, a number or (m,).
+
+        Returns:
+            A number for one input and output, otherwise (l, m).
+
+        Raises:
+            StructureError: u0 of the wrong size, or an integrator (a pole at 1), which has no static gain.
+        """
+        points = self._operating_point(u0)
+        at_one = np.eye(self.l) + self.matrices.sum(axis=0)
+        if np.linalg.svd(at_one, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(self.a).sum()):
+            raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+        slopes = np.array([f.slope(u) for f, u in zip(self.nonlinearities, points)])
+        sums = np.stack([np.atleast_1d(b.sum(axis=0)) for b in self.b], axis=1)
+        gain = np.linalg.solve(at_one, sums * slopes)
+        return float(gain[0, 0]) if gain.size == 1 else gain
+
+    def impulse_response(self, n: int = 100) -> Array:
+        """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""
+        response = np.zeros((n, self.l, self.m))
+        for c in range(self.m):
+            for lag, row in self.terms(c):
+                response[lag : lag + 1, :, c] = row
+            response[:, :, c] = autoregression(self.matrices, response[:, :, c])
+        return response
+
+    def inverse_impulse(self, n: int) -> Array:
+        """Return the impulse response of A^-1, (n, l, l): [k, o, p] of output o to equation p."""
+        impulses = np.zeros((n, self.l, self.l))
+        impulses[:1] = np.eye(self.l)
+        return np.stack([autoregression(self.matrices, impulses[:, :, p]) for p in range(self.l)], axis=2)
+
+    def frequency_response(self, w: ArrayLike) -> Array:
+        """Return A^-1 B_c at the frequencies w (radians per unit of time, up to pi / dt), complex (len(w), l, m)."""
+        shift = self._shift(w)
+        numerator = np.zeros((shift.size, self.l, self.m), dtype=complex)
+        for c in range(self.m):
+            for lag, row in self.terms(c):
+                numerator[:, :, c] += (shift**lag)[:, None] * row
+        return np.asarray(np.linalg.solve(self._denominator(shift), numerator))
+
+    def _shift(self, w: ArrayLike) -> Any:
+        """The shift operator q^-1 at the frequencies w."""
+        return np.exp(-1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
+
+    def _denominator(self, shift: Any) -> Any:
+        """A(q), (len(shift), l, l)."""
+        return np.eye(self.l) + sum(
+            (shift**i)[:, None, None] * matrix for i, matrix in enumerate(self.matrices, start=1)
+        ) + np.zeros((shift.size, 1, 1))
+
+    # -- gauge and units -----------------------------------------------------------------------------------------
+
+    def _regauged(self, gauge: str, signs: bool) -> Self:
+        if gauge == "none":
+            scales = [f.unit_slope for f in self.nonlinearities]
+        else:
+            scales = [gauge_factor(gauge, self.a, b, name) for b, name in zip(self.b, self.inputs)]
+        if gauge == "norm" and not signs:
+            scales = [abs(scale) for scale in scales]
+        return replace(
+            self, b=tuple(b / s for b, s in zip(self.b, scales)), gauge=gauge,
+            nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
+        )
+
+    def _in_raw_units(self, transform: Transform) -> Self:
+        gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
+        a = self.a if self.l == 1 else self.a * (gain[:, None] / gain)
+        b = tuple(row * gain for row in self.b)
+        offset = gain * self.offset + shift + a.reshape(self.matrices.shape).sum(axis=0) @ shift
+        functions = []
+        for f, rows, scale, origin in zip(self.nonlinearities, b, transform.u_scale, transform.u_offset):
+            moved, constant = f.mapped(scale, origin)
+            functions.append(moved)
+            offset = offset + constant * rows.sum(axis=0)
+        return replace(self, a=a, b=b, nonlinearities=tuple(functions), offset=offset)
+
+    # -- text and content of files -------------------------------------------------------------------------------
+
+    def coefficients(self) -> list[tuple[str, float]]:
+        """Return (name, value) of every coefficient of A, B, the offset, C and (Box-Jenkins) D, as tables show them."""
+        several, found = self.l > 1, []
+        for (i, *pair), value in np.ndenumerate(self.a):
+            pair = f"[{','.join(self.outputs[o] for o in pair)}]" if several else ""
+            found.append((f"a{i + 1}{pair}", float(value)))
+        for channel, b in zip(self.inputs, self.b):
+            for (j, *output), value in np.ndenumerate(b):
+                words = ([channel] if self.m > 1 else []) + [self.outputs[o] for o in output]
+                found.append((f"b{j}" + (f"[{','.join(words)}]" if words else ""), float(value)))
+        for name, value in zip(self.outputs, self.offset):
+            found.append((f"offset[{name}]" if several else "offset", float(value)))
+        for name, values in (("c", self.c), ("d", () if self.d is None else self.d)):
+            found += [(f"{name}{i}", float(value)) for i, value in enumerate(values, start=1)]
+        return found
+
+    def equation(self, digits: int = 4) -> str:
+        """Write the model as difference equations, one per output; of the noise where D is apart.
+
+        f is `f`: where its offset is identifiable the constant is inside f, otherwise it stands at the end.
+        """
+        noise = signed_terms(((v, f"e(k-{i})") for i, v in enumerate(self.c, start=1)), digits)
+        if self.d is None:
+            lines = [self._equation(o, self.outputs, digits) for o in range(self.l)]
+            return "\n".join(lines) + (" + e(k)" + noise if self.c.size else "")
+        name = self.outputs[0]
+        x = next(word for word in ("x", "x0", "x_plant", f"{name}_x") if word not in (*self.inputs, name))
+        plant = self._equation(0, (x,), digits)
+        if self.structure == "oe":
+            return f"{plant}\n{name}(k) = {x}(k) + e(k)"
+        past = signed_terms(((-v, f"v(k-{i})") for i, v in enumerate(self.d, start=1)), digits)
+        return f"{plant}\nv(k) = e(k){noise}{past}\n{name}(k) = {x}(k) + v(k)"
+
+    def _equation(self, o: int, outputs: tuple[str, ...], digits: int) -> str:
+        terms = []
+        for i, matrix in enumerate(self.matrices, start=1):
+            terms += [(-float(matrix[o, p]), f"{name}(k-{i})") for p, name in enumerate(outputs)]
+        for c, (name, f) in enumerate(zip(self.inputs, self.nonlinearities)):
+            function = "f" if self.m == 1 else f"f_{name}"
+            for lag, row in self.terms(c):
+                sample = f"{name}(k-{lag})" if lag else f"{name}(k)"
+                gain = float(row[o]) * (float(f.mu[0]) if f.is_linear else 1.0)
+                terms.append((gain, sample if f.is_linear else f"{function}({sample})"))
+        if self.c0 is None:
+            terms.append((float(self.offset[o]), ""))
+        return f"{outputs[o]}(k) = {signed_sum(terms, digits)}"
+
+    def __str__(self) -> str:
+        """Return the equations, the poles and the noise model."""
+        text = super().__str__()
+        apart = () if self.d is None else self.noise_poles
+        for name, found in (("zeros of the noise", self.noise_zeros), ("poles of the noise", apart)):
+            if len(found):
+                text += f"\n{name}: {roots.in_words(found)}"
+        return text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the model in JSON types."""
+        return super().to_dict() | {
+            "a": self.a.tolist(),
+            "b": [b.tolist() for b in self.b],
+            "nk": list(self.nk),
+            "offset": self.offset.tolist(),
+            "c": self.c.tolist(),
+            "d": None if self.d is None else self.d.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
+        """Build the model that `to_dict` described; the errors are those of the parts.
+
+        Args:
+            content: what `to_dict` returned, or the content of a file with the plant apart, or without noise.
+            functions: those of a basis of UserFunctions, by name.
+        """
+        if content["kind"] == "HammersteinARX":
+            content = {**content, "c": (), "d": None}
+        elif "plant" in content:
+            content = {**content["plant"], "c": content["c"], "d": content["d"]}
+        outputs = len(content["outputs"])
+        a = np.array(content["a"], dtype=float)
+        return cls(
+            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
+            b=tuple(np.array(b, dtype=float) for b in content["b"]),
+            nk=tuple(content["nk"]), offset=np.array(content["offset"], dtype=float), c=content["c"], d=content["d"],
+            **cls._shared_fields(content, functions),
+        )
