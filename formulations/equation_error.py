@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from formulations.arguments import per_channel, whole_number
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
-from optid.data.channels import Transform
+from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
@@ -227,13 +227,6 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     share = energy_unit(units) / unit
     problem = lifted_problem(statistics, share * ridge, share * curvature, units.u_scale)
     return EquationError(statistics, problem, model_meta(data), units, bases, unit)
-
-
-def model_meta(data: Data | Stream) -> dict[str, Any]:
-    """Names, units and sampling time that a model carries."""
-    return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
-            "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
-            "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
 
 
 def lifted_problem(statistics: Statistics, ridge: float, curvature: float, scales: Sequence[float]) -> RankOne:

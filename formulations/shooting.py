@@ -25,23 +25,19 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.arguments import one_output
-from formulations.equation_error import model_meta
-from formulations.gauges import check_gauge, scale_fixed
-from formulations.output_error import OutputError
-from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
-from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, with_poles
-from optid.bases.basis import Basis
+from formulations.gauges import scale_fixed
+from formulations.prediction_error import Bases, Orders, channel_key, transfer_errors, transfer_model
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
+from optid.identify.prediction_error.plant_starts import arx_start, iterated
+from optid.identify.prediction_error.transfer_errors import TransferErrors
+from optid.models import HammersteinTF
 from optid.models.gauges import leading_sign
-from optid.models.roots import contained
 from optid.program.program import Program, Values
 from optid.program.solution import Bound
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
-from optid.statistics.sensitivities import Unknowns, simulate
+from optid.statistics.sensitivities import simulate
 
 Array = np.ndarray
 
@@ -54,9 +50,8 @@ LIMIT = 20_000
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 
-def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str] = "polynomial:3",
-          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True
-          ) -> Program:
+def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
+          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Program:
     """Pose the least squares of the simulation errors with the simulated outputs as variables.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
@@ -77,23 +72,18 @@ def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | 
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a basis function that no sample excites.
     """
-    check_gauge(gauge)
-    record, layout, units = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis, offset)
-    if record.n_samples > LIMIT:
+    criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset, "simulation errors")
+    if criterion.data.n_samples > LIMIT:
         raise StructureError(
-            f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "
-            f"{LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
-    check_excited(record, layout)
-    check_inputs_differ(record, layout)
-    unknowns = Unknowns(layout, record.n_experiments, (True,) * layout.m, bool(offset))
-    check_rows(record, unknowns)
-    return _Shooting(OutputError(record, unknowns, gauge, units)).program(constraints)
+            f"{criterion.data.n_samples} samples: with the outputs of every sample as variables this formulation takes "
+            f"up to {LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
+    return _Shooting(criterion).program(constraints)
 
 
 class _Shooting:
     """Writes the programme of one record."""
 
-    def __init__(self, criterion: OutputError) -> None:
+    def __init__(self, criterion: TransferErrors) -> None:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
         several = criterion.unknowns.experiments > 1
         self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
@@ -103,7 +93,7 @@ class _Shooting:
 
     def key(self, name: str, c: int) -> str:
         """Name of a quantity of an input."""
-        return name if self.layout.m == 1 else f"{name}[{self.layout.inputs[c]}]"
+        return channel_key(self.criterion, name, c)
 
     def program(self, constraints: Sequence[Any]) -> Program:
         """Return the programme under the user's constraints."""
@@ -188,11 +178,9 @@ class _Shooting:
     def _start(self) -> dict[str, Array]:
         """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
         criterion, unknowns = self.criterion, self.criterion.unknowns
-        first = equation_error(self.data, unknowns)
-        first = criterion.normalised(blank(unknowns) if first is None else first)
-        found = [with_poles(criterion, first, contained(first[unknowns.slices["a"]], RADIUS), "ARX")]
-        others = [iterated(criterion, found[0].x, method) for method in ("sm", "iv")]
-        best = min([*found, *(one for one in others if one is not None)], key=lambda one: one.value)
+        found = arx_start(criterion)
+        others = [iterated(criterion, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
+        best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
         point = unknowns.unpack(criterion.normalised(best.x))
         start = {"a": point.a, "offset": np.array([point.offset])}
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
@@ -214,11 +202,4 @@ class _Shooting:
 
     def recover(self, values: Values) -> HammersteinTF:
         """Build the model."""
-        pairs = [(np.asarray(values[self.key("mu", c)]), np.asarray(values[self.key("b", c)]))
-                 for c in range(self.layout.m)]
-        plant = HammersteinARX(
-            a=np.asarray(values.get("a", np.zeros(0)), dtype=float), b=tuple(b for _, b in pairs),
-            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(self.layout.bases, pairs)),
-            nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float),
-            gauge=self.criterion.gauge, **model_meta(self.data))
-        return HammersteinTF(plant).with_transform(self.criterion.units)
+        return transfer_model(self.criterion, values)

@@ -9,14 +9,14 @@ from scipy.signal import lfilter
 
 import optid
 from formulations.constraints import shape, stability
-from formulations.hammerstein_armax import exact as armax
-from formulations.hammerstein_armax import linear as linear_armax
-from formulations.hammerstein_bj import exact as bj
-from formulations.hammerstein_bj import linear as linear_bj
-from formulations.noise_models import arma
+from formulations.prediction_error import armax as linear_armax
+from formulations.prediction_error import bj as linear_bj
+from formulations.prediction_error import hammerstein_armax as armax
+from formulations.prediction_error import hammerstein_bj as bj
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
+from optid.identify.prediction_error.noise_starts import arma
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 

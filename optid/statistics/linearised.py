@@ -4,7 +4,7 @@ A block of rows [x0 | shared | errors] leaves a Gram matrix, or a triangular fac
 digits. The initial states of an experiment are eliminated within it. Whose errors they are does not matter here.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -55,6 +55,12 @@ class Linearised:
         moves = [-np.linalg.lstsq(x, s @ step + e, rcond=1e-12)[0] for x, s, e in self.states]
         return np.asarray(np.concatenate([*moves, np.zeros(0)]), dtype=float)
 
+    def after(self, step: Array) -> float:
+        """Return the sum of squares of the linear errors after a step of all unknowns."""
+        matrix, errors = self.whole
+        rest = matrix @ step + errors
+        return float(rest @ rest) + self.remainder
+
     @cached_property
     def whole(self) -> tuple[Array, Array]:
         """Factor (p + E n, p + E n) and errors of all unknowns together, initial states last."""
@@ -76,6 +82,28 @@ class Compressed:
     rows: int
 
 
+def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
+               gauge: Array | None = None, method: Literal["auto", "gram", "qr"] = "auto") -> Linearised:
+    """Compress the errors of all experiments with their sensitivities.
+
+    Args:
+        blocks: number of an experiment -> rows [x0 | shared | errors], and the number of errors in each block; asked
+            for again where a QR decomposition is needed.
+        experiments: their number.
+        n: size of an initial state.
+        p: number of shared unknowns.
+        gauge: (rows, p) directions without effect, which are given weight; None for none.
+        method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
+    """
+    use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
+    alone = experiments == 1  # then the gauge takes part before the factorisation, which so is regular
+    parts = [compressed(blocks(i), n + p + 1, use, gauge if alone else None, n) for i in range(experiments)]
+    found = _assembled(parts, n, p, None if alone else gauge, use)
+    if method == "auto" and not found.condition < CONDITION_LIMIT:
+        return linearised(blocks, experiments, n, p, gauge, "qr")
+    return found
+
+
 def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
                first: int = 0) -> Compressed:
     """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
@@ -84,8 +112,8 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
         blocks: (rows, columns) and the number of errors in each.
         columns: number of columns.
         method: "gram" or "qr".
-        gauge: (rows, p) directions without effect, which are given weight; None for none.
-        first: column of their first unknown.
+        gauge: as in `linearised`.
+        first: column of the first shared unknown.
     """
     total, rows = np.zeros((columns, columns)), 0
     for block, count in blocks:
@@ -104,17 +132,9 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
     return Compressed(total if method == "qr" else _factor(total), rows)
 
 
-def assembled(parts: Sequence[Compressed], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
-              ) -> Linearised:
-    """Put the experiments together.
-
-    Args:
-        parts: one for each experiment.
-        n: size of an initial state.
-        p: number of shared unknowns.
-        gauge: as in `linearise`.
-        method: how the parts were compressed.
-    """
+def _assembled(parts: Sequence[Compressed], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
+               ) -> Linearised:
+    """Put the experiments together, each with its own initial state."""
     states, rest = zip(*(eliminated(part.factor, n) for part in parts))
     rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
     together = len(rest) > 1 or len(rows_of_gauge)

@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from formulations.state_models import state_model
+from optid.arrays import Array
 from optid.bases import Linear
+from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.errors import DataError, StructureError
-from optid.models import HammersteinSS
+from optid.errors import StructureError
+from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
-from optid.models.state_forms import balancing
+from optid.statistics.expansion import Expansion
 from optid.statistics.linearised import Linearised
 from optid.statistics.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
-
-Array = np.ndarray
 
 STABLE = 1 - 1e-9
 FLOOR = 1e-7
@@ -29,8 +28,8 @@ FLOOR = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class StateError:
-    """A `formulations.prediction_error.Criterion`: the weighted sum of squared errors of all outputs.
+class StateErrors:
+    """A `descent.Criterion`: the weighted sum of squared errors of all outputs.
 
     Attributes:
         data: the record.
@@ -46,6 +45,11 @@ class StateError:
     weight: Array
     limit: float = STABLE
     checks: tuple[Callable[[Any], str], ...] = ()
+
+    @property
+    def gauge(self) -> str:
+        """How the scale between mu and b is fixed."""
+        return "norm"
 
     @property
     def errors(self) -> str:
@@ -107,7 +111,7 @@ class StateError:
         """Return the errors (N, l) of every experiment."""
         return residuals(self.data, self.unknowns, x, self.at)
 
-    def reweighted(self, x: Array, full: bool) -> "StateError":
+    def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.
 
         A fixed point of this iteration is stationary for the determinant of the covariance (``full``), or the product
@@ -173,45 +177,26 @@ class StateError:
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0)
 
 
-def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
-            ) -> Array | None:
-    """Return an admissible vector of unknowns near a model; None without one.
+def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
+                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
+    """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
 
-    A model whose state is not carried stably is contracted; the initial states are those that fit best.
+    Args:
+        expansion: the signals of the fit.
+        data: the record, for names, units and sampling time.
+        matrices: A (n, n), B (n, m), C (l, n) and D (l, m).
+        mus: coefficients of the nonlinearity of every input.
+        nus: coefficients of every feedback family in its orthonormal coordinates.
+        e: (n, s), one column per family.
+        K: (n, l), zero where None.
+        offset: (l,) of the output, zero where None.
     """
-    point = criterion.point_of(_balanced(criterion, model))
-    candidates = [point]
-    if criterion.unknowns.innovations:
-        candidates.append(replace(point, K=np.zeros_like(point.K)))
-    largest = spectral_radius(point.A)
-    candidates += [replace(point, A=point.A * (radius / max(largest, radius)), K=np.zeros_like(point.K))
-                   for radius in radii]
-    for candidate in candidates:
-        x = criterion.normalised(criterion.unknowns.pack(candidate))
-        if not criterion.admissible(x):
-            continue
-        try:
-            at = criterion.linearise(x)
-        except (DataError, np.linalg.LinAlgError):
-            continue
-        if np.isfinite(at.value):
-            p = criterion.unknowns.shared
-            x[p:] += at.follow(np.zeros(p))
-            return x
-    return None
-
-
-def _balanced(criterion: StateError, model: HammersteinSS) -> HammersteinSS:
-    """Balance the states for the signals and weights of the fit, so that all entries of A are of one size.
-
-    A model without balanced states stays as it is.
-    """
-    data = criterion.data
-    f = model.expanded(np.vstack([e.u for e in data.experiments]))
-    y = np.vstack([e.y for e in data.experiments])
-    g = [np.nanstd(function(y[:, o])) for function, o in zip(model.feedback, model.output_of)]
-    driven = np.hstack([model.B * f.std(axis=0), model.E * np.array(g)])
-    try:
-        return model.transformed(balancing(model.A, driven, np.linalg.cholesky(criterion.weight).T @ model.C))
-    except StructureError:
-        return model
+    families = expansion.feedback
+    parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
+    injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
+    A, B, C, D = matrices
+    return HammersteinSS(
+        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
+        nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
+        feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
+        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))
