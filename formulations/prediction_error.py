@@ -55,108 +55,6 @@ Orders = int | Sequence[int]
 Bases = Basis | str | Sequence[Basis | str]
 
 
-def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 6,
-                   seed: int = 0) -> Procedure:
-    """Minimise the simulation error of a Hammerstein model.
-
-    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``.
-
-    Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
-        na: number of poles.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
-        nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
-        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
-        offset: estimate the constant of the equation; False holds it at zero, for centred data.
-        starts: number of starts that are compared at most; three suffice where they agree on a model that explains
-            nine tenths of the output.
-        seed: of the random ones.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, several outputs.
-        DataError: no stretch of some length in which every input is present.
-        RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
-            does not tell apart.
-    """
-    return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
-
-
-def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence[Any] = (), offset: bool = True,
-       starts: int = 6, seed: int = 0) -> Procedure:
-    """Minimise the simulation error of a linear model.
-
-    Named variables: ``Theta``, ``a``, ``b``, ``offset``, ``x0``.
-
-    Args:
-        data: as in `hammerstein_oe`.
-        na: as in `hammerstein_oe`.
-        nb: as in `hammerstein_oe`.
-        nk: as in `hammerstein_oe`.
-        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``, ``x0``.
-        offset: as in `hammerstein_oe`.
-        starts: as in `hammerstein_oe`.
-        seed: as in `hammerstein_oe`.
-
-    Raises:
-        StructureError, DataError, RankError: as `hammerstein_oe`.
-    """
-    return _procedure("oe.exact", data, na, nb, nk, "linear", 0, 0, constraints, None, offset, starts, seed)
-
-
-def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases = "polynomial:3", nk: Orders = 0,
-                      constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 3,
-                      seed: int = 0) -> Procedure:
-    """Minimise the innovations of a Hammerstein ARMAX model.
-
-    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``.
-
-    Args:
-        data: the record; one output; samples may be missing.
-        na: order of A.
-        nb: as in `hammerstein_oe`.
-        nc: order of C.
-        basis: as in `hammerstein_oe`.
-        nk: as in `hammerstein_oe`.
-        constraints: as in `hammerstein_oe`.
-        gauge: as in `hammerstein_oe`.
-        offset: as in `hammerstein_oe`.
-        starts: number of starts that are compared.
-        seed: as in `hammerstein_oe`.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, several outputs.
-        RankError: too few samples for the unknowns, or a basis function that no sample excites.
-    """
-    return _procedure("hammerstein_armax.exact", data, na, nb, nk, basis, nc, None, constraints, gauge, offset, starts,
-                      seed)
-
-
-def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constraints: Sequence[Any] = (),
-          offset: bool = True, starts: int = 3, seed: int = 0) -> Procedure:
-    """Minimise the innovations of a linear ARMAX model.
-
-    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``offset``.
-
-    Args:
-        data: as in `hammerstein_armax`.
-        na: order of A.
-        nb: as in `hammerstein_oe`.
-        nc: order of C.
-        nk: as in `hammerstein_oe`.
-        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``, ``c``.
-        offset: as in `hammerstein_oe`.
-        starts: as in `hammerstein_armax`.
-        seed: as in `hammerstein_oe`.
-
-    Raises:
-        StructureError, RankError: as `hammerstein_armax`.
-    """
-    return _procedure("armax.exact", data, na, nb, nk, "linear", nc, None, constraints, None, offset, starts, seed)
-
-
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,
                    constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 4,
                    seed: int = 0) -> Procedure:
@@ -165,21 +63,25 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``mu``, ``offset``, ``x0``.
 
     Args:
-        data: as in `hammerstein_oe`.
+        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
         na: number of poles of the plant.
-        nb: as in `hammerstein_oe`.
+        nb: number of coefficients of B, one per input or one for all.
         nc: order of C.
         nd: order of D.
-        basis: as in `hammerstein_oe`.
-        nk: as in `hammerstein_oe`.
-        constraints: as in `hammerstein_oe`.
-        gauge: as in `hammerstein_oe`.
-        offset: as in `hammerstein_oe`.
-        starts: as in `hammerstein_armax`.
-        seed: as in `hammerstein_oe`.
+        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
+        nk: delay of the first coefficient of B in samples, one per input or one for all.
+        constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
+        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        starts: number of starts that are compared. Of output error at most: three suffice where they agree on a model
+            that explains nine tenths of the output.
+        seed: of the random ones.
 
     Raises:
-        StructureError, DataError, RankError: as `hammerstein_oe`.
+        StructureError: impossible orders, unknown gauge, several outputs.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
+            does not tell apart.
     """
     return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, whole_number("nd", nd), constraints, gauge,
                       offset, starts, seed)
@@ -189,25 +91,54 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
        offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear Box-Jenkins model.
 
-    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``.
-
-    Args:
-        data: as in `hammerstein_oe`.
-        na: as in `hammerstein_bj`.
-        nb: as in `hammerstein_oe`.
-        nc: order of C.
-        nd: order of D.
-        nk: as in `hammerstein_oe`.
-        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``, ``c``, ``d``, ``x0``.
-        offset: as in `hammerstein_oe`.
-        starts: as in `hammerstein_armax`.
-        seed: as in `hammerstein_oe`.
-
-    Raises:
-        StructureError, DataError, RankError: as `hammerstein_oe`.
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are
+    the errors raised.
     """
     return _procedure("bj.exact", data, na, nb, nk, "linear", nc, whole_number("nd", nd), constraints, None, offset,
                       starts, seed)
+
+
+def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
+                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 6,
+                   seed: int = 0) -> Procedure:
+    """Minimise the simulation error of a Hammerstein model.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the
+    errors raised.
+    """
+    return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
+
+
+def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence[Any] = (), offset: bool = True,
+       starts: int = 6, seed: int = 0) -> Procedure:
+    """Minimise the simulation error of a linear model.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the errors
+    raised.
+    """
+    return _procedure("oe.exact", data, na, nb, nk, "linear", 0, 0, constraints, None, offset, starts, seed)
+
+
+def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases = "polynomial:3", nk: Orders = 0,
+                      constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 3,
+                      seed: int = 0) -> Procedure:
+    """Minimise the innovations of a Hammerstein ARMAX model; the record is not cut where inputs are missing.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``. Arguments as in `hammerstein_bj`, as are the
+    errors raised, except for that of a record without stretches.
+    """
+    return _procedure("hammerstein_armax.exact", data, na, nb, nk, basis, nc, None, constraints, gauge, offset, starts,
+                      seed)
+
+
+def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constraints: Sequence[Any] = (),
+          offset: bool = True, starts: int = 3, seed: int = 0) -> Procedure:
+    """Minimise the innovations of a linear ARMAX model; the record is not cut where inputs are missing.
+
+    Named variables: ``Theta``, ``a``, ``b``, ``c``, ``offset``. Arguments as in `hammerstein_armax`, as are the errors
+    raised.
+    """
+    return _procedure("armax.exact", data, na, nb, nk, "linear", nc, None, constraints, None, offset, starts, seed)
 
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
@@ -220,14 +151,9 @@ def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc:
 
 def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                     gauge: str | None, offset: bool, errors: str) -> TransferErrors:
-    """Return the criterion of checked arguments on the record in its own units.
+    """Return the criterion on the record in its own units, its arguments checked as in `hammerstein_bj`.
 
-    Args:
-        data: as in `hammerstein_oe`, and so are all arguments that it has.
-        nc: order of C.
-        nd: order of D; None where D is A.
-        gauge: None for a linear model.
-        errors: what they are called, for messages.
+    Where D is A, nd is None; of a linear model the gauge. ``errors`` is what messages call them.
     """
     if gauge is not None:
         check_gauge(gauge)

@@ -57,41 +57,6 @@ WORDS = {"criterion": ("simulation", "prediction"), "stability": ("stable", "fre
          "weighting": ("auto", "scale", "variance", "determinant")}
 
 
-def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
-       weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-       stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
-       constraints: Sequence[Any] = ()) -> Procedure:
-    """Minimise the simulation or prediction error of a linear state-space model.
-
-    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``.
-
-    Args:
-        data: the record. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
-        nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
-        criterion: "simulation" (output error, K = 0) or "prediction" (innovation form, K estimated).
-        block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
-            may be estimated as in `formulations.hammerstein_ss.sid`.
-        weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
-            covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
-            likelihood of Gaussian noise) for prediction.
-        offset: estimate a constant; False takes the record as it is.
-        feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
-        stability: "stable" keeps every iterate stable (for prediction, its predictor); "free" lets the poles go where
-            the errors are smallest, for plants that integrate or grow over the record.
-        initial: models of the same structure to start from besides.
-        iterations: Gauss-Newton steps per descent at most.
-        constraints: rules about poles, builders of CVXPY constraints in the named variables.
-
-    Raises:
-        StructureError: words, orders or starts that do not fit.
-        DataError: no stretch of some length in which every input is present.
-        RankError: too few samples for the unknowns.
-    """
-    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    return _procedure("ss.exact", data, nx, "linear", None, words, block_rows, offset, feedthrough, initial, iterations,
-                      constraints)
-
-
 def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
                    criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
                    weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
@@ -105,26 +70,47 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
-        data: as in `ss`.
-        nx: as in `ss`.
+        data: the record. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
+        nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
         basis: basis of the input nonlinearity, one per input or one for all.
         feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
-        criterion: "simulation" (P2: measured feedback, K = 0) or "prediction" (P1: K estimated).
-        block_rows: as in `ss`.
-        weighting: as in `ss`.
-        offset: as in `ss`.
-        feedthrough: as in `ss`.
-        stability: as in `ss`; what counts are the poles with the feedback taken as a given signal.
-        initial: as in `ss`.
-        iterations: as in `ss`.
-        constraints: as in `ss`, also those of `formulations.constraints.shape`.
+        criterion: "simulation" (P2: measured feedback, K = 0) or "prediction" (P1: innovation form, K estimated).
+        block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
+            may be estimated as in `formulations.hammerstein_ss.sid`.
+        weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
+            covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
+            likelihood of Gaussian noise) for prediction.
+        offset: estimate a constant; False takes the record as it is.
+        feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
+        stability: "stable" keeps every iterate stable (for prediction, its predictor), with the feedback taken as a
+            given signal; "free" lets the poles go where the errors are smallest, for plants that integrate or grow
+            over the record.
+        initial: models of the same structure to start from besides.
+        iterations: Gauss-Newton steps per descent at most.
+        constraints: rules about poles, builders of CVXPY constraints in the named variables.
 
     Raises:
-        StructureError, DataError, RankError: as `ss`; RankError also for a feedback basis that is linear in y.
+        StructureError: words, orders or starts that do not fit.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
     """
     words = {"criterion": criterion, "weighting": weighting, "stability": stability}
     return _procedure("hammerstein_ss.exact", data, nx, basis, feedback_basis, words, block_rows, offset, feedthrough,
                       initial, iterations, constraints)
+
+
+def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
+       weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+       stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+       constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation or prediction error of a linear state-space model.
+
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``. Arguments as in `hammerstein_ss`, as
+    are the errors raised.
+    """
+    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
+    return _procedure("ss.exact", data, nx, "linear", None, words, block_rows, offset, feedthrough, initial, iterations,
+                      constraints)
 
 
 def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],
@@ -274,7 +260,7 @@ class _Step:
         to_state = np.linalg.inv(left) if static else left
         for c in range(expansion.m):
             mu, b = self.key("mu", c), self.key("b", c)
-            vectors = {"Theta": (variables[b], values[b])}
+            vectors: dict[str, tuple[Any, Any]] = {"Theta": (variables[b], values[b])}
             if static:
                 seen, rest = values["C"] @ to_state, to_state @ values[b][:n]
                 gain = seen @ variables[b][:n] + (variables["C"] - values["C"]) @ rest + (

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
+_SHARED = re.compile(r"[Aa]rguments as in `(\w+)`")
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
@@ -47,7 +48,10 @@ class Description:
         return {key: p for key, p in self.signature.parameters.items() if p.kind is p.KEYWORD_ONLY}
 
     def arguments(self) -> dict[str, str]:
-        """Return {argument: its first sentence}; "as in `other`" is looked up in the module."""
+        """Return {argument: its first sentence}.
+
+        "As in `other`", of an argument or of all ("Arguments as in `other`"), is looked up in the module.
+        """
         return _arguments(self.text, self.siblings)
 
 
@@ -115,7 +119,8 @@ def _parameter(argument: ast.arg, kind: Any, default: ast.expr | None) -> inspec
 
 
 def _arguments(text: str, siblings: Mapping[str, str]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    shared = _SHARED.search(text)
+    found = _arguments(siblings.get(shared[1], ""), siblings) if shared else {}
     lines = text.splitlines()
     if "Args:" not in lines:
         return found

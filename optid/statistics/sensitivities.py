@@ -18,7 +18,6 @@ zero; otherwise the initial state of the plant is unknown, and the noise starts 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,7 +26,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.models import noise_filter
 from optid.models.layout import Layout
-from optid.models.noise_filter import DEAD, PRESENT
+from optid.models.noise_filter import DEAD, PRESENT, Filtered
 from optid.statistics.linearised import Linearised, compressed, eliminated, linearised
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
@@ -74,8 +73,8 @@ def linearise(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, *,
         chunk: samples at a time.
         functions: what `expanded` returned for the record.
     """
-    return linearised(lambda i: blocks(data, unknowns, point, i, functions=functions, chunk=chunk), unknowns.experiments,
-                      unknowns.memory, unknowns.shared, gauge, method)
+    return linearised(lambda i: blocks(data, unknowns, point, i, functions=functions, chunk=chunk),
+                      unknowns.experiments, unknowns.memory, unknowns.shared, gauge, method)
 
 
 def instruments(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chunk: int = CHUNK,
@@ -100,46 +99,22 @@ def simulate(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chu
     return [_simulated(data, unknowns, point, i, None, chunk) for i in range(unknowns.experiments)]
 
 
-@dataclass(frozen=True, eq=False)
-class Predicted:
-    """One experiment at a point, each (N,).
-
-    Attributes:
-        x: output of the plant; where D is A, the right-hand side of its equation.
-        s: what the noise filter has explained: y - x, or y where D is A; missing samples replaced by predictions.
-        innovations: zero where they cannot be computed.
-        state: PRESENT, MISSING (predicted only) or DEAD (no prediction).
-    """
-
-    x: Array
-    s: Array
-    innovations: Array
-    state: Any
-
-    @property
-    def rows(self) -> int:
-        """Number of innovations."""
-        return int(np.count_nonzero(self.state == PRESENT))
-
-
-def predict(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int,
-            functions: Sequence[Array] | None = None, chunk: int = CHUNK) -> Predicted:
+def predict(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, x: Array) -> Filtered:
     """Run the predictor over one experiment.
+
+    The samples that its noise filter explains are y - x, or y where D is A.
 
     Args:
         data: the record.
         unknowns: their order.
         point: as in `linearise`.
         index: number of the experiment.
-        functions: as in `linearise`.
-        chunk: samples at a time.
+        x: (N,) what `simulate` returned for it.
     """
-    x, y = _simulated(data, unknowns, point, index, functions, chunk), data.experiments[index].y[:, 0]
+    y = data.experiments[index].y[:, 0]
     if unknowns.apart:
-        found = noise_filter.innovations(y - x, None, point.c, point.d)
-    else:
-        found = noise_filter.innovations(y, x, point.c, point.a, start=unknowns.skipped)
-    return Predicted(x, np.nan_to_num(found.filled), found.innovations, found.state)
+        return noise_filter.innovations(y - x, None, point.c, point.d)
+    return noise_filter.innovations(y, x, point.c, point.a, start=unknowns.skipped)
 
 
 def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, *,
@@ -151,7 +126,11 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
     """
     e, layout, at, n = data.experiments[index], unknowns.layout, unknowns.slices, unknowns.memory
     y, na, extra = e.y[:, 0], layout.na, layout.na if measured else 0
-    noise = None if unknowns.plain else predict(data, unknowns, point, index, functions, chunk)
+    noise, x, explained = None, np.zeros(0), np.zeros(0)
+    if not unknowns.plain:
+        x = _simulated(data, unknowns, point, index, functions, chunk)
+        noise = predict(data, unknowns, point, index, x)
+        explained = np.nan_to_num(noise.filled)
     depth = max(unknowns.nc, len(point.d))
     history, kinds = np.zeros((depth, n + unknowns.shared + 1)), np.full(depth, DEAD, dtype=np.int8)
     head, run = n, _Run(unknowns, point, index, whitened=True)
@@ -160,7 +139,7 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
         part = slice(start, min(start + chunk, len(y)))
         count = part.stop - part.start
         run.advance(e.u[part], None if functions is None else functions[index][part])
-        output = run.output() if noise is None else noise.x[part]
+        output = run.output() if noise is None else x[part]
         if head and run.forgotten and np.max(np.abs(history[:, :n]), initial=0.0) <= FORGOTTEN * run.peak:
             head, history = 0, history[:, n:]
         block = np.empty((depth + count, head + unknowns.shared + extra + 1))
@@ -182,7 +161,7 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
                     rows[:, head + unknowns.shared + i - 1] = -lines[na - i : na - i + count, 1]
         elif noise is not None:
             for i in range(1, na + 1):
-                rows[:, head + i - 1] = -_delayed(noise.s, part, i)
+                rows[:, head + i - 1] = -_delayed(explained, part, i)
         for c, lags in enumerate(layout.lags):
             if unknowns.free[c]:
                 rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
@@ -194,7 +173,7 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
             rows[:, -1] = output - y[part]
             present = np.isfinite(y[part])
         else:
-            for name, signal, sign in (("c", noise.innovations, 1.0), ("d", noise.s, -1.0)):
+            for name, signal, sign in (("c", noise.innovations, 1.0), ("d", explained, -1.0)):
                 for i in range(at[name].stop - at[name].start):
                     rows[:, head + at[name].start + i] = sign * _delayed(signal, part, i + 1)
             rows[:, -1] = -noise.innovations[part]

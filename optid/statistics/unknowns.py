@@ -36,6 +36,13 @@ class Unknowns:
         """Number of unknowns that all experiments share: the first entries of x."""
         return max((at.stop for at in self.slices.values()), default=0)
 
+    @cached_property
+    def products(self) -> tuple[tuple[str, str], ...]:
+        """Parts (mu, b) of free inputs, and (nu, e) of feedback, of which the output shows the product alone."""
+        partner = {"mu": "b", "nu": "e"}
+        return tuple((part, partner[part[:2]] + part[2:]) for part, at in self.slices.items()
+                     if part[:2] in partner and at.stop > at.start)
+
     @property
     def size(self) -> int:
         """Length of x."""

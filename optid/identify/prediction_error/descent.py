@@ -1,13 +1,13 @@
 """Levenberg-Marquardt descents on a sum of squared errors, in the scaling of Moré (1978), and comparison of starts."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.record import Data
 from optid.statistics.linearised import Linearised
 from optid.statistics.unknowns import Unknowns
 
@@ -33,40 +33,47 @@ BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit cir
           "constraint such as stable:0.999")
 
 
-class Criterion(Protocol):
-    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states."""
+class Criterion(ABC):
+    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states.
+
+    Attributes:
+        data: the record.
+        unknowns: the order of x.
+        gauge: how the scale between mu and b is fixed.
+        energy: sum of squares of the outputs about their means.
+    """
+
+    data: Data
+    unknowns: Unknowns
+    gauge: str
+    energy: float
 
     @property
+    @abstractmethod
     def errors(self) -> str:
-        """Their name: "simulation errors" or "prediction errors"."""
-        ...
+        """What they are called: "simulation errors" or "prediction errors"."""
 
-    @property
-    def gauge(self) -> str:
-        """How the scale between mu and b is fixed."""
-        ...
-
-    @property
-    def unknowns(self) -> Unknowns:
-        """The order of x."""
-        ...
-
-    @cached_property
-    def energy(self) -> float:
-        """Sum of squares of the record about its mean."""
-        ...
-
+    @abstractmethod
     def linearise(self, x: Array) -> Linearised:
         """Return the errors near x."""
-        ...
 
+    @abstractmethod
     def admissible(self, x: Array) -> bool:
         """Whether the errors exist at x: its filters are stable."""
-        ...
+
+    def scale(self, x: Array, b: str) -> float:
+        """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""
+        return float(np.linalg.norm(x[self.unknowns.slices[b]]))
 
     def normalised(self, x: Array) -> Array:
-        """Return the same model in its gauge."""
-        ...
+        """Return the same model in the gauge."""
+        x, at = np.array(x), self.unknowns.slices
+        for mu, b in self.unknowns.products:
+            if factor := self.scale(x, b):
+                x[at[mu]], x[at[b]] = x[at[mu]] * factor, x[at[b]] / factor
+            else:  # a channel without effect: any direction will do
+                x[at[mu]], x[at[b]] = 0.0, 1 / np.sqrt(x[at[b]].size)
+        return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +119,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
     x = criterion.normalised(x)
     at = criterion.linearise(x)
     p = len(at.pull)
-    free = np.ones(p, dtype=bool) if held is None else ~held
+    free = np.ones(p, dtype=bool) if held is None else np.logical_not(held)
     scale, least = np.zeros(int(free.sum())), EXACT * criterion.energy
     damping, rejected, blocked = 1e-3, 0, False
     for count in range(1, iterations + 1):

@@ -7,7 +7,7 @@ and b, are projected out at every iterate (data-driven local coordinates, McKelv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from optid.bases import Linear
 from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.prediction_error.descent import Criterion
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
 from optid.statistics.expansion import Expansion
@@ -28,8 +29,8 @@ FLOOR = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class StateErrors:
-    """A `descent.Criterion`: the weighted sum of squared errors of all outputs.
+class StateErrors(Criterion):
+    """The weighted sum of squared errors of all outputs.
 
     Attributes:
         data: the record.
@@ -45,11 +46,7 @@ class StateErrors:
     weight: Array
     limit: float = STABLE
     checks: tuple[Callable[[Any], str], ...] = ()
-
-    @property
-    def gauge(self) -> str:
-        """How the scale between mu and b is fixed."""
-        return "norm"
+    gauge: ClassVar[str] = "norm"
 
     @property
     def errors(self) -> str:
@@ -76,27 +73,13 @@ class StateErrors:
             return False
         return not self.checks or not any(check(self.at(point)) for check in self.checks)
 
-    def normalised(self, x: Array) -> Array:
-        """Return the same model with [b; d] of every free input, and e of every family, of norm one."""
-        x, at = np.array(x), self.unknowns.slices
-        for outer, inner in (("b", "mu"), ("e", "nu")):
-            for name in [name for name in at if name.startswith(inner)]:
-                column = outer + name[len(inner) :]
-                size = float(np.linalg.norm(x[at[column]]))
-                if size:
-                    x[at[name]], x[at[column]] = x[at[name]] * size, x[at[column]] / size
-                else:  # a channel without effect: any direction will do
-                    x[at[name]], x[at[column]] = 0.0, 1 / np.sqrt(x[at[column]].size)
-        return x
-
     def gauge_rows(self, x: Array) -> Array:
         """Orthonormal directions (rows, shared) of theta that a step does not take, since they change no output."""
         at, rows = self.unknowns.slices, list(self.unknowns.similarity(x))
-        for outer, inner in (("b", "mu"), ("e", "nu")):
-            for name in [name for name in at if name.startswith(inner)]:
-                row, column = np.zeros(self.unknowns.shared), outer + name[len(inner) :]
-                row[at[name]], row[at[column]] = x[at[name]], -x[at[column]]
-                rows.append(row)
+        for mu, b in self.unknowns.products:
+            row = np.zeros(self.unknowns.shared)
+            row[at[mu]], row[at[b]] = x[at[mu]], -x[at[b]]
+            rows.append(row)
         if not rows:
             return np.zeros((0, self.unknowns.shared))
         values, vectors = np.linalg.svd(np.array(rows), full_matrices=False)[1:]

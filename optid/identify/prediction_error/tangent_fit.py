@@ -104,10 +104,10 @@ class TangentFit:
         """
         x, at = self.criterion.normalised(x), self.criterion.unknowns.slices
         errors = self.criterion.linearise(x) if self.constraints else None
-        for mu in [part for part in at if part.startswith("mu") and x[at[part]].size]:
-            if self.criterion.gauge != "norm":
-                break
-            b, best, chosen = "b" + mu[2:], np.inf, x
+        for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
+            if not mu.startswith("mu"):  # the signs of feedback functions stay
+                continue
+            best, chosen = np.inf, x
             first = leading_sign(x[at[b]])
             for mu_sign, b_sign in ((first, first), (-first, -first), (-first, first), (first, -first)):
                 turned = np.array(x)

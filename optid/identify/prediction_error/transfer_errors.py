@@ -13,13 +13,14 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError
+from optid.identify.prediction_error.descent import Criterion
 from optid.models import noise_filter, roots
 from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
 from optid.program.units import in_units, inner_bases, own_units
 from optid.statistics.linearised import Linearised
 from optid.statistics.regression import ROWS_PER_COLUMN, collect
-from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict
+from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict, simulate
 from optid.statistics.unknowns import TransferUnknowns
 
 STABLE = 1 - 1e-9
@@ -27,8 +28,8 @@ STABLE = 1 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class TransferErrors:
-    """Simulation errors, or one-step prediction errors with a noise filter; a `descent.Criterion`.
+class TransferErrors(Criterion):
+    """Simulation errors, or one-step prediction errors with a noise filter.
 
     Attributes:
         data: the record.
@@ -70,7 +71,8 @@ class TransferErrors:
     def innovations(self, x: Array) -> list[Array]:
         """Return the innovations (N,) of every experiment, NaN where there is none."""
         point = self.unknowns.unpack(x)
-        found = [predict(self.data, self.unknowns, point, i, self.functions) for i in range(self.data.n_experiments)]
+        simulated = simulate(self.data, self.unknowns, point)
+        found = [predict(self.data, self.unknowns, point, i, x) for i, x in enumerate(simulated)]
         return [np.where(one.state == noise_filter.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
@@ -80,36 +82,25 @@ class TransferErrors:
             return False
         return not self.unknowns.apart or roots.radius(x[at["a"]]) < STABLE
 
-    def normalised(self, x: Array) -> Array:
-        """Return the same model in the gauge."""
-        x, at = np.array(x), self.unknowns.slices
-        for c, free in enumerate(self.unknowns.free):
-            if free:
-                mu, b = x[at[f"mu{c}"]], x[at[f"b{c}"]]
-                factor = 1.0
-                if self.gauge == "norm":
-                    factor = float(np.linalg.norm(b))
-                elif self.gauge != "none":
-                    factor = gauge_factor(self.gauge, x[at["a"]], b, self.unknowns.layout.inputs[c])
-                if not factor:  # an input without effect: any direction will do
-                    x[at[f"mu{c}"]], x[at[f"b{c}"]] = 0.0, 1 / np.sqrt(b.size)
-                    continue
-                x[at[f"mu{c}"]], x[at[f"b{c}"]] = mu * factor, b / factor
-        return x
+    def scale(self, x: Array, b: str) -> float:
+        """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge."""
+        if self.gauge == "norm":
+            return super().scale(x, b)
+        at, channel = self.unknowns.slices, self.unknowns.layout.inputs[int(b[1:])]
+        return 1.0 if self.gauge == "none" else gauge_factor(self.gauge, x[at["a"]], x[at[b]], channel)
 
     def gauge_rows(self, x: Array) -> Array:
         """Gradients (inputs, p) of the gauge: directions that a step does not take."""
         at, rows = self.unknowns.slices, []
-        for c, free in enumerate(self.unknowns.free):
-            if free:
-                row = np.zeros(self.unknowns.shared)
-                if self.gauge == "b0":
-                    row[at[f"b{c}"].start] = 1.0
-                elif self.gauge == "gain":
-                    row[at[f"b{c}"]], row[at["a"]] = 1.0, -1.0
-                else:
-                    row[at[f"b{c}"]] = x[at[f"b{c}"]]
-                rows.append(row)
+        for _, b in self.unknowns.products:
+            row = np.zeros(self.unknowns.shared)
+            if self.gauge == "b0":
+                row[at[b].start] = 1.0
+            elif self.gauge == "gain":
+                row[at[b]], row[at["a"]] = 1.0, -1.0
+            else:
+                row[at[b]] = x[at[b]]
+            rows.append(row)
         return np.array(rows).reshape(-1, self.unknowns.shared)
 
 
