@@ -56,21 +56,8 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
 
-    Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
-        na: number of poles.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
-        nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth constraint in
-            the named variables.
-        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
-        offset: estimate the constant of the equation; False holds it at zero, for centred data.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, several outputs, or a record that is too long.
-        DataError: no stretch of some length in which every input is present.
-        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+    Arguments as in `formulations.prediction_error.hammerstein_bj`, as are the errors raised; constraints may be any
+    smooth ones in the named variables. A record that is too long is refused (`StructureError`).
     """
     criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset, "simulation errors")
     if criterion.data.n_samples > LIMIT:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
-_SHARED = re.compile(r"[Aa]rguments as in `(\w+)`")
+_SHARED = re.compile(r"[Aa]rguments as in `(?:([\w.]+)\.)?(\w+)`")
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
@@ -50,7 +50,7 @@ class Description:
     def arguments(self) -> dict[str, str]:
         """Return {argument: its first sentence}.
 
-        "As in `other`", of an argument or of all ("Arguments as in `other`"), is looked up in the module.
+        "As in `other`" is looked up in the module, "Arguments as in `other`", of all of them, also in another one.
         """
         return _arguments(self.text, self.siblings)
 
@@ -92,8 +92,12 @@ def _in_source(module: str, name: str) -> Description | None:
         parameters.append(_parameter(argument, inspect.Parameter.KEYWORD_ONLY, default))
     if given.kwarg:
         parameters.append(_parameter(given.kwarg, inspect.Parameter.VAR_KEYWORD, None))
-    siblings = {other: ast.get_docstring(found) or "" for other, found in functions.items()}
+    siblings = _docstrings(module)
     return Description(inspect.Signature(parameters), siblings[name], siblings)
+
+
+def _docstrings(module: str) -> dict[str, str]:
+    return {name: ast.get_docstring(found) or "" for name, found in _functions(module).items()}
 
 
 @cache
@@ -119,8 +123,10 @@ def _parameter(argument: ast.arg, kind: Any, default: ast.expr | None) -> inspec
 
 
 def _arguments(text: str, siblings: Mapping[str, str]) -> dict[str, str]:
-    shared = _SHARED.search(text)
-    found = _arguments(siblings.get(shared[1], ""), siblings) if shared else {}
+    shared, found = _SHARED.search(text), {}
+    if shared:
+        others = _docstrings(shared[1]) if shared[1] else siblings
+        found = _arguments(others.get(shared[2], ""), others)
     lines = text.splitlines()
     if "Args:" not in lines:
         return found

@@ -89,7 +89,7 @@ def instruments(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, 
     total = np.zeros((size, size))
     for i in range(unknowns.experiments):
         found = blocks(data, unknowns, point, i, functions=functions, chunk=chunk, measured=True)
-        _, rest = eliminated(compressed(found, unknowns.memory + size, "gram").factor, unknowns.memory)
+        _, rest = eliminated(compressed(found, unknowns.memory + size, "gram")[0], unknowns.memory)
         total += rest.T @ rest
     return total
 

@@ -121,7 +121,7 @@ class StateUnknowns(Unknowns):
 
     def unpack(self, x: Array) -> StatePoint:
         """Return the point of a vector."""
-        part = {name: x[at].reshape(self.shapes[name]) for name, at in self.slices.items()}
+        part = self.parts(x)
         n, outputs, m, s = self.n, self.l, self.expansion.m, len(self.expansion.feedback)
         b, d = np.zeros((n, m)), np.zeros((outputs, m))
         for c, direct in enumerate(self.feedthrough):

@@ -43,6 +43,10 @@ class Unknowns:
         return tuple((part, partner[part[:2]] + part[2:]) for part, at in self.slices.items()
                      if part[:2] in partner and at.stop > at.start)
 
+    def parts(self, x: Array) -> dict[str, Array]:
+        """Return the shared parts of x in their shapes."""
+        return {name: x[at].reshape(self.shapes[name]) for name, at in self.slices.items()}
+
     @property
     def size(self) -> int:
         """Length of x."""
@@ -130,8 +134,7 @@ class TransferUnknowns(Unknowns):
 
     def unpack(self, x: Array) -> TransferPoint:
         """Return the point of x."""
-        part = {name: x[at] for name, at in self.slices.items()}
-        inputs = range(self.layout.m)
+        part, inputs = self.parts(x), range(self.layout.m)
         return TransferPoint(
             part["a"], tuple(part[f"mu{c}"] if self.free[c] else np.ones(1) for c in inputs),
             tuple(part[f"b{c}"] for c in inputs), float(np.sum(part["offset"])),

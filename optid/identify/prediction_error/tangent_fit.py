@@ -41,14 +41,10 @@ class Places:
 
     def values(self, x: Array) -> dict[str, Array]:
         """Name the parts of x; initial states are (n,), or (n, experiments)."""
-        unknowns, found = self.unknowns, {}
+        unknowns, parts = self.unknowns, self.unknowns.parts(x)
         states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.memory).T
-        for name, part in self.names.items():
-            if part == "x0":
-                found[name] = states if unknowns.experiments > 1 else states[:, 0]
-            else:
-                found[name] = x[unknowns.slices[part]].reshape(unknowns.shapes[part])
-        return found
+        parts["x0"] = states if unknowns.experiments > 1 else states[:, 0]
+        return {name: parts[part] for name, part in self.names.items()}
 
     def pack(self, values: Mapping[str, Array]) -> Array:
         """Return x of named values."""
