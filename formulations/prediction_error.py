@@ -23,7 +23,7 @@ less certain after a gap (a Kalman filter's gain would grow there): A, B and f a
 present allow, C gets a small bias when gaps are many, a few hundredths with a third of the outputs missing at random.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -224,7 +224,8 @@ class _Step:
         structural |= {"gauge": tuple(fixed)} if fixed else {}
 
         if unknowns.memory:
-            named["x0"] = variables["x0"] + self._levels_before(named)
+            thetas = [named[self.key("Theta", c)] for c in range(unknowns.layout.m)]
+            named["x0"] = variables["x0"] + self.criterion.levels_before(variables.get("a"), thetas)
         view = View(named, kind="tangent", channels=unknowns.layout.inputs, gauge=gauge, reference=values, units=units,
                     bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))))
         usual = self.places.values(self.criterion.normalised(self.optimum))
@@ -238,25 +239,6 @@ class _Step:
     def recover(self, values: Values) -> HammersteinTF:
         """Return the model of the values of the variables, in the units of the record."""
         return transfer_model(self.criterion, values)
-
-    def _levels_before(self, named: Mapping[str, Any]) -> Any:
-        """What x0 lacks in the record's own units, in which the time before the record is at the levels.
-
-        In the units of the record it is at zero, as the definition of x0 has it.
-        """
-        units, unknowns = self.criterion.units, self.criterion.unknowns
-        layout, rows = unknowns.layout, np.arange(unknowns.memory)[:, None]
-        total: Any = np.zeros(unknowns.memory)
-        if layout.na and units.y_offset[0]:
-            later = (np.arange(1, layout.na + 1) > rows).astype(float)
-            total = total - units.y_offset[0] / units.y_scale[0] * (later @ named["a"])
-        for c, (origin, scale) in enumerate(zip(units.u_offset, units.u_scale)):
-            if origin:
-                later = (np.asarray(layout.lags[c]) > rows).astype(float)
-                total = total + origin / scale * (later @ named[self.key("Theta", c)][0])
-        if unknowns.experiments == 1:
-            return total
-        return cp.reshape(total, (unknowns.memory, 1), order="F") @ np.ones((1, unknowns.experiments))
 
 
 def channel_key(criterion: TransferErrors, name: str, c: int) -> str:

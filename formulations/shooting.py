@@ -19,7 +19,7 @@ difficult starts. IPOPT uses the sparsity, and takes records up to the limit in 
 without it here and are for some hundred samples. Longer records are refused; ``hammerstein_oe.exact`` takes them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cvxpy as cp
@@ -75,8 +75,6 @@ class _Shooting:
         several = criterion.unknowns.experiments > 1
         self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
         self.variables: dict[str, cp.Variable] = {}
-        self.tables = [[basis.values(e.u[:, c]) for c, basis in enumerate(self.layout.bases)]
-                       for e in self.data.experiments]
 
     def key(self, name: str, c: int) -> str:
         """Name of a quantity of an input."""
@@ -104,7 +102,7 @@ class _Shooting:
             structural["stability"] = self._stable()
         structural["gauge"] = tuple(scale_fixed(gauge, self.variables[self.key("b", c)], self.variables.get("a"))
                                     for c in range(layout.m))
-        start = self._start()
+        start = self._start(derived)
         reference = {name: start[name] for name in ("a", "offset") if name in start}
         units = self.criterion.units
         view = View(expressions, kind="exact", channels=layout.inputs,
@@ -131,7 +129,7 @@ class _Shooting:
         for c, lags in enumerate(layout.lags):
             name = f"{self.key('w', c)}{label}"
             w = variables[name] = cp.Variable(count, name=name)
-            derived[name] = self.tables[i][c] @ variables[self.key("mu", c)]
+            derived[name] = layout.bases[c].values(e.u[:, c]) @ variables[self.key("mu", c)]
             constraints[f"nonlinearity of {name}"] = (w == derived[name],)
             for j, lag in enumerate(lags):
                 right = right + variables[self.key("b", c)][j] * w[n - lag : count - lag]
@@ -162,7 +160,7 @@ class _Shooting:
             below = level
         return tuple(constraints)
 
-    def _start(self) -> dict[str, Array]:
+    def _start(self, derived: Mapping[str, Any]) -> dict[str, Array]:
         """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
         criterion, unknowns = self.criterion, self.criterion.unknowns
         found = arx_start(criterion)
@@ -173,19 +171,16 @@ class _Shooting:
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
             sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
             start |= {self.key("mu", c): sign * mu, self.key("b", c): sign * b}
-        outputs = simulate(self.data, unknowns, point)
-        for e, label, x, tables in zip(self.data.experiments, self.labels, outputs, self.tables):
-            start[f"x{label}"] = x
-            there = np.isfinite(e.y[:, 0])
-            start[f"residual{label}"] = x[there] - e.y[there, 0]
-            for c, table in enumerate(tables):
-                start[f"{self.key('w', c)}{label}"] = table @ start[self.key("mu", c)]
+        start |= {f"x{label}": x for label, x in zip(self.labels, simulate(self.data, unknowns, point))}
         level = point.a
         start["kappa"] = np.zeros(self.layout.na)
         for m in range(self.layout.na, 0, -1):  # the recursion backwards
             start[f"a of order {m}"], start["kappa"][m - 1] = level, level[-1]
             level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
-        return {name: start[name] for name in self.variables}
+        start = {name: value for name, value in start.items() if name in self.variables}
+        for name, value in start.items():
+            self.variables[name].value = value
+        return {**start, **{name: np.asarray(expression.value) for name, expression in derived.items()}}
 
     def recover(self, values: Values) -> HammersteinTF:
         """Build the model."""

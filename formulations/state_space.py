@@ -32,7 +32,6 @@ from formulations.arguments import enough_rows, in_memory, one_of, outputs_prese
 from formulations.equation_error import tangent_product
 from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import identified
-from optid.certificate.simulation_bound import simulation_bound
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
@@ -40,14 +39,13 @@ from optid.errors import RankError, StructureError
 from optid.identify.design.expansion import Bases
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
-from optid.identify.prediction_error.state_search import entered, quietly, search_states, with_fitted_noise
+from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
 from optid.identify.prediction_error.tangent_fit import Places, TangentFit
 from optid.models import HammersteinSS
 from optid.program.program import Program, Values
-from optid.program.solution import Status
 from optid.program.units import energy_unit, inverse, outer_bases
 from optid.program.view import View
-from optid.solving.solve import Evidence, Procedure
+from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
 from optid.statistics.state_sensitivities import StateUnknowns
 
@@ -180,22 +178,7 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
     step = _Step(plan.name, errors, constraints, plan.units)
     fit = TangentFit(errors, step.places, step.pose, step.recover, constraints)
     evidence = yield from refine(fit, best, {"order": nx, **figures}, fit.signed(best.x))
-    return None if evidence is None else _completed(evidence, errors, energy_unit(plan.units))
-
-
-def _completed(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
-    """Add the noise model, and the Hankel bound to a simulation error with one weight per output."""
-    weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
-    model, remarks = with_fitted_noise(evidence.model, errors)
-    bound = evidence.bound
-    if not unknowns.innovations and not np.any(weight - np.diag(np.diag(weight))):
-        records = [np.hstack([e.u, e.y]) for e in errors.data.experiments]
-        bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
-                                 2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
-                                 "starts are compared")
-        reason = bound.reason if evidence.status is Status.LOCAL else reason
-    figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
-    return replace(evidence, model=model, bound=bound, reason=reason, figures=figures)
+    return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
 
 
 @dataclass(frozen=True, eq=False)

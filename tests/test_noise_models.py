@@ -383,3 +383,14 @@ def test_gas_furnace_of_box_and_jenkins(real_data):
         value, error = estimates[name]
         assert abs(value - published) < error
     assert fit.solution.objective / 296 == pytest.approx(0.0561, abs=0.0005)
+
+
+@pytest.mark.parametrize("kind", ORDERS)
+def test_long_records_are_searched_in_part_unless_that_part_is_missing(kind):
+    data = record(system(kind), (12_000,))
+    pose, orders = ORDERS[kind]
+    y = data.y.copy()
+    y[3_000:9_000] = np.nan
+    for one, error in ((data, 0.05), (Data(data.u, y), 0.1)):
+        fit = quiet(one, pose, **orders)
+        assert fit.model.a == pytest.approx(A, abs=error) and fit.model.c == pytest.approx(C, abs=error)

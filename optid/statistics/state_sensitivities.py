@@ -257,7 +257,7 @@ def _infinite(unknowns: StateUnknowns) -> Linearised:
 def _blocks(data: "Data", unknowns: StateUnknowns, x: Array, index: int, weight: Array, model: Any, chunk: int
             ) -> Iterator[tuple[Array, int]]:
     """Yield weighted rows [x0 | shared | error], zero where the output is missing, and their number."""
-    record, roots = data.experiments[index].y, _Roots(weight)
+    record, covariance = data.experiments[index].y, np.linalg.inv(weight)
     first = 0
     for outputs, jacobian in _runs(data, unknowns, unknowns.unpack(x), index, model, chunk):
         error = outputs - record[first : first + len(outputs)]
@@ -267,28 +267,18 @@ def _blocks(data: "Data", unknowns: StateUnknowns, x: Array, index: int, weight:
         block = np.concatenate([jacobian, error[:, :, None]], axis=2)
         missing = np.isnan(error)
         block[missing] = 0.0
-        if not missing.any():
-            block = np.einsum("op,kpq->koq", roots.of(np.zeros(error.shape[1], dtype=bool)), block)
-        else:
-            for pattern in np.unique(missing, axis=0):
-                rows = (missing == pattern).all(axis=1)
-                block[rows] = np.einsum("op,kpq->koq", roots.of(pattern), block[rows])
+        for pattern in np.unique(missing, axis=0):
+            rows = (missing == pattern).all(axis=1)
+            block[rows] = np.einsum("op,kpq->koq", _root(covariance, pattern), block[rows])
         yield block.reshape(-1, block.shape[2]), int(np.count_nonzero(~missing))
 
 
-class _Roots:
-    """Square roots R of the weight of the outputs present, with e^T R^T R e the weighted square."""
-
-    def __init__(self, weight: Array) -> None:
-        self.covariance = np.linalg.inv(weight)
-
-    def of(self, missing: Any) -> Array:
-        here, size = np.flatnonzero(~missing), missing.size
-        root = np.zeros((size, size))
-        if here.size:
-            inside = self.covariance[np.ix_(here, here)]
-            root[np.ix_(here, here)] = np.linalg.cholesky(np.linalg.inv(inside)).T
-        return root
+def _root(covariance: Array, missing: Any) -> Array:
+    """Return the square root R of the weight of the outputs present, with e^T R^T R e the weighted square."""
+    here, root = np.flatnonzero(~missing), np.zeros((missing.size, missing.size))
+    if here.size:
+        root[np.ix_(here, here)] = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(here, here)])).T
+    return root
 
 
 def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: Any, chunk: int

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend
 from optid.identify.prediction_error.plant_starts import with_poles
@@ -62,7 +63,7 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
 
 
 def _part(criterion: TransferErrors) -> TransferErrors:
-    """The record itself, or the middle of a long one."""
+    """The middle of a long record, or the record itself where it is short or the middle is mostly missing."""
     data = criterion.data
     if data.n_samples <= 2 * SEARCH:
         return criterion
@@ -77,7 +78,14 @@ def _part(criterion: TransferErrors) -> TransferErrors:
     else:
         first = (size - SEARCH) // 2
         cut = data.select(experiments=[longest]).window(first, first + SEARCH)
+    if 2 * _complete(cut) < _complete(data):
+        return criterion
     return replace(criterion, data=cut, unknowns=replace(criterion.unknowns, experiments=cut.n_experiments))
+
+
+def _complete(data: Data) -> float:
+    """Share of the samples of which no channel is missing."""
+    return float(np.mean(np.concatenate([np.isfinite(np.hstack([e.u, e.y])).all(axis=1) for e in data.experiments])))
 
 
 def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.certificate.simulation_bound import simulation_bound
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
@@ -15,7 +16,8 @@ from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.roots import spectral_radius
 from optid.models.state_forms import balancing
-from optid.solving.solve import Procedure
+from optid.program.solution import Status
+from optid.solving.solve import Evidence, Procedure
 
 ROUNDS = 10
 """Times the errors are weighted anew at most."""
@@ -128,11 +130,31 @@ def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
         return model
 
 
-def with_fitted_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
+def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
+    """Add the noise model, and the Hankel bound to a simulation error with one weight per output.
+
+    Args:
+        evidence: of a fit.
+        errors: as they were weighted at last.
+        unit: what one squared unit of the outputs is in units of the record.
+    """
+    weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
+    model, remarks = _with_noise(evidence.model, errors)
+    bound = evidence.bound
+    if not unknowns.innovations and not np.any(weight - np.diag(np.diag(weight))):
+        records = [np.hstack([e.u, e.y]) for e in errors.data.experiments]
+        bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
+                                 2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
+                                 "starts are compared")
+        reason = bound.reason if evidence.status is Status.LOCAL else reason
+    figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
+    return replace(evidence, model=model, bound=bound, reason=reason, figures=figures)
+
+
+def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
     """Add the covariances of the noise: with K as it was fitted, or with one estimated from the simulation errors.
 
-    Returns:
-        The model, and the figure that says why there is no noise model where there is none.
+    The figure besides says why there is no noise model where there is none.
     """
     data = errors.data
     try:

@@ -103,6 +103,27 @@ class TransferErrors(Criterion):
             rows.append(row)
         return np.array(rows).reshape(-1, self.unknowns.shared)
 
+    def levels_before(self, a: Any, thetas: Sequence[Any]) -> Any:
+        """Return what x0 lacks in the record's own units, in which the time before the record is at the levels.
+
+        In the units of the model it is at zero, as the definition of x0 has it.
+
+        Args:
+            a: (na,) values or expressions.
+            thetas: (P, nb) of every input.
+        """
+        units, memory, layout = self.units, self.unknowns.memory, self.unknowns.layout
+        rows, total = np.arange(memory)[:, None], np.zeros(memory)
+        if layout.na and units.y_offset[0]:
+            later = (np.arange(1, layout.na + 1) > rows).astype(float)
+            total = total - units.y_offset[0] / units.y_scale[0] * (later @ a)
+        for lags, theta, origin, scale in zip(layout.lags, thetas, units.u_offset, units.u_scale):
+            if origin:
+                total = total + origin / scale * ((np.asarray(lags) > rows).astype(float) @ theta[0])
+        if self.unknowns.experiments == 1:
+            return total
+        return total[:, None] @ np.ones((1, self.unknowns.experiments))
+
 
 def plant_record(data: Data, na: int, nb: Sequence[int], nk: Sequence[int], basis: Any, offset: bool, *,
                  states: bool = True) -> tuple[Data, Layout, Transform]:
