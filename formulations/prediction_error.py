@@ -25,7 +25,6 @@ present allow, C gets a small bias when gaps are many, a few hundredths with a t
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
@@ -40,11 +39,11 @@ from optid.data.record import Data
 from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
-from optid.identify.prediction_error.tangent_fit import CompressedErrors, Places, TangentFit
+from optid.identify.prediction_error.tangent_fit import CompressedErrors, TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, plant_record
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
 from optid.program.program import Program, RankOneForm, Values
-from optid.program.units import energy_unit, outer_bases
+from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
@@ -172,29 +171,18 @@ def _run(name: str, criterion: TransferErrors, constraints: Sequence[Any], start
     free = replace(criterion, gauge="none" if criterion.gauge == "none" else "norm")
     best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
     enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")
-    step = _Step(name, criterion, tuple(constraints), best.x)
-    fit = TangentFit(criterion, step.places, step.pose, step.recover, step.constraints,
-                     energy_unit(criterion.units))
+    fit = _Fit(name, criterion, tuple(constraints), best.x)
     return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    """The programme of one step, in the tangent of an iterate."""
-
-    name: str
+class _Fit(TangentFit):
     criterion: TransferErrors
-    constraints: tuple[Any, ...]
     optimum: Array  # without constraints, whose values have usual sizes
 
-    def key(self, name: str, c: int) -> str:
-        """Name of a quantity of an input."""
-        return channel_key(self.criterion, name, c)
-
-    @cached_property
-    def places(self) -> Places:
-        """The named variables in the order of the unknowns."""
-        return Places.of(self.criterion.unknowns, self.key)
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of an input."""
+        return channel_key(self.criterion, name, number)
 
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0."""
@@ -233,7 +221,7 @@ class _Step:
                           {**usual, "residual": at.whole[1]}, self.recover, view, frozenset(structural),
                           derived={"residual": residual}, scale=self.criterion.energy, compressed=compressed,
                           least_squares=None if damping else RankOneForm(compressed.problem, tuple(self.places.names),
-                                                                         ()), unit=energy_unit(units))
+                                                                         ()), unit=self.criterion.unit)
         return program.subject_to(*self.constraints)
 
     def recover(self, values: Values) -> HammersteinTF:

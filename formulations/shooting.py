@@ -35,7 +35,7 @@ from optid.models import HammersteinTF
 from optid.models.gauges import leading_sign
 from optid.program.program import Program, Values
 from optid.program.solution import Bound
-from optid.program.units import energy_unit, outer_bases
+from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.statistics.sensitivities import simulate
 
@@ -113,7 +113,7 @@ class _Shooting:
         program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
                           variables=self.variables, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived=derived, scale=self.criterion.energy,
-                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=energy_unit(units))
+                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=self.criterion.unit)
         return program.subject_to(*constraints)
 
     def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -22,7 +22,6 @@ constrained to first order about the iterate as well.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
@@ -40,7 +39,7 @@ from optid.identify.design.expansion import Bases
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
-from optid.identify.prediction_error.tangent_fit import Places, TangentFit
+from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.models import HammersteinSS
 from optid.program.program import Program, Values
 from optid.program.units import energy_unit, inverse, outer_bases
@@ -175,33 +174,23 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
     errors, best, figures = search_states(errors, starts, words["weighting"], iterations)
-    step = _Step(plan.name, errors, constraints, plan.units)
-    fit = TangentFit(errors, step.places, step.pose, step.recover, constraints)
+    fit = _Fit(plan.name, errors, constraints, plan.units)
     evidence = yield from refine(fit, best, {"order": nx, **figures}, fit.signed(best.x))
     return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
-    """The programme of one step, in the tangent of an iterate."""
-
-    name: str
+class _Fit(TangentFit):
     criterion: StateErrors
-    constraints: tuple[Any, ...]
     units: Transform
 
     def key(self, name: str, number: int) -> str:
-        """Name of a quantity of an input, or of a family of feedback functions."""
+        """Name a quantity of an input, or of a family of feedback functions."""
         x = self.criterion.unknowns.expansion
         if name in ("nu", "e"):
             word = {"nu": "mu feedback", "e": "b feedback"}[name]
             return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
         return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
-
-    @cached_property
-    def places(self) -> Places:
-        """The named variables in the order of the unknowns."""
-        return Places.of(self.criterion.unknowns, self.key)
 
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0."""

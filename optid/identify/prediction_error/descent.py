@@ -41,12 +41,14 @@ class Criterion(ABC):
         unknowns: the order of x.
         gauge: how the scale between mu and b is fixed.
         energy: sum of squares of the outputs about their means.
+        unit: what one unit of the sum of squares is in units of the record.
     """
 
     data: Data
     unknowns: Unknowns
     gauge: str
     energy: float
+    unit: float = 1.0
 
     @property
     @abstractmethod

@@ -195,7 +195,7 @@ def _evidence(fit: TangentFit, here: _Iterate, status: Status, reason: str, figu
     unknown = NO_BOUND.format(fit.criterion.errors)
     bound = Bound.none(unknown)
     reason = unknown if status is Status.LOCAL else reason
-    return Evidence(fit.model(here.x), fit.unit * here.at.value, bound, status, reason, figures)
+    return Evidence(fit.model(here.x), fit.criterion.unit * here.at.value, bound, status, reason, figures)
 
 
 def _largest_dual(program: Program, solution: Solution) -> float:

@@ -14,7 +14,6 @@ from optid.identify.prediction_error.plant_starts import with_poles
 from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models.roots import contained
-from optid.program.units import energy_unit
 from optid.statistics.linearised import Linearised
 
 SEARCH = 5_000
@@ -56,7 +55,7 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
     figures: dict[str, Any] = {"starts": sentence}
     if not criterion.unknowns.plain:
         figures["starts that agree"] = agreed
-    figures[f"{criterion.errors} of the starts"] = energy_unit(criterion.units) * np.array(
+    figures[f"{criterion.errors} of the starts"] = criterion.unit * np.array(
         sorted((one.value for one in found), reverse=True))
     others = [one for one in found[1:] if abs(one.value - best.value) > 1e-3 * best.value] if part is criterion else []
     return replace(final, steps=final.steps + best.steps), others, figures

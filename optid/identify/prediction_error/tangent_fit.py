@@ -1,5 +1,6 @@
 """What a formulation hands to the iteration: named variables, the programme of a step, and the model of its values."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,24 +65,35 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
-class TangentFit:
-    """A fit by programmes in the tangent of an iterate.
+class TangentFit(ABC):
+    """A fit by programmes in the tangent of an iterate; a formulation states the programme and its model.
 
     Attributes:
+        name: of the formulation.
         criterion: the errors, in the gauge of the programmes.
-        places: where the variables stand.
-        pose: (x, errors near x, damping) -> the programme of one step, with the user's constraints.
-        recover: values of the variables -> model.
         constraints: the user's.
-        unit: what one unit of the sum of squares is in units of the record.
     """
 
+    name: str
     criterion: Criterion
-    places: Places
-    pose: Callable[[Array, Linearised, float], Program]
-    recover: Callable[[Values], Any]
-    constraints: tuple[Any, ...] = ()
-    unit: float = 1.0
+    constraints: tuple[Any, ...]
+
+    @abstractmethod
+    def key(self, name: str, number: int) -> str:
+        """Return the variable of a part of the unknowns, such as "mu" of input 0."""
+
+    @abstractmethod
+    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+        """State the programme of the step from z0, with the user's constraints; ``at`` are the errors near z0."""
+
+    @abstractmethod
+    def recover(self, values: Values) -> Any:
+        """Return the model of the values of the variables."""
+
+    @cached_property
+    def places(self) -> Places:
+        """The named variables in the order of the unknowns."""
+        return Places.of(self.criterion.unknowns, self.key)
 
     @property
     def floor(self) -> float:

@@ -17,7 +17,7 @@ from optid.identify.prediction_error.descent import Criterion
 from optid.models import noise_filter, roots
 from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
-from optid.program.units import in_units, inner_bases, own_units
+from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics.linearised import Linearised
 from optid.statistics.regression import ROWS_PER_COLUMN, collect
 from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict, simulate
@@ -51,6 +51,11 @@ class TransferErrors(Criterion):
     def errors(self) -> str:
         """What they are called."""
         return "simulation errors" if self.unknowns.plain else "prediction errors"
+
+    @property
+    def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What one unit of the sum of squares is in units of the record."""
+        return energy_unit(self.units)
 
     @cached_property
     def functions(self) -> tuple[Array, ...] | None:
