@@ -180,10 +180,6 @@ class _Fit(TangentFit):
     criterion: TransferErrors
     optimum: Array  # without constraints, whose values have usual sizes
 
-    def key(self, name: str, number: int) -> str:
-        """Name a quantity of an input."""
-        return channel_key(self.criterion, name, number)
-
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0."""
         unknowns, units, gauge = self.criterion.unknowns, self.criterion.units, self.criterion.gauge
@@ -203,7 +199,7 @@ class _Fit(TangentFit):
         named: dict[str, Any] = {"offset": cp.Constant(np.zeros(1)), **variables}
         fixed = []
         for c, free in enumerate(unknowns.free):
-            mu, b, theta = (self.key(word, c) for word in ("mu", "b", "Theta"))
+            mu, b, theta = (self.criterion.key(word, c) for word in ("mu", "b", "Theta"))
             if free:
                 named[theta] = tangent_product(variables[mu], variables[b], values[mu], values[b])
                 fixed.append(scale_fixed(gauge, variables[b], variables.get("a"), values[b]))
@@ -212,7 +208,7 @@ class _Fit(TangentFit):
         structural |= {"gauge": tuple(fixed)} if fixed else {}
 
         if unknowns.memory:
-            thetas = [named[self.key("Theta", c)] for c in range(unknowns.layout.m)]
+            thetas = [named[self.criterion.key("Theta", c)] for c in range(unknowns.layout.m)]
             named["x0"] = variables["x0"] + self.criterion.levels_before(variables.get("a"), thetas)
         view = View(named, kind="tangent", channels=unknowns.layout.inputs, gauge=gauge, reference=values, units=units,
                     bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))))
@@ -229,18 +225,12 @@ class _Fit(TangentFit):
         return transfer_model(self.criterion, values)
 
 
-def channel_key(criterion: TransferErrors, name: str, c: int) -> str:
-    """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
-    inputs = criterion.data.inputs
-    return name if len(inputs) == 1 else f"{name}[{inputs[c]}]"
-
-
 def transfer_model(criterion: TransferErrors, values: Values) -> HammersteinTF:
     """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter."""
     layout, part = criterion.unknowns.layout, {name: np.asarray(value, dtype=float) for name, value in values.items()}
-    mus = [part.get(channel_key(criterion, "mu", c), np.ones(1)) for c in range(layout.m)]
+    mus = [part.get(criterion.key("mu", c), np.ones(1)) for c in range(layout.m)]
     plant = HammersteinARX(
-        a=part.get("a", np.zeros(0)), b=tuple(part[channel_key(criterion, "b", c)] for c in range(layout.m)),
+        a=part.get("a", np.zeros(0)), b=tuple(part[criterion.key("b", c)] for c in range(layout.m)),
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
         offset=part.get("offset", np.zeros(1)), gauge=criterion.gauge, **model_meta(criterion.data))
     d = part.get("d", np.zeros(0)) if criterion.unknowns.apart else plant.a

@@ -26,7 +26,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.gauges import scale_fixed
-from formulations.prediction_error import Bases, Orders, channel_key, transfer_errors, transfer_model
+from formulations.prediction_error import Bases, Orders, transfer_errors, transfer_model
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.prediction_error.plant_starts import arx_start, iterated
@@ -74,11 +74,7 @@ class _Shooting:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
         several = criterion.unknowns.experiments > 1
         self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
-        self.variables: dict[str, cp.Variable] = {}
-
-    def key(self, name: str, c: int) -> str:
-        """Name of a quantity of an input."""
-        return channel_key(self.criterion, name, c)
+        self.key, self.variables = criterion.key, dict[str, cp.Variable]()
 
     def program(self, constraints: Sequence[Any]) -> Program:
         """Return the programme under the user's constraints."""

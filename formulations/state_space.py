@@ -184,14 +184,6 @@ class _Fit(TangentFit):
     criterion: StateErrors
     units: Transform
 
-    def key(self, name: str, number: int) -> str:
-        """Name a quantity of an input, or of a family of feedback functions."""
-        x = self.criterion.unknowns.expansion
-        if name in ("nu", "e"):
-            word = {"nu": "mu feedback", "e": "b feedback"}[name]
-            return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
-        return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
-
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0."""
         variables, values = self.places.variables(), self.places.values(z0)
@@ -231,7 +223,7 @@ class _Fit(TangentFit):
         static = not expansion.feedback and np.linalg.cond(left) <= 1e12
         to_state = np.linalg.inv(left) if static else left
         for c in range(expansion.m):
-            mu, b = self.key("mu", c), self.key("b", c)
+            mu, b = self.criterion.key("mu", c), self.criterion.key("b", c)
             vectors: dict[str, tuple[Any, Any]] = {"Theta": (variables[b], values[b])}
             if static:
                 seen, rest = values["C"] @ to_state, to_state @ values[b][:n]
@@ -241,7 +233,7 @@ class _Fit(TangentFit):
                 direct = values[b].size > n
                 vectors["static"] = (gain + variables[b][n:], at + values[b][n:]) if direct else (gain, at)
             for word, (vector, at) in vectors.items():
-                found[self.key(word, c)] = (
+                found[self.criterion.key(word, c)] = (
                     tangent_product(variables[mu], vector, values[mu], at) if mu in variables
                     else cp.reshape(vector, (1, at.size), order="F"))
         return found

@@ -56,6 +56,10 @@ class Criterion(ABC):
         """What they are called: "simulation errors" or "prediction errors"."""
 
     @abstractmethod
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of a channel, such as "mu" of input 0."""
+
+    @abstractmethod
     def linearise(self, x: Array) -> Linearised:
         """Return the errors near x."""
 

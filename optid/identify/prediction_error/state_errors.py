@@ -53,6 +53,14 @@ class StateErrors(Criterion):
         """What they are called."""
         return "prediction errors" if self.unknowns.innovations else "simulation errors"
 
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of an input, or of a family of feedback functions."""
+        x = self.unknowns.expansion
+        if name in ("nu", "e"):
+            word = {"nu": "mu feedback", "e": "b feedback"}[name]
+            return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
+        return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
+
     @cached_property
     def energy(self) -> float:
         """Weighted sum of squares of the outputs about their means."""

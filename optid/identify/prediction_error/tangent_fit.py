@@ -79,10 +79,6 @@ class TangentFit(ABC):
     constraints: tuple[Any, ...]
 
     @abstractmethod
-    def key(self, name: str, number: int) -> str:
-        """Return the variable of a part of the unknowns, such as "mu" of input 0."""
-
-    @abstractmethod
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0, with the user's constraints; ``at`` are the errors near z0."""
 
@@ -93,7 +89,7 @@ class TangentFit(ABC):
     @cached_property
     def places(self) -> Places:
         """The named variables in the order of the unknowns."""
-        return Places.of(self.criterion.unknowns, self.key)
+        return Places.of(self.criterion.unknowns, self.criterion.key)
 
     @property
     def floor(self) -> float:

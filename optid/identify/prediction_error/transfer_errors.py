@@ -57,6 +57,10 @@ class TransferErrors(Criterion):
         """What one unit of the sum of squares is in units of the record."""
         return energy_unit(self.units)
 
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
+        return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
+
     @cached_property
     def functions(self) -> tuple[Array, ...] | None:
         """Values of the basis functions, where they are few enough to be kept."""
