@@ -163,7 +163,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, bool(offset),
                                 whole_number("nc", nc), nd)
     if unknowns.apart:
-        enough_rows(outputs_present(record), "output samples", unknowns.size, "lags")
+        enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
     return TransferErrors(record, unknowns, gauge or "none", units)
 
 
