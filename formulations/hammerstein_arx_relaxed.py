@@ -109,7 +109,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str, weig
     objective = cp.Minimize(squares if weight is None else squares + 2 / problem.unit * tau * norms)
     constraints = {"residual": (r == residual,)}
 
-    form: dict[str, Any] = {"least_squares": LeastSquaresStructure(problem.problem, (*linear, *theta), ())}
+    form: dict[str, Any] = {"structure": LeastSquaresStructure(problem.problem, (*linear, *theta))}
     if weight is not None:
         form = {"parameters": {"weight": tau},
                 "certify": partial(certify_nuclear, problem.problem, heights / problem.unit)}

@@ -19,29 +19,25 @@ difficult starts. IPOPT uses the sparsity, and takes records up to the limit in 
 without it here and are for some hundred samples. Longer records are refused; ``hammerstein_oe.exact`` takes them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from formulations.output_error import OutputError
-from formulations.output_error_records import check_excited, check_inputs_differ, check_rows, plant_record
-from formulations.output_error_starts import RADIUS, blank, equation_error, iterated, with_poles
-from optid.bases.basis import Basis
+from formulations.prediction_error import Bases, Orders, transfer_errors, transfer_model
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.arguments import one_output
-from optid.identify.equation_error.compression import model_meta
-from optid.identify.gauges import check_gauge, scale_fixed
-from optid.models import HammersteinTF, Nonlinearity
+from optid.identify.gauges import scale_fixed
+from optid.identify.prediction_error.plant_starts import arx_start, iterated
+from optid.identify.prediction_error.transfer_errors import TransferErrors
+from optid.models import HammersteinTF
 from optid.models.gauges import leading_sign
-from optid.models.roots import contained
 from optid.program.program import Program, Values
 from optid.program.solution import Bound
-from optid.program.units import energy_unit, outer_bases
+from optid.program.units import outer_bases
 from optid.program.view import View
-from optid.statistics.sensitivities import Unknowns, simulate
+from optid.statistics.sensitivities import simulate
 
 Array = np.ndarray
 
@@ -54,56 +50,31 @@ LIMIT = 20_000
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 
-def exact(data: Data, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str] = "polynomial:3",
-          nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True
-          ) -> Program:
+def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
+          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Program:
     """Pose the least squares of the simulation errors with the simulated outputs as variables.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
 
-    Args:
-        data: the record; one output. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
-        na: number of poles.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all; a cubic polynomial by default.
-        nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders such as ``shape.monotone("increasing")`` or ``lambda v: {...}``; any smooth constraint in
-            the named variables.
-        gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
-        offset: estimate the constant of the equation; False holds it at zero, for centred data.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, several outputs, or a record that is too long.
-        DataError: no stretch of some length in which every input is present.
-        RankError: too few samples for the unknowns, or a basis function that no sample excites.
+    Arguments as in `formulations.prediction_error.hammerstein_bj`, as are the errors raised; constraints may be any
+    smooth ones in the named variables. A record that is too long is refused (`StructureError`).
     """
-    check_gauge(gauge)
-    record, layout, units = plant_record(one_output(data, "simulation errors"), na, nb, nk, basis, offset)
-    if record.n_samples > LIMIT:
+    criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset, "simulation errors")
+    if criterion.data.n_samples > LIMIT:
         raise StructureError(
-            f"{record.n_samples} samples: with the outputs of every sample as variables this formulation takes up to "
-            f"{LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
-    check_excited(record, layout)
-    check_inputs_differ(record, layout)
-    unknowns = Unknowns(layout, record.n_experiments, (True,) * layout.m, bool(offset))
-    check_rows(record, unknowns)
-    return _Shooting(OutputError(record, unknowns, gauge, units)).program(constraints)
+            f"{criterion.data.n_samples} samples: with the outputs of every sample as variables this formulation takes "
+            f"up to {LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
+    return _Shooting(criterion).program(constraints)
 
 
 class _Shooting:
     """Writes the programme of one record."""
 
-    def __init__(self, criterion: OutputError) -> None:
+    def __init__(self, criterion: TransferErrors) -> None:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
         several = criterion.unknowns.experiments > 1
         self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
-        self.variables: dict[str, cp.Variable] = {}
-        self.tables = [[basis.values(e.u[:, c]) for c, basis in enumerate(self.layout.bases)]
-                       for e in self.data.experiments]
-
-    def key(self, name: str, c: int) -> str:
-        """Name of a quantity of an input."""
-        return name if self.layout.m == 1 else f"{name}[{self.layout.inputs[c]}]"
+        self.key, self.variables = criterion.key, dict[str, cp.Variable]()
 
     def program(self, constraints: Sequence[Any]) -> Program:
         """Return the programme under the user's constraints."""
@@ -127,7 +98,7 @@ class _Shooting:
             structural["stability"] = self._stable()
         structural["gauge"] = tuple(scale_fixed(gauge, self.variables[self.key("b", c)], self.variables.get("a"))
                                     for c in range(layout.m))
-        start = self._start()
+        start = self._start(derived)
         reference = {name: start[name] for name in ("a", "offset") if name in start}
         units = self.criterion.units
         view = View(expressions, channels=layout.inputs,
@@ -138,7 +109,7 @@ class _Shooting:
         program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
                           variables=self.variables, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived=derived, scale=self.criterion.energy,
-                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=energy_unit(units))
+                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=self.criterion.unit)
         return program.subject_to(*constraints)
 
     def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -154,7 +125,7 @@ class _Shooting:
         for c, lags in enumerate(layout.lags):
             name = f"{self.key('w', c)}{label}"
             w = variables[name] = cp.Variable(count, name=name)
-            derived[name] = self.tables[i][c] @ variables[self.key("mu", c)]
+            derived[name] = layout.bases[c].values(e.u[:, c]) @ variables[self.key("mu", c)]
             constraints[f"nonlinearity of {name}"] = (w == derived[name],)
             for j, lag in enumerate(lags):
                 right = right + variables[self.key("b", c)][j] * w[n - lag : count - lag]
@@ -185,40 +156,28 @@ class _Shooting:
             below = level
         return tuple(constraints)
 
-    def _start(self) -> dict[str, Array]:
+    def _start(self, derived: Mapping[str, Any]) -> dict[str, Array]:
         """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
         criterion, unknowns = self.criterion, self.criterion.unknowns
-        first = equation_error(self.data, unknowns)
-        first = criterion.normalised(blank(unknowns) if first is None else first)
-        found = [with_poles(criterion, first, contained(first[unknowns.slices["a"]], RADIUS), "ARX")]
-        others = [iterated(criterion, found[0].x, method) for method in ("sm", "iv")]
-        best = min([*found, *(one for one in others if one is not None)], key=lambda one: one.value)
+        found = arx_start(criterion)
+        others = [iterated(criterion, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
+        best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
         point = unknowns.unpack(criterion.normalised(best.x))
         start = {"a": point.a, "offset": np.array([point.offset])}
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
             sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
             start |= {self.key("mu", c): sign * mu, self.key("b", c): sign * b}
-        outputs = simulate(self.data, unknowns, point)
-        for e, label, x, tables in zip(self.data.experiments, self.labels, outputs, self.tables):
-            start[f"x{label}"] = x
-            there = np.isfinite(e.y[:, 0])
-            start[f"residual{label}"] = x[there] - e.y[there, 0]
-            for c, table in enumerate(tables):
-                start[f"{self.key('w', c)}{label}"] = table @ start[self.key("mu", c)]
+        start |= {f"x{label}": x for label, x in zip(self.labels, simulate(self.data, unknowns, point))}
         level = point.a
         start["kappa"] = np.zeros(self.layout.na)
         for m in range(self.layout.na, 0, -1):  # the recursion backwards
             start[f"a of order {m}"], start["kappa"][m - 1] = level, level[-1]
             level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
-        return {name: start[name] for name in self.variables}
+        start = {name: value for name, value in start.items() if name in self.variables}
+        for name, value in start.items():
+            self.variables[name].value = value
+        return {**start, **{name: np.asarray(expression.value) for name, expression in derived.items()}}
 
     def recover(self, values: Values) -> HammersteinTF:
         """Build the model."""
-        pairs = [(np.asarray(values[self.key("mu", c)]), np.asarray(values[self.key("b", c)]))
-                 for c in range(self.layout.m)]
-        model = HammersteinTF(
-            a=np.asarray(values.get("a", np.zeros(0)), dtype=float), b=tuple(b for _, b in pairs),
-            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(self.layout.bases, pairs)),
-            nk=self.layout.nk, offset=np.asarray(values.get("offset", np.zeros(1)), dtype=float), d=(),
-            gauge=self.criterion.gauge, **model_meta(self.data))
-        return model.with_transform(self.criterion.units)
+        return transfer_model(self.criterion, values)

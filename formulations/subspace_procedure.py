@@ -10,10 +10,10 @@ import numpy as np
 from formulations.constraints.stability import stable
 from formulations.realisation import Factors, Realisation, least_squares_values, realisation_programme
 from formulations.shift import constrained_shift
-from formulations.simulation_bound import simulation_bound
-from formulations.state_models import state_model
 from formulations.subspace_plan import BEST, Plan
+from optid.certificate.simulation_bound import simulation_bound
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.prediction_error.state_errors import state_model
 from optid.identify.subspace.imputation import count_windows, impute
 from optid.identify.subspace.innovations import model_innovations
 from optid.identify.subspace.methods import (
@@ -146,8 +146,9 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     if remark:
         figures["noise model"] = remark
     status, reason = (Status.INACCURATE, doubt) if doubt else (_status(solution), solution.reason)
-    bound = simulation_bound(plan.records, step, solution.objective / program.unit, len(gamma) // data.l,
-                             _said(solution))
+    form = step.form
+    bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / program.unit,
+                             len(gamma) // data.l, _said(solution), not np.any(form.gain) and not step.instrumented)
     bound = replace(bound, value=program.unit * bound.value)
     return Evidence(model, solution.objective, bound, status, reason, figures)
 

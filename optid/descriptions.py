@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
+_SHARED = re.compile(r"[Aa]rguments as in `(?:([\w.]+)\.)?(\w+)`")
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
@@ -47,7 +48,10 @@ class Description:
         return {key: p for key, p in self.signature.parameters.items() if p.kind is p.KEYWORD_ONLY}
 
     def arguments(self) -> dict[str, str]:
-        """Return {argument: its first sentence}; "as in `other`" is looked up in the module."""
+        """Return {argument: its first sentence}.
+
+        "As in `other`" is looked up in the module, "Arguments as in `other`", of all of them, also in another one.
+        """
         return _arguments(self.text, self.siblings)
 
 
@@ -82,8 +86,12 @@ def _in_source(module: str, name: str) -> Description | None:
                   *((a, kind.KEYWORD_ONLY, default) for a, default in zip(given.kwonlyargs, given.kw_defaults)),
                   (given.kwarg, kind.VAR_KEYWORD, None)]
     signature = inspect.Signature([_parameter(a, *rest) for a, *rest in parameters if a is not None])
-    siblings = {other: ast.get_docstring(found) or "" for other, found in functions.items()}
+    siblings = _docstrings(module)
     return Description(signature, siblings[name], siblings)
+
+
+def _docstrings(module: str) -> dict[str, str]:
+    return {name: ast.get_docstring(found) or "" for name, found in _functions(module).items()}
 
 
 @cache
@@ -109,7 +117,10 @@ def _parameter(argument: ast.arg, kind: Any, default: ast.expr | None) -> inspec
 
 
 def _arguments(text: str, siblings: Mapping[str, str]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    shared, found = _SHARED.search(text), {}
+    if shared:
+        others = _docstrings(shared[1]) if shared[1] else siblings
+        found = _arguments(others.get(shared[2], ""), others)
     lines = text.splitlines()
     if "Args:" not in lines:
         return found

@@ -10,14 +10,14 @@ from scipy.signal import lfilter
 
 import optid
 from formulations.constraints import shape, stability
-from formulations.hammerstein_armax import exact as armax
-from formulations.hammerstein_armax import linear as linear_armax
-from formulations.hammerstein_bj import exact as bj
-from formulations.hammerstein_bj import linear as linear_bj
-from formulations.noise_models import arma
+from formulations.prediction_error import armax as linear_armax
+from formulations.prediction_error import bj as linear_bj
+from formulations.prediction_error import hammerstein_armax as armax
+from formulations.prediction_error import hammerstein_bj as bj
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
+from optid.identify.prediction_error.noise_starts import arma
 from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 
@@ -385,3 +385,14 @@ def test_gas_furnace_of_box_and_jenkins(real_data):
         value, error = estimates[name]
         assert abs(value - published) < error
     assert fit.solution.objective / 296 == pytest.approx(0.0561, abs=0.0005)
+
+
+@pytest.mark.parametrize("kind", ORDERS)
+def test_long_records_are_searched_in_part_unless_that_part_is_missing(kind):
+    data = record(system(kind), (12_000,))
+    pose, orders = ORDERS[kind]
+    y = data.y.copy()
+    y[3_000:9_000] = np.nan
+    for one, error in ((data, 0.05), (Data(data.u, y), 0.1)):
+        fit = quiet(one, pose, **orders)
+        assert fit.model.a == pytest.approx(A, abs=error) and fit.model.c == pytest.approx(C, abs=error)

@@ -1,5 +1,7 @@
 """Prediction errors with a noise filter: against the model's own predictor, finite differences and output error."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -8,9 +10,8 @@ from systems import inputs, nonlinearity
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.models import HammersteinTF
-from optid.statistics import sensitivities
-from optid.statistics.noise_sensitivities import NoisePoint, NoiseUnknowns, blocks, linearise, predict
-from optid.statistics.sensitivities import PlantPoint, Unknowns
+from optid.statistics.sensitivities import blocks, linearise, predict, simulate
+from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
@@ -40,12 +41,12 @@ def point_of(model, data, apart, seed=3):
     """A point off the truth, with its unknowns."""
     rng = np.random.default_rng(seed)
     layout = model.layout
-    unknowns = Unknowns(layout, data.n_experiments, tuple(not isinstance(b, Linear) for b in layout.bases))
-    noise = NoiseUnknowns(unknowns, len(model.c), len(model.noise_denominator) if apart else None)
+    free = tuple(not isinstance(b, Linear) for b in layout.bases)
+    denominator = len(model.noise_denominator) if apart else None
+    noise = TransferUnknowns(layout, data.n_experiments, free, True, len(model.c), denominator)
     x0 = rng.normal(size=(data.n_experiments, layout.first_row))
     mus = tuple(f.mu for f in model.nonlinearities)
-    point = NoisePoint(PlantPoint(model.a, mus, model.b, float(model.offset[0]), x0), model.c,
-                      model.noise_denominator)
+    point = TransferPoint(model.a, mus, model.b, float(model.offset[0]), x0, model.c, model.noise_denominator)
     return noise, noise.pack(point) + 0.02 * rng.standard_normal(noise.size)
 
 
@@ -56,8 +57,8 @@ CASES = {"armax": (plant(c=C), False), "arx": (plant(), False), "long": (plant(c
 
 def errors(data, unknowns, x):
     found = []
-    for i, e in enumerate(data.experiments):
-        one = predict(e.u, e.y[:, 0], unknowns, unknowns.unpack(x), i)
+    for i, y in enumerate(simulate(data, unknowns, unknowns.unpack(x))):
+        one = predict(data, unknowns, unknowns.unpack(x), i, y)
         found.append(np.where(one.state == 0, -one.innovations, 0.0))
     return np.concatenate(found)
 
@@ -73,12 +74,14 @@ def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps):
     unknowns, x = point_of(model, data, apart)
     rows = []
     for i, e in enumerate(data.experiments):
-        found = predict(e.u, e.y[:, 0], unknowns, unknowns.unpack(x), i)
-        part = np.vstack([block for block, _ in blocks(e.u, found, unknowns, unknowns.unpack(x), chunk=17)])
+        found = predict(data, unknowns, unknowns.unpack(x), i, simulate(data, unknowns, unknowns.unpack(x))[i])
+        parts = [block for block, _ in blocks(data, unknowns, unknowns.unpack(x), i, chunk=17)]
+        width = unknowns.memory + unknowns.shared + 1  # a forgotten initial state has no columns
+        part = np.vstack([np.pad(block, ((0, 0), (width - block.shape[1], 0))) for block in parts])
         states = np.zeros((len(part), data.n_experiments * unknowns.memory))
         states[:, i * unknowns.memory : (i + 1) * unknowns.memory] = part[:, : unknowns.memory]
         rows.append(np.hstack([part[:, unknowns.memory : -1], states, part[:, -1:]]))
-        assert found.rows == np.count_nonzero(found.state == 0) < len(e.u) + apart
+        assert np.count_nonzero(found.state == 0) < len(e.u) + apart
     whole = np.vstack(rows)
     assert whole[:, -1] == pytest.approx(errors(data, unknowns, x), abs=1e-13)
     for j in range(unknowns.size):
@@ -98,9 +101,9 @@ def test_derivatives_where_outputs_never_follow_one_another(name):
     unknowns, x = point_of(model, data, apart)
     rows = []
     for i, e in enumerate(data.experiments):
-        found = predict(e.u, e.y[:, 0], unknowns, unknowns.unpack(x), i)
-        assert found.rows == np.isfinite(e.y[10 * unknowns.skipped :]).sum() > 5
-        rows.append(np.vstack([b for b, _ in blocks(e.u, found, unknowns, unknowns.unpack(x), chunk=17)]))
+        found = predict(data, unknowns, unknowns.unpack(x), i, simulate(data, unknowns, unknowns.unpack(x))[i])
+        assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.skipped :]).sum() > 5
+        rows.append(np.vstack([b for b, _ in blocks(data, unknowns, unknowns.unpack(x), i, chunk=17)]))
     whole = np.vstack(rows)
     for j in range(unknowns.size):
         step = 1e-6 * np.eye(unknowns.size)[j]
@@ -130,12 +133,12 @@ def test_errors_are_those_of_the_models_predictor():
         data = records(model, gaps=gaps)
         unknowns, x = point_of(model, data, apart)
         point = unknowns.unpack(x)
-        truth = HammersteinTF(point.plant.a, point.plant.bs, tuple(
-            type(f)(f.basis, mu) for f, mu in zip(model.nonlinearities, point.plant.mus)), (0, 2),
-            point.plant.offset, inputs=data.inputs, c=point.c, d=point.d)
-        expected = truth.innovations(data, list(point.plant.x0) if apart else "fit")
-        for i, e in enumerate(data.experiments):
-            found = predict(e.u, e.y[:, 0], unknowns, point, i)
+        truth = HammersteinTF(point.a, point.bs, tuple(
+            type(f)(f.basis, mu) for f, mu in zip(model.nonlinearities, point.mus)), (0, 2),
+            point.offset, inputs=data.inputs, c=point.c, d=point.d)
+        expected = truth.innovations(data, list(point.x0) if apart else "fit")
+        for i, y in enumerate(simulate(data, unknowns, point)):
+            found = predict(data, unknowns, point, i, y)
             assert np.array_equal(found.state == 0, np.isfinite(expected[i][:, 0]))
             assert found.innovations == pytest.approx(np.nan_to_num(expected[i][:, 0]), abs=1e-11)
 
@@ -144,10 +147,14 @@ def test_without_a_noise_filter_it_is_the_output_error():
     model, _ = CASES["oe"]
     data = records(model, counts=(300, 200), gaps="y")
     unknowns, x = point_of(model, data, True)
-    ours = linearise(data, unknowns, unknowns.unpack(x), method="qr")
-    theirs = sensitivities.linearise(data, unknowns.plant, unknowns.unpack(x).plant, method="qr")
-    assert ours.value == pytest.approx(theirs.value, rel=1e-10)
-    assert np.abs(ours.root.T @ ours.root) == pytest.approx(np.abs(theirs.root.T @ theirs.root), rel=1e-8, abs=1e-8)
+    plain = linearise(data, unknowns, unknowns.unpack(x), method="qr")
+    filtered = replace(unknowns, nc=1, nd=2)  # C = D = 1 as a point of a model with a noise filter
+    point = replace(unknowns.unpack(x), c=np.zeros(1), d=np.zeros(2))
+    ours = linearise(data, filtered, point, method="qr").whole[0]
+    ours = np.delete(ours, np.arange(unknowns.shared, filtered.shared), axis=1)
+    assert linearise(data, filtered, point, method="qr").value == pytest.approx(plain.value, rel=1e-10)
+    theirs = plain.whole[0]
+    assert ours.T @ ours == pytest.approx(theirs.T @ theirs, rel=1e-8, abs=1e-8)
 
 
 def test_packing():
@@ -158,4 +165,4 @@ def test_packing():
     model, _ = CASES["armax"]
     unknowns, x = point_of(model, data, False)
     assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
-    assert np.array_equal(unknowns.unpack(x).d, unknowns.unpack(x).plant.a)
+    assert np.array_equal(unknowns.unpack(x).d, unknowns.unpack(x).a)

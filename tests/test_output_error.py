@@ -9,16 +9,18 @@ from scipy.optimize import least_squares
 from systems import by_hand, nonlinearity, siso
 
 import optid
-from formulations import hammerstein_oe
 from formulations.constraints import shape
-from formulations.output_error import OutputError
-from formulations.output_error_records import plant_layout
-from formulations.prediction_error import descend
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
+from optid.identify.prediction_error import search
+from optid.identify.prediction_error.descent import descend
+from optid.identify.prediction_error.plant_starts import plant_starts
+from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models import HammersteinARX, Nonlinearity, roots
+from optid.models.layout import Layout
 from optid.program.solution import Status
-from optid.statistics.sensitivities import PlantPoint, Unknowns, simulate
+from optid.statistics.sensitivities import simulate
+from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 BASIS = Triangular(4).fitted(-0.7, 1.3)
 
@@ -105,10 +107,10 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     a = np.real(np.poly(np.concatenate([poles, np.conj(poles[1:])])))[1:]
     true = siso(basis=BASIS, a=a, b=(rng.normal(size=3),), nk=seed % 2)
     data = record(true, count=250, noise=0.3, seed=seed)
-    layout = plant_layout(data, 3, 3, seed % 2, (BASIS,))
-    unknowns = Unknowns(layout, 1, (True,))
-    criterion = OutputError(data, unknowns, "norm")
-    start = criterion.normalised(unknowns.pack(PlantPoint(
+    layout = Layout(3, (3,), (seed % 2,), (BASIS,), data.outputs, data.inputs)
+    unknowns = TransferUnknowns(layout, 1, (True,))
+    criterion = TransferErrors(data, unknowns, "norm")
+    start = criterion.normalised(unknowns.pack(TransferPoint(
         roots.contained(a + 0.05 * rng.normal(size=3), 0.98), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
         (true.b[0] + 0.1 * rng.normal(size=3),), 0.0, np.zeros((1, unknowns.memory)))))
     ours = descend(criterion, start)
@@ -263,14 +265,14 @@ def test_an_optimum_beyond_stability_is_named_and_a_constraint_is_the_remedy():
 
 def test_every_point_of_a_descent_is_stable():
     data = record(siso(basis=BASIS, a=[-1.9, 0.95]), noise=2.0)
-    unknowns = Unknowns(plant_layout(data, 2, 2, 0, (BASIS,)), 1, (True,))
+    unknowns = TransferUnknowns(Layout(2, (2,), (0,), (BASIS,), ("y",), ("u",)), 1, (True,))
 
-    class Watched(hammerstein_oe.OutputError):
+    class Watched(TransferErrors):
         def linearise(self, x):
             assert roots.radius(x[self.unknowns.slices["a"]]) < 1
             return super().linearise(x)
 
-    hammerstein_oe.search(Watched(data, unknowns, "norm"), 8, 0)
+    search.search(Watched(data, unknowns, "norm"), lambda part: plant_starts(part, 8, 0))
 
 
 @pytest.mark.slow
@@ -325,7 +327,7 @@ def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
         data = record(siso(basis=BASIS), noise=noise, seed=seed)
         with monkeypatch.context() as all_of_them:
             fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
-            all_of_them.setattr(hammerstein_oe, "SUFFICIENT", None)
+            all_of_them.setattr(search, "SUFFICIENT", None)
             whole = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
         assert len(whole.figures["simulation errors of the starts"]) == 6
         staged.append(len(fit.figures["simulation errors of the starts"]))
@@ -425,10 +427,10 @@ def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
     assert fit.solution.status is Status.LOCAL and np.max(np.abs(fit.model.poles)) <= 0.95
     # no model with its poles inside the same circle, nearby, has smaller errors by more than the boundary's curvature
     plant = fit.model
-    unknowns = Unknowns(plant_layout(record, 3, 2, 0, (plant.f.basis,)), 1, (True,))
-    criterion = OutputError(record, unknowns, "norm")
+    unknowns = TransferUnknowns(Layout(3, (2,), (0,), (plant.f.basis,), record.outputs, record.inputs), 1, (True,))
+    criterion = TransferErrors(record, unknowns, "norm")
     at_rest = np.zeros((1, unknowns.memory))
-    x = unknowns.pack(PlantPoint(plant.a, (plant.f.mu,), plant.b, float(plant.offset[0]), at_rest))
+    x = unknowns.pack(TransferPoint(plant.a, (plant.f.mu,), plant.b, float(plant.offset[0]), at_rest))
     rng = np.random.default_rng(0)
     for _ in range(20):
         roots = fit.model.poles[np.argsort(np.imag(fit.model.poles))]

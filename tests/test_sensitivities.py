@@ -7,7 +7,8 @@ import optid
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.models import HammersteinARX, Nonlinearity
 from optid.models.layout import Layout
-from optid.statistics.sensitivities import PlantPoint, Unknowns, expanded, instruments, linearise, simulate
+from optid.statistics.sensitivities import expanded, instruments, linearise, simulate
+from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 
 def case(seed=0, constant=True):
@@ -20,9 +21,9 @@ def case(seed=0, constant=True):
     data = optid.Data([rng.uniform(-1, 1, (n, 2)) for n in lengths], ys)
     bases = (Triangular(4, (-1, 1)), Linear().fitted(-1, 1))
     layout = Layout(3, (2, 3), (0, 2), bases, ("y",), ("u1", "u2"))
-    unknowns = Unknowns(layout, 2, (True, False), constant)
+    unknowns = TransferUnknowns(layout, 2, (True, False), constant)
     poles = [0.8, 0.5 + 0.3j, 0.5 - 0.3j]
-    point = PlantPoint(np.real(np.poly(poles))[1:], (rng.normal(size=4), np.ones(1)),
+    point = TransferPoint(np.real(np.poly(poles))[1:], (rng.normal(size=4), np.ones(1)),
                        (rng.normal(size=2), rng.normal(size=3)), 0.3 if constant else 0.0,
                        rng.normal(size=(2, unknowns.memory)))
     return data, unknowns, point
@@ -112,9 +113,9 @@ def test_ill_conditioned_sensitivities_are_factorised_by_qr():
     rng = np.random.default_rng(1)
     data = optid.Data(rng.normal(size=400), rng.normal(size=400))
     layout = Layout(4, (4,), (0,), (Linear().fitted(-3, 3),), ("y",), ("u",))
-    unknowns = Unknowns(layout, 1, (False,))
+    unknowns = TransferUnknowns(layout, 1, (False,))
     nearly = np.poly([0.99, 0.985, 0.98, 0.975])[1:]
-    point = PlantPoint(nearly, (np.ones(1),), (np.array([1.0, 0.5, 0.2, 0.1]),), 0.0, np.zeros((1, 4)))
+    point = TransferPoint(nearly, (np.ones(1),), (np.array([1.0, 0.5, 0.2, 0.1]),), 0.0, np.zeros((1, 4)))
     found = linearise(data, unknowns, point)
     assert found.method == "qr" and found.condition > 1e6
     assert found.value == pytest.approx(np.sum(errors(data, unknowns, unknowns.pack(point)) ** 2), rel=1e-10)
@@ -145,8 +146,8 @@ def test_every_basis(basis):
     rng = np.random.default_rng(2)
     data = optid.Data(rng.uniform(-1, 1, 80), rng.normal(size=80))
     basis = basis.fitted(-1, 1)
-    unknowns = Unknowns(Layout(1, (2,), (1,), (basis,), ("y",), ("u",)), 1, (True,))
-    point = PlantPoint(np.array([-0.6]), (rng.normal(size=basis.size),), (np.array([0.8, 0.6]),), 0.1,
+    unknowns = TransferUnknowns(Layout(1, (2,), (1,), (basis,), ("y",), ("u",)), 1, (True,))
+    point = TransferPoint(np.array([-0.6]), (rng.normal(size=basis.size),), (np.array([0.8, 0.6]),), 0.1,
                        rng.normal(size=(1, unknowns.memory)))
     x = unknowns.pack(point)
     slopes = jacobian(data, unknowns, x)
@@ -168,8 +169,8 @@ def test_kept_basis_functions_change_nothing():
 def test_gauge_changes_the_factor_of_one_experiment_in_its_own_direction_alone(method):
     data, unknowns, point = case()
     data = data.select(experiments=[0])
-    unknowns = Unknowns(unknowns.layout, 1, unknowns.free)
-    point = PlantPoint(point.a, point.mus, point.bs, point.offset, point.x0[:1])
+    unknowns = TransferUnknowns(unknowns.layout, 1, unknowns.free)
+    point = TransferPoint(point.a, point.mus, point.bs, point.offset, point.x0[:1])
     row = scale_row(unknowns, point)
     free = linearise(data, unknowns, point, method=method)
     fixed = linearise(data, unknowns, point, gauge=row, method=method)

@@ -13,11 +13,13 @@ import optid
 from formulations.constraints import shape
 from formulations.constraints.rule import Rule
 from formulations.constraints.stability import stable
-from formulations.state_error import StateError, entered
-from formulations.state_space_exact import exact, linear
+from formulations.state_space import hammerstein_ss as exact
+from formulations.state_space import ss as linear
 from optid.bases import Linear, Polynomial, Triangular, UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_search import entered
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
 from optid.statistics.expansion import expand
@@ -37,7 +39,7 @@ def problem(innovations, missing, fed, experiments=2, n=3, seed=0, basis=None):
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     expansion = expand(records, bases, feedback, data.inputs, data.outputs)
     unknowns = StateUnknowns(n, expansion, experiments, (True, False), innovations)
-    criterion = StateError(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
+    criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
     return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
 
 
@@ -120,7 +122,7 @@ def test_scipy_finds_no_better_point(criterion):
     _, data = system(seed=3, kind="innovation" if criterion == "prediction" else "output", samples=300, noise=0.2)
     fit = optid.fit(data, linear, nx=2, criterion=criterion, weighting="scale")
     unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion == "prediction")
-    error = StateError(data, unknowns, np.diag(1 / data.y.var(axis=0)))
+    error = StateErrors(data, unknowns, np.diag(1 / data.y.var(axis=0)))
     x = entered(error, fit.model)
     assert error.linearise(x).value == pytest.approx(fit.solution.objective, rel=1e-8)
     root = np.linalg.cholesky(error.weight).T

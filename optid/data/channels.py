@@ -164,3 +164,10 @@ def sampling_time(dt: Any) -> float:
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
         raise DataError(f"dt = {dt!r}: the sampling time is a positive number.")
     return float(dt)
+
+
+def model_meta(data: Any) -> dict[str, Any]:
+    """Return the names, units and sampling time of a record or stream that a model carries."""
+    return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
+            "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
+            "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}

@@ -97,7 +97,7 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     pull = basis.T @ (problem.root @ lifted - problem.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
 
-    n, l = statistics.layout.n_columns, len(statistics.layout.outputs)  # noqa: E741
+    n, l = compressed.regression(found).shape  # noqa: E741
     root = statistics.root
     sensitivity = np.einsum("ij,jok->oik", root[:n, :n], (coefficients @ directions).reshape(n, l, -1))
     parameters = float(np.sum(sensitivity**2))

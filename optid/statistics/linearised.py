@@ -4,7 +4,7 @@ A block of rows [x0 | shared | errors] leaves a Gram matrix, or a triangular fac
 digits. The initial states of an experiment are eliminated within it. Whose errors they are does not matter here.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -55,6 +55,12 @@ class Linearised:
         moves = [-np.linalg.lstsq(x, s @ step + e, rcond=1e-12)[0] for x, s, e in self.states]
         return np.asarray(np.concatenate([*moves, np.zeros(0)]), dtype=float)
 
+    def after(self, step: Array) -> float:
+        """Return the sum of squares of the linear errors after a step of all unknowns."""
+        matrix, errors = self.whole
+        rest = matrix @ step + errors
+        return float(rest @ rest) + self.remainder
+
     @cached_property
     def whole(self) -> tuple[Array, Array]:
         """Factor (p + E n, p + E n) and errors of all unknowns together, initial states last."""
@@ -68,63 +74,62 @@ class Linearised:
         return matrix, errors
 
 
-@dataclass(frozen=True, eq=False)
-class Compressed:
-    """One experiment: a factor of [x0 | shared | (measured) | errors], and the number of errors in it."""
+def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
+               gauge: Array | None = None, method: Literal["auto", "gram", "qr"] = "auto") -> Linearised:
+    """Compress the errors of all experiments with their sensitivities.
 
-    factor: Array
-    rows: int
+    Args:
+        blocks: number of an experiment -> rows [x0 | shared | errors], and the number of errors in each block; asked
+            for again where a QR decomposition is needed.
+        experiments: their number.
+        n: size of an initial state.
+        p: number of shared unknowns.
+        gauge: (rows, p) directions without effect, which are given weight; None for none.
+        method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
+    """
+    use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
+    factors, rows = zip(*(compressed(blocks(i), n + p + 1, use, gauge, n) for i in range(experiments)))
+    states, rest = zip(*(eliminated(factor, n) for factor in factors))
+    triangle = rest[0] if experiments == 1 else np.linalg.qr(np.vstack(rest), mode="r")
+    full = np.zeros((p + 1, p + 1))
+    full[: len(triangle)] = triangle
+    condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
+    if method == "auto" and not condition < CONDITION_LIMIT:
+        return linearised(blocks, experiments, n, p, gauge, "qr")
+    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), sum(rows), condition, use)
 
 
 def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
-               first: int = 0) -> Compressed:
+               first: int = 0) -> tuple[Array, int]:
     """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
 
     Args:
         blocks: (rows, columns) and the number of errors in each.
         columns: number of columns.
         method: "gram" or "qr".
-        gauge: (rows, p) directions without effect, which are given weight; None for none.
-        first: column of their first unknown.
+        gauge: as in `linearised`; it takes part before the factorisation, which so is regular.
+        first: column of the first shared unknown.
+
+    Returns:
+        A factor of [x0 | shared | (measured) | errors], and the number of errors.
     """
     total, rows = np.zeros((columns, columns)), 0
     for block, count in blocks:
         rows += count
         used = slice(columns - block.shape[1], None)
         if method == "qr":
-            total[used, used] = add_to_root(total[used, used], block) if used.start else add_to_root(total, block)
+            total[used, used] = add_to_root(total[used, used], block)
         else:
             total[used, used] += block.T @ block
     if gauge is not None and len(gauge):
         span = slice(first, first + gauge.shape[1])
         energy = np.sum(total[:, span] ** 2, axis=0) if method == "qr" else np.diag(total)[span]
+        sizes = np.abs(gauge)  # directions without effect get a weight of the size of the others
+        lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
         extra = np.zeros((len(gauge), columns))
-        extra[:, first:] = _weighted(gauge, energy)[0]
+        extra[:, span] = gauge * np.where(lengths > 0, lengths, 1.0)[:, None]
         total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
-    return Compressed(total if method == "qr" else _factor(total), rows)
-
-
-def assembled(parts: Sequence[Compressed], n: int, p: int, gauge: Array | None, method: Literal["gram", "qr"]
-              ) -> Linearised:
-    """Put the experiments together.
-
-    Args:
-        parts: one for each experiment.
-        n: size of an initial state.
-        p: number of shared unknowns.
-        gauge: as in `linearise`.
-        method: how the parts were compressed.
-    """
-    states, rest = zip(*(eliminated(part.factor, n) for part in parts))
-    rows_of_gauge = _weighted(gauge, np.sum([np.sum(part[:, :p] ** 2, axis=0) for part in rest], axis=0))
-    together = len(rest) > 1 or len(rows_of_gauge)
-    stacked = np.vstack([*rest, *rows_of_gauge])
-    triangle = np.linalg.qr(stacked, mode="r") if together else stacked
-    full = np.zeros((p + 1, p + 1))
-    full[: len(triangle)] = triangle
-    condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
-    rows = sum(part.rows for part in parts)
-    return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), rows, condition, method)
+    return total if method == "qr" else _factor(total), rows
 
 
 def eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
@@ -143,12 +148,3 @@ def _factor(gram: Array) -> Array:
         values, vectors = np.linalg.eigh(scaled)
         root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"), dtype=float)
         return root * size
-
-
-def _weighted(gauge: Array | None, energy: Array) -> list[Array]:
-    """Rows [gauge | 0] that give the directions without effect a weight of the size of the others, of given energy."""
-    if gauge is None or not len(gauge):
-        return []
-    sizes = np.abs(gauge)
-    lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
-    return [np.hstack([gauge * np.where(lengths > 0, lengths, 1.0)[:, None], np.zeros((len(gauge), 1))])]

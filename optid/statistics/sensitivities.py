@@ -1,24 +1,34 @@
-"""Simulation errors of a Hammerstein model and their sensitivities, compressed chunk by chunk.
+"""Prediction errors of transfer-function models and their sensitivities, compressed chunk by chunk.
 
-The model ``A(q) y = sum_c B_c(q) f_c(u_c) + d``, with an initial state that enters the first n equations, has
+``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + d`` and an initial state in the first n equations. D is A (ARX,
+ARMAX) or a polynomial of its own (Box-Jenkins); C = D = 1 is output error, whose e are the simulation errors. With
+w = D/A (one where D is A) the predicted output has the partial derivatives
 
-    dy/da_i = -q^-i y / A,   dy/dmu_c = B_c eta_c / A,   dy/db_cj = q^-(nk_c + j) f_c / A,   dy/dd = 1 / A,
+    a_i: -q^-i w x (where D is A: -q^-i y),  mu_c: B_c w eta_c,  b_cj: q^-(nk_c + j) w f_c,  d: w 1,  c_i: q^-i e,
+    d_i: -q^-i (y - x),
 
-so that one all-pole filter of the basis functions (na columns never, P per input) gives all of them by shifts and
-weighted sums. What leaves a chunk is a Gram matrix of [sensitivities | errors] (`optid.statistics.linearised`); the
-filters keep their states from one chunk to the next.
+and all of them pass through 1/C (Ljung 1999, section 10.3): one filter of the basis functions (P per input) gives all
+of them by shifts and weighted sums. Filters keep their states from one chunk to the next; what leaves a chunk is a
+factor of [sensitivities | errors] (`optid.statistics.linearised`).
+
+Where an output is missing its innovation counts as zero and its prediction takes its place, so that there the recursion
+runs through 1/D instead: the sensitivities stay those of the criterion. Where a missing input leaves no prediction the
+innovation is zero as well, and starts anew. Where D is A the first innovations, whose lags reach before the record, are
+zero; otherwise the initial state of the plant is unknown, and the noise starts from rest.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.models import noise_filter
 from optid.models.layout import Layout
-from optid.statistics.linearised import CONDITION_LIMIT, Compressed, Linearised, assembled, compressed, eliminated
+from optid.models.noise_filter import DEAD, PRESENT, Filtered
+from optid.statistics.linearised import Linearised, compressed, eliminated, linearised
+from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -31,84 +41,6 @@ TABLE = 1 << 18
 
 FORGOTTEN = 1e-13
 """Share of its peak below which the response to the initial state no longer informs about it."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlantPoint:
-    """Values of the unknowns of a simulation.
-
-    Attributes:
-        a: (na,) coefficients of A.
-        mus: (P_c,) coefficients of f_c, one array per input.
-        bs: (nb_c,) coefficients of B_c, one array per input.
-        offset: constant of the equation.
-        x0: (E, n) what the past of every experiment adds to its first n equations.
-    """
-
-    a: Array
-    mus: tuple[Array, ...]
-    bs: tuple[Array, ...]
-    offset: float
-    x0: Array
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """The unknowns of a simulation as one vector x = [a; mu_1; b_1; mu_2; ...; offset; x0 of every experiment].
-
-    Attributes:
-        layout: orders and bases; one output.
-        experiments: number of experiments.
-        free: whether the coefficients of every nonlinearity are unknown; where not, mu is one (`Linear`).
-        constant: whether the offset is unknown; where not, it is zero.
-    """
-
-    layout: Layout
-    experiments: int
-    free: tuple[bool, ...]
-    constant: bool = True
-
-    @property
-    def memory(self) -> int:
-        """Size n of an initial state."""
-        return self.layout.first_row
-
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        """Where every part stands in x: "a", "mu0", "b0", "mu1", ..., "offset"."""
-        parts = [("a", self.layout.na)]
-        for c, (basis, nb) in enumerate(zip(self.layout.bases, self.layout.nb)):
-            parts += [(f"mu{c}", basis.size if self.free[c] else 0), (f"b{c}", nb)]
-        found, position = {}, 0
-        for name, size in [*parts, ("offset", int(self.constant))]:
-            found[name] = slice(position, position + size)
-            position += size
-        return found
-
-    @property
-    def shared(self) -> int:
-        """Number of unknowns that all experiments share: the first entries of x."""
-        return self.slices["offset"].stop
-
-    @property
-    def size(self) -> int:
-        """Length of x."""
-        return self.shared + self.experiments * self.memory
-
-    def pack(self, point: PlantPoint) -> Array:
-        """Return x of a point."""
-        parts = [point.a]
-        for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
-            parts += [mu[: len(mu) if self.free[c] else 0], b]
-        return np.concatenate([*parts, [point.offset][: int(self.constant)], point.x0.ravel()])
-
-    def unpack(self, x: Array) -> PlantPoint:
-        """Return the point of x."""
-        at = self.slices
-        inputs = range(self.layout.m)
-        return PlantPoint(x[at["a"]], tuple(x[at[f"mu{c}"]] if self.free[c] else np.ones(1) for c in inputs),
-                          tuple(x[at[f"b{c}"]] for c in inputs), float(np.sum(x[at["offset"]])),
-                          x[self.shared :].reshape(self.experiments, self.memory))
 
 
 def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, ...] | None:
@@ -126,136 +58,171 @@ def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, .
     return tuple(np.hstack([basis.values(e.u[:, c]) for c, basis in enumerate(layout.bases)]) for e in data.experiments)
 
 
-def linearise(data: "Data", unknowns: Unknowns, point: PlantPoint, *, gauge: Array | None = None,
+def linearise(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, *, gauge: Array | None = None,
               method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK,
               functions: Sequence[Array] | None = None) -> Linearised:
-    """Simulate a model over all experiments and compress its errors with their sensitivities.
+    """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
 
     Args:
-        data: the record; missing outputs drop out of the sum, the state goes on.
+        data: the record; missing outputs drop out of the sum.
         unknowns: their order.
-        point: where; A must be stable.
-        gauge: (rows, p) directions of the shared unknowns that change no simulation (the scale between mu and b).
+        point: where; C must be invertible, and A stable where D is not A.
+        gauge: (rows, p) directions of the shared unknowns that change no prediction (the scale between mu and b).
             They are given weight in the factor, so that it is not singular; at the point they contribute nothing.
         method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
         chunk: samples at a time.
         functions: what `expanded` returned for the record.
     """
-    use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
-    alone = unknowns.experiments == 1  # then the gauge takes part before the factorisation, which so is regular
-    parts = [_experiment(data, unknowns, point, i, use, chunk, gauge if alone else None, functions)
-             for i in range(unknowns.experiments)]
-    found = assembled(parts, unknowns.memory, unknowns.shared, None if alone else gauge, use)
-    if method == "auto" and not found.condition < CONDITION_LIMIT:
-        return linearise(data, unknowns, point, gauge=gauge, method="qr", chunk=chunk, functions=functions)
-    return found
+    return linearised(lambda i: blocks(data, unknowns, point, i, functions=functions, chunk=chunk),
+                      unknowns.experiments, unknowns.memory, unknowns.shared, gauge, method)
 
 
-def instruments(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK,
+def instruments(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chunk: int = CHUNK,
                 functions: Sequence[Array] | None = None) -> Array:
     """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors] without initial states.
 
     It holds the normal equations of Steiglitz-McBride and of the refined instrumental variable: in both the measured
     output takes the place of the simulated one in the columns of a. Missing outputs are replaced by simulated ones.
+    There must be no noise filter.
     """
-    total = np.zeros((unknowns.shared + unknowns.layout.na + 1,) * 2)
+    size = unknowns.shared + unknowns.layout.na + 1
+    total = np.zeros((size, size))
     for i in range(unknowns.experiments):
-        part = _experiment(data, unknowns, point, i, "gram", chunk, None, functions, measured=True)
-        _, rest = eliminated(part.factor, unknowns.memory)
+        found = blocks(data, unknowns, point, i, functions=functions, chunk=chunk, measured=True)
+        _, rest = eliminated(compressed(found, unknowns.memory + size, "gram")[0], unknowns.memory)
         total += rest.T @ rest
     return total
 
 
-def simulate(data: "Data", unknowns: Unknowns, point: PlantPoint, chunk: int = CHUNK) -> list[Array]:
-    """Return the simulated output (N,) of every experiment."""
-    found = []
-    for i, e in enumerate(data.experiments):
-        run = _Run(unknowns, point, point.x0[i], chunk)
-        found.append(np.concatenate([run.advance(e.u[k : k + chunk]) for k in range(0, len(e.u), chunk)]))
-    return found
+def simulate(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chunk: int = CHUNK) -> list[Array]:
+    """Return the simulated output (N,) of every experiment; where D is A, the right-hand side of its equation."""
+    return [_simulated(data, unknowns, point, i, None, chunk) for i in range(unknowns.experiments)]
 
 
-def _experiment(data: "Data", unknowns: Unknowns, point: PlantPoint, index: int, method: str, chunk: int,
-                gauge: Array | None, functions: Sequence[Array] | None, measured: bool = False) -> Compressed:
-    e = data.experiments[index]
-    columns = unknowns.memory + unknowns.shared + measured * unknowns.layout.na + 1
-    table = None if functions is None else functions[index]
-    found = _blocks(e.u, e.y[:, 0], unknowns, point, point.x0[index], chunk, measured, table)
-    return compressed(found, columns, method, gauge, unknowns.memory)
+def predict(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, x: Array) -> Filtered:
+    """Run the predictor over one experiment.
+
+    The samples that its noise filter explains are y - x, or y where D is A.
+
+    Args:
+        data: the record.
+        unknowns: their order.
+        point: as in `linearise`.
+        index: number of the experiment.
+        x: (N,) what `simulate` returned for it.
+    """
+    y = data.experiments[index].y[:, 0]
+    if unknowns.apart:
+        return noise_filter.innovations(y - x, None, point.c, point.d)
+    return noise_filter.innovations(y, x, point.c, point.a, start=unknowns.skipped)
 
 
-def _blocks(u: Array, y: Array, unknowns: Unknowns, point: PlantPoint, x0: Array, chunk: int, measured: bool,
-            functions: Array | None) -> Iterator[tuple[Array, int]]:
-    """Yield [x0 | shared | (measured) | errors] of every chunk with zeros where the output is missing, and its rows."""
-    run = _Run(unknowns, point, x0, chunk)
-    n, na, at = unknowns.memory, unknowns.layout.na, unknowns.slices
-    history = np.zeros((na, 2))  # simulated and measured output through 1 / A
-    for start in range(0, len(u), chunk):
-        output = run.advance(u[start : start + chunk], None if functions is None else functions[start : start + chunk])
-        target, count = y[start : start + chunk], len(output)
-        missing = np.isnan(target)
-        past = np.empty((na + count, 2 if measured else 1))
-        past[:na], past[na:, 0] = history[:, : past.shape[1]], output
-        if measured:
-            past[na:, 1] = np.where(missing, output, target)
-        all_pole(point.a, past, na)
-        history = past[len(past) - na :] if measured else np.repeat(past[len(past) - na :], 2, axis=1)
-        head = 0 if run.forgotten else n
-        block = np.empty((count, head + unknowns.shared + measured * na + 1))
+def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, *,
+           functions: Sequence[Array] | None = None, chunk: int = CHUNK, measured: bool = False
+           ) -> Iterator[tuple[Array, int]]:
+    """Yield [x0 | shared | (measured) | errors] of every chunk of an experiment, and its number of errors.
+
+    Rows without an error are zero. The columns of x0 are left out where the initial state is forgotten.
+    """
+    e, layout, at, n = data.experiments[index], unknowns.layout, unknowns.slices, unknowns.memory
+    y, na, extra = e.y[:, 0], layout.na, layout.na if measured else 0
+    noise, x, explained = None, np.zeros(0), np.zeros(0)
+    if not unknowns.plain:
+        x = _simulated(data, unknowns, point, index, functions, chunk)
+        noise = predict(data, unknowns, point, index, x)
+        explained = np.nan_to_num(noise.filled)
+    depth = max(unknowns.nc, len(point.d))
+    history, kinds = np.zeros((depth, n + unknowns.shared + 1)), np.full(depth, DEAD, dtype=np.int8)
+    head, run = n, _Run(unknowns, point, index, whitened=True)
+    past = np.zeros((na + len(run.d), 1 + measured))  # outputs of the plant and measured ones through 1 / A
+    for start in range(0, len(y), chunk):
+        part = slice(start, min(start + chunk, len(y)))
+        count = part.stop - part.start
+        run.advance(e.u[part], None if functions is None else functions[index][part])
+        output = run.output() if noise is None else x[part]
+        if head and run.forgotten and np.max(np.abs(history[:, :n]), initial=0.0) <= FORGOTTEN * run.peak:
+            head, history = 0, history[:, n:]
+        block = np.empty((depth + count, head + unknowns.shared + extra + 1))
+        if depth:
+            block[:depth] = history
+        rows = block[depth:]
         for i in range(head):
-            block[:, i] = run.shifted(run.impulse, i)
-        for i in range(1, na + 1):
-            block[:, head + i - 1] = -past[na - i : na - i + count, 0]
+            rows[:, i] = run.shifted(run.impulse, i)
+        if unknowns.apart and na:
+            lines = np.empty((len(past) + count, 1 + measured))
+            lines[: len(past)], lines[len(past) :, 0] = past, output
             if measured:
-                block[:, head + unknowns.shared + i - 1] = -past[na - i : na - i + count, 1]
-        for c, lags in enumerate(unknowns.layout.lags):
+                lines[len(past) :, 1] = np.where(np.isnan(y[part]), output, y[part])
+            all_pole(point.a, lines, len(past))
+            past, lines = lines[count:], through(run.d, lines)
+            for i in range(1, na + 1):
+                rows[:, head + i - 1] = -lines[na - i : na - i + count, 0]
+                if measured:
+                    rows[:, head + unknowns.shared + i - 1] = -lines[na - i : na - i + count, 1]
+        elif noise is not None:
+            for i in range(1, na + 1):
+                rows[:, head + i - 1] = -_delayed(explained, part, i)
+        for c, lags in enumerate(layout.lags):
             if unknowns.free[c]:
-                mus = slice(head + at[f"mu{c}"].start, head + at[f"mu{c}"].stop)
-                block[:, mus] = run.through_numerator(c)
+                rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
             for j, lag in enumerate(lags):
-                block[:, head + at[f"b{c}"].start + j] = run.shifted_function(c, lag)
+                rows[:, head + at[f"b{c}"].start + j] = run.shifted_function(c, lag)
         if unknowns.constant:
-            block[:, head + at["offset"].start] = run.shifted(run.step, 0)
-        block[:, -1] = output - target
-        block[missing] = 0.0
-        yield block, count - int(np.count_nonzero(missing))
+            rows[:, head + at["offset"].start] = run.shifted(run.step, 0)
+        if noise is None:
+            rows[:, -1] = output - y[part]
+            present = np.isfinite(y[part])
+        else:
+            for name, signal, sign in (("c", noise.innovations, 1.0), ("d", explained, -1.0)):
+                for i in range(at[name].stop - at[name].start):
+                    rows[:, head + at[name].start + i] = sign * _delayed(signal, part, i + 1)
+            rows[:, -1] = -noise.innovations[part]
+            state = np.concatenate([kinds, noise.state[part]])
+            _kernels()[1](block, state, np.ascontiguousarray(point.c), np.ascontiguousarray(point.d), depth)
+            history, kinds, present = block[count:].copy(), state[count:], state[depth:] == PRESENT
+        rows[~present] = 0.0
+        yield rows, int(np.count_nonzero(present))
 
 
 class _Run:
-    """A simulation in chunks: basis functions, the constant and an impulse through 1 / A, with n samples of history."""
+    """Basis functions, the constant and an impulse through 1/A (apart) and D, chunk by chunk, with n samples before."""
 
-    def __init__(self, unknowns: Unknowns, point: PlantPoint, x0: Array, chunk: int) -> None:
-        self.unknowns, self.point, self.x0 = unknowns, point, x0
-        sizes = [basis.size for basis in unknowns.layout.bases]
-        edges = np.cumsum([0, *sizes])
+    def __init__(self, unknowns: TransferUnknowns, point: TransferPoint, index: int, whitened: bool) -> None:
+        self.unknowns, self.point, self.x0 = unknowns, point, point.x0[index]
+        edges = np.cumsum([0, *(basis.size for basis in unknowns.layout.bases)])
         self.spans = [slice(int(i), int(j)) for i, j in zip(edges[:-1], edges[1:])]
         self.step, self.impulse = int(edges[-1]), int(edges[-1]) + 1
-        self.filtered = np.zeros((unknowns.memory, self.impulse + 1))
-        self.functions: list[Array] = []
+        self.d = point.d if whitened and unknowns.apart else np.zeros(0)
+        self.n = unknowns.layout.first_row
+        self.history = np.zeros((self.n + len(self.d), self.impulse + 1))
+        self.table, self.functions = self.history, []
         self.count, self.started, self.peak, self.forgotten = 0, False, 0.0, False
 
-    def advance(self, u: Array, functions: Array | None = None) -> Array:
-        """Filter the next chunk (T, m) of the input, or its basis functions, and return the simulated output (T,)."""
-        n, layout, point = self.unknowns.memory, self.unknowns.layout, self.point
-        if self.started and not self.forgotten:
-            tail = float(np.max(np.abs(self.filtered[len(self.filtered) - n :, self.impulse]), initial=0.0))
+    def advance(self, u: Array, functions: Array | None = None) -> None:
+        """Filter the next chunk (T, m) of the input, or its basis functions."""
+        past, self.count = len(self.history), len(u)
+        if self.unknowns.apart and self.started and not self.forgotten:
+            tail = float(np.max(np.abs(self.history[:, self.impulse]), initial=0.0))
             self.forgotten = tail <= FORGOTTEN * self.peak
-        self.count = len(u)
-        table = np.empty((n + self.count, self.impulse + 1))
-        table[:n] = self.filtered[len(self.filtered) - n :]
+        table = np.empty((past + self.count, self.impulse + 1))
+        table[:past] = self.history
         if functions is not None:
-            table[n:, : self.step] = functions
-        for c, (basis, span) in enumerate(zip(layout.bases if functions is None else (), self.spans)):
-            table[n:, span] = basis.values(u[:, c])
-        table[n:, self.step], table[n:, self.impulse] = 1.0, 0.0
-        table[n, self.impulse] += not self.started
-        all_pole(point.a, table, n)
-        self.filtered, self.started = table, True
-        self.peak = max(self.peak, float(np.max(np.abs(table[:, self.impulse]))))
-        self.functions = [table[:, span] @ mu for span, mu in zip(self.spans, point.mus)]
-        output = point.offset * self.shifted(self.step, 0)
-        for c, lags in enumerate(layout.lags):
-            for b, lag in zip(point.bs[c], lags):
+            table[past:, : self.step] = functions
+        for c, (basis, span) in enumerate(zip(self.unknowns.layout.bases if functions is None else (), self.spans)):
+            table[past:, span] = basis.values(u[:, c])
+        table[past:, self.step], table[past:, self.impulse] = 1.0, 0.0
+        table[past, self.impulse] += not self.started
+        if self.unknowns.apart:
+            all_pole(self.point.a, table, past)
+            self.peak = max(self.peak, float(np.max(np.abs(table[:, self.impulse]))))
+        self.started, self.history, self.table = True, table[len(table) - past :], through(self.d, table)
+        self.functions = [self.table[:, span] @ mu for span, mu in zip(self.spans, self.point.mus)]
+
+    def output(self) -> Array:
+        """Return the output of the plant (T,), or the right-hand side of its equation where nothing is filtered."""
+        output = self.point.offset * self.shifted(self.step, 0)
+        for c, lags in enumerate(self.unknowns.layout.lags):
+            for b, lag in zip(self.point.bs[c], lags):
                 output += b * self.shifted_function(c, lag)
         for i, value in enumerate(self.x0 if not self.forgotten else ()):
             output += value * self.shifted(self.impulse, i)
@@ -263,21 +230,43 @@ class _Run:
 
     def shifted(self, column: int, lag: int) -> Array:
         """Return a filtered signal of the chunk, delayed."""
-        start = self.unknowns.memory - lag
-        return self.filtered[start : start + self.count, column]
+        return self.table[self.n - lag : self.n - lag + self.count, column]
 
     def shifted_function(self, c: int, lag: int) -> Array:
-        """Return f_c / A, delayed."""
-        start = self.unknowns.memory - lag
-        return self.functions[c][start : start + self.count]
+        """Return f_c, filtered and delayed."""
+        return self.functions[c][self.n - lag : self.n - lag + self.count]
 
     def through_numerator(self, c: int) -> Array:
-        """Return B_c eta_c / A, (T, P_c)."""
+        """Return B_c eta_c, filtered, (T, P_c)."""
         total = np.zeros((self.count, self.spans[c].stop - self.spans[c].start))
         for b, lag in zip(self.point.bs[c], self.unknowns.layout.lags[c]):
-            start = self.unknowns.memory - lag
-            total += b * self.filtered[start : start + self.count, self.spans[c]]
+            total += b * self.table[self.n - lag : self.n - lag + self.count, self.spans[c]]
         return total
+
+
+def _simulated(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int,
+               functions: Sequence[Array] | None, chunk: int) -> Array:
+    u, run, found = data.experiments[index].u, _Run(unknowns, point, index, whitened=False), []
+    for start in range(0, len(u), chunk):
+        part = slice(start, start + chunk)
+        run.advance(u[part], None if functions is None else functions[index][part])
+        found.append(run.output())
+    return np.concatenate(found)
+
+
+def _delayed(signal: Array, part: slice, lag: int) -> Array:
+    first = part.start - lag
+    if first >= 0:
+        return signal[first : part.stop - lag]
+    return np.concatenate([np.zeros(min(-first, part.stop - part.start)), signal[: max(part.stop - lag, 0)]])
+
+
+def through(d: Array, table: Array) -> Array:
+    """Return the columns of a table (nd + T, K) through D (T, K): its first rows are history."""
+    total = table[len(d) :]
+    for i, value in enumerate(d, start=1):
+        total = total + value * table[len(d) - i : len(table) - i]
+    return total
 
 
 def all_pole(a: Array, table: Array, first: int) -> None:
@@ -289,7 +278,7 @@ def all_pole(a: Array, table: Array, first: int) -> None:
         first: rows of history.
     """
     if len(a):
-        _all_pole()(np.ascontiguousarray(a), table, first)
+        _kernels()[0](np.ascontiguousarray(a), table, first)
 
 
 def _march(a: Array, table: Array, first: int) -> None:
@@ -299,8 +288,27 @@ def _march(a: Array, table: Array, first: int) -> None:
                 table[k, c] -= a[i] * table[k - 1 - i, c]
 
 
+def _mixed(table: Array, state: Any, c: Array, d: Array, first: int) -> None:
+    """Pass all columns but the last, the errors, through 1/C after present samples and through 1/D after others."""
+    for k in range(first, table.shape[0]):
+        if state[k] == 2:
+            for j in range(table.shape[1] - 1):
+                table[k, j] = 0.0
+            continue
+        for i in range(max(c.size, d.size)):
+            kind = state[k - 1 - i]
+            weight = 0.0
+            if kind == 0 and i < c.size:
+                weight = c[i]
+            elif kind == 1 and i < d.size:
+                weight = d[i]
+            if weight != 0.0:
+                for j in range(table.shape[1] - 1):
+                    table[k, j] -= weight * table[k - 1 - i, j]
+
+
 @cache
-def _all_pole() -> Any:
+def _kernels() -> tuple[Any, Any]:
     from numba import njit
 
-    return njit(cache=True, nogil=True)(_march)
+    return njit(cache=True, nogil=True)(_march), njit(cache=True, nogil=True)(_mixed)

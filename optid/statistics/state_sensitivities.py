@@ -16,7 +16,8 @@ from optid.arrays import Array
 from optid.errors import DataError
 from optid.models import state_simulation
 from optid.statistics.expansion import Expansion
-from optid.statistics.linearised import CONDITION_LIMIT, Linearised, assembled, compressed
+from optid.statistics.linearised import Linearised, linearised
+from optid.statistics.unknowns import Unknowns
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -55,7 +56,7 @@ class StatePoint:
 
 
 @dataclass(frozen=True, eq=False)
-class StateUnknowns:
+class StateUnknowns(Unknowns):
     """The unknowns as one vector; the initial states come last.
 
     Attributes:
@@ -79,13 +80,18 @@ class StateUnknowns:
         """Number of outputs."""
         return self.expansion.l
 
+    @property
+    def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Size of an initial state."""
+        return self.n
+
     @cached_property
     def free(self) -> tuple[bool, ...]:
         """Whether mu of every input is unknown: it is one where the basis has a single function."""
         return tuple(size > 1 for size in self.expansion.input_sizes)
 
     @cached_property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
+    def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Shape of every part in the order of the vector: "A", "C", "K", "offset", "mu0", "b0", ..., "nu0", "e0"."""
         n, outputs = self.n, self.l
         found: dict[str, tuple[int, ...]] = {"A": (n, n), "C": (outputs, n)}
@@ -103,25 +109,6 @@ class StateUnknowns:
             found[f"e{f}"] = (n,)
         return found
 
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        """Where every part stands; matrices row by row."""
-        found, position = {}, 0
-        for name, shape in self.shapes.items():
-            found[name] = slice(position, position + int(np.prod(shape)))
-            position = found[name].stop
-        return found
-
-    @property
-    def shared(self) -> int:
-        """Number of unknowns that all experiments share."""
-        return max((at.stop for at in self.slices.values()), default=0)
-
-    @property
-    def size(self) -> int:
-        """Number of all unknowns."""
-        return self.shared + self.experiments * self.n
-
     def pack(self, point: StatePoint) -> Array:
         """Return the vector of a point."""
         columns = [np.concatenate([point.b[:, c], point.d[:, c][: self.l * direct]])
@@ -134,7 +121,7 @@ class StateUnknowns:
 
     def unpack(self, x: Array) -> StatePoint:
         """Return the point of a vector."""
-        part = {name: x[at].reshape(self.shapes[name]) for name, at in self.slices.items()}
+        part = self.parts(x)
         n, outputs, m, s = self.n, self.l, self.expansion.m, len(self.expansion.feedback)
         b, d = np.zeros((n, m)), np.zeros((outputs, m))
         for c, direct in enumerate(self.feedthrough):
@@ -240,18 +227,12 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
     Returns:
         The errors near x; of infinite value where they leave the range of numbers.
     """
-    columns = unknowns.n + unknowns.shared + 1
-    chunk = chunk or max(32, NUMBERS // (columns * unknowns.l))
-    for method in ("gram", "qr"):
-        try:
-            parts = [compressed(_blocks(data, unknowns, x, i, weight, model, chunk), columns, method)
-                     for i in range(unknowns.experiments)]
-        except FloatingPointError:
-            return _infinite(unknowns)
-        found = assembled(parts, unknowns.n, unknowns.shared, gauge, method)
-        if found.condition < CONDITION_LIMIT:
-            break
-    return found
+    chunk = chunk or max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
+    try:
+        return linearised(lambda i: _blocks(data, unknowns, x, i, weight, model, chunk), unknowns.experiments,
+                          unknowns.n, unknowns.shared, gauge)
+    except FloatingPointError:
+        return _infinite(unknowns)
 
 
 def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any) -> list[Array]:
@@ -276,7 +257,7 @@ def _infinite(unknowns: StateUnknowns) -> Linearised:
 def _blocks(data: "Data", unknowns: StateUnknowns, x: Array, index: int, weight: Array, model: Any, chunk: int
             ) -> Iterator[tuple[Array, int]]:
     """Yield weighted rows [x0 | shared | error], zero where the output is missing, and their number."""
-    record, roots = data.experiments[index].y, _Roots(weight)
+    record, covariance = data.experiments[index].y, np.linalg.inv(weight)
     first = 0
     for outputs, jacobian in _runs(data, unknowns, unknowns.unpack(x), index, model, chunk):
         error = outputs - record[first : first + len(outputs)]
@@ -286,28 +267,18 @@ def _blocks(data: "Data", unknowns: StateUnknowns, x: Array, index: int, weight:
         block = np.concatenate([jacobian, error[:, :, None]], axis=2)
         missing = np.isnan(error)
         block[missing] = 0.0
-        if not missing.any():
-            block = np.einsum("op,kpq->koq", roots.of(np.zeros(error.shape[1], dtype=bool)), block)
-        else:
-            for pattern in np.unique(missing, axis=0):
-                rows = (missing == pattern).all(axis=1)
-                block[rows] = np.einsum("op,kpq->koq", roots.of(pattern), block[rows])
+        for pattern in np.unique(missing, axis=0):
+            rows = (missing == pattern).all(axis=1)
+            block[rows] = np.einsum("op,kpq->koq", _root(covariance, pattern), block[rows])
         yield block.reshape(-1, block.shape[2]), int(np.count_nonzero(~missing))
 
 
-class _Roots:
-    """Square roots R of the weight of the outputs present, with e^T R^T R e the weighted square."""
-
-    def __init__(self, weight: Array) -> None:
-        self.covariance = np.linalg.inv(weight)
-
-    def of(self, missing: Any) -> Array:
-        here, size = np.flatnonzero(~missing), missing.size
-        root = np.zeros((size, size))
-        if here.size:
-            inside = self.covariance[np.ix_(here, here)]
-            root[np.ix_(here, here)] = np.linalg.cholesky(np.linalg.inv(inside)).T
-        return root
+def _root(covariance: Array, missing: Any) -> Array:
+    """Return the square root R of the weight of the outputs present, with e^T R^T R e the weighted square."""
+    here, root = np.flatnonzero(~missing), np.zeros((missing.size, missing.size))
+    if here.size:
+        root[np.ix_(here, here)] = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(here, here)])).T
+    return root
 
 
 def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: Any, chunk: int

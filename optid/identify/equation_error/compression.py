@@ -14,7 +14,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
-from optid.data.channels import Transform
+from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
@@ -190,13 +190,6 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     columns = _positions(layout)
     problem = _lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
-
-
-def model_meta(data: Data | Stream) -> dict[str, Any]:
-    """Names, units and sampling time that a model carries."""
-    return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
-            "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
-            "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}
 
 
 def _positions(layout: Layout) -> np.ndarray:

@@ -7,21 +7,21 @@ and b, are projected out at every iterate (data-driven local coordinates, McKelv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from formulations.state_models import state_model
+from optid.arrays import Array
 from optid.bases import Linear
+from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.errors import DataError, StructureError
-from optid.models import HammersteinSS
-from optid.models.balancing import balancing
+from optid.errors import StructureError
+from optid.identify.prediction_error.descent import Criterion
+from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
+from optid.statistics.expansion import Expansion
 from optid.statistics.linearised import Linearised
 from optid.statistics.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
-
-Array = np.ndarray
 
 STABLE = 1 - 1e-9
 FLOOR = 1e-7
@@ -29,8 +29,8 @@ FLOOR = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class StateError:
-    """A `formulations.prediction_error.Criterion`: the weighted sum of squared errors of all outputs.
+class StateErrors(Criterion):
+    """The weighted sum of squared errors of all outputs.
 
     Attributes:
         data: the record.
@@ -46,11 +46,20 @@ class StateError:
     weight: Array
     limit: float = STABLE
     checks: tuple[Callable[[Any], str], ...] = ()
+    gauge: ClassVar[str] = "norm"
 
     @property
     def errors(self) -> str:
         """What they are called."""
         return "prediction errors" if self.unknowns.innovations else "simulation errors"
+
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of an input, or of a family of feedback functions."""
+        x = self.unknowns.expansion
+        if name in ("nu", "e"):
+            word = {"nu": "mu feedback", "e": "b feedback"}[name]
+            return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
+        return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
 
     @cached_property
     def energy(self) -> float:
@@ -72,27 +81,13 @@ class StateError:
             return False
         return not self.checks or not any(check(self.at(point)) for check in self.checks)
 
-    def normalised(self, x: Array) -> Array:
-        """Return the same model with [b; d] of every free input, and e of every family, of norm one."""
-        x, at = np.array(x), self.unknowns.slices
-        for outer, inner in (("b", "mu"), ("e", "nu")):
-            for name in [name for name in at if name.startswith(inner)]:
-                column = outer + name[len(inner) :]
-                size = float(np.linalg.norm(x[at[column]]))
-                if size:
-                    x[at[name]], x[at[column]] = x[at[name]] * size, x[at[column]] / size
-                else:  # a channel without effect: any direction will do
-                    x[at[name]], x[at[column]] = 0.0, 1 / np.sqrt(x[at[column]].size)
-        return x
-
     def gauge_rows(self, x: Array) -> Array:
         """Orthonormal directions (rows, shared) of theta that a step does not take, since they change no output."""
         at, rows = self.unknowns.slices, list(self.unknowns.similarity(x))
-        for outer, inner in (("b", "mu"), ("e", "nu")):
-            for name in [name for name in at if name.startswith(inner)]:
-                row, column = np.zeros(self.unknowns.shared), outer + name[len(inner) :]
-                row[at[name]], row[at[column]] = x[at[name]], -x[at[column]]
-                rows.append(row)
+        for mu, b in self.unknowns.products:
+            row = np.zeros(self.unknowns.shared)
+            row[at[mu]], row[at[b]] = x[at[mu]], -x[at[b]]
+            rows.append(row)
         if not rows:
             return np.zeros((0, self.unknowns.shared))
         values, vectors = np.linalg.svd(np.array(rows), full_matrices=False)[1:]
@@ -107,7 +102,7 @@ class StateError:
         """Return the errors (N, l) of every experiment."""
         return residuals(self.data, self.unknowns, x, self.at)
 
-    def reweighted(self, x: Array, full: bool) -> "StateError":
+    def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.
 
         A fixed point of this iteration is stationary for the determinant of the covariance (``full``), or the product
@@ -173,45 +168,26 @@ class StateError:
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0)
 
 
-def entered(criterion: StateError, model: HammersteinSS, radii: Sequence[float] = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
-            ) -> Array | None:
-    """Return an admissible vector of unknowns near a model; None without one.
+def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
+                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
+    """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
 
-    A model whose state is not carried stably is contracted; the initial states are those that fit best.
+    Args:
+        expansion: the signals of the fit.
+        data: the record, for names, units and sampling time.
+        matrices: A (n, n), B (n, m), C (l, n) and D (l, m).
+        mus: coefficients of the nonlinearity of every input.
+        nus: coefficients of every feedback family in its orthonormal coordinates.
+        e: (n, s), one column per family.
+        K: (n, l), zero where None.
+        offset: (l,) of the output, zero where None.
     """
-    point = criterion.point_of(_balanced(criterion, model))
-    candidates = [point]
-    if criterion.unknowns.innovations:
-        candidates.append(replace(point, K=np.zeros_like(point.K)))
-    largest = spectral_radius(point.A)
-    candidates += [replace(point, A=point.A * (radius / max(largest, radius)), K=np.zeros_like(point.K))
-                   for radius in radii]
-    for candidate in candidates:
-        x = criterion.normalised(criterion.unknowns.pack(candidate))
-        if not criterion.admissible(x):
-            continue
-        try:
-            at = criterion.linearise(x)
-        except (DataError, np.linalg.LinAlgError):
-            continue
-        if np.isfinite(at.value):
-            p = criterion.unknowns.shared
-            x[p:] += at.follow(np.zeros(p))
-            return x
-    return None
-
-
-def _balanced(criterion: StateError, model: HammersteinSS) -> HammersteinSS:
-    """Balance the states for the signals and weights of the fit, so that all entries of A are of one size.
-
-    A model without balanced states stays as it is.
-    """
-    data = criterion.data
-    f = model.expanded(np.vstack([e.u for e in data.experiments]))
-    y = np.vstack([e.y for e in data.experiments])
-    g = [np.nanstd(function(y[:, o])) for function, o in zip(model.feedback, model.output_of)]
-    driven = np.hstack([model.B * f.std(axis=0), model.E * np.array(g)])
-    try:
-        return model.transformed(balancing(model.A, driven, np.linalg.cholesky(criterion.weight).T @ model.C))
-    except StructureError:
-        return model
+    families = expansion.feedback
+    parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
+    injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
+    A, B, C, D = matrices
+    return HammersteinSS(
+        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
+        nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
+        feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
+        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))

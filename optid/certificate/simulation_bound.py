@@ -1,50 +1,33 @@
 """The Hankel bound on the objective of a state-space fit, where that objective is a simulation error."""
 
-import numpy as np
+from collections.abc import Sequence
 
+from optid.arrays import Array
 from optid.certificate.hankel import hankel_bounds
 from optid.errors import OptidError
-from optid.identify.subspace.observer import ObserverProblem
 from optid.program.solution import Bound
 from optid.statistics.expansion import Expansion
 
 WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
 
 
-def simulation_bound(records: list[np.ndarray], step: ObserverProblem, error: float, block_rows: int, said: str
-                     ) -> Bound:
+def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, weights: Array, error: float,
+                     block_rows: int, said: str, applies: bool = True) -> Bound:
     """Return the bound that holds for every model of the order with these functions, or none with the reason.
-
-    The objective of the step in B, D, E and x0 is the squared error of the simulator with measured feedback where no
-    observer gain corrects the state and no instruments stand for the feedback; for anything else the bound does not
-    hold and is not given.
-
-    Args:
-        records: raw channels [u | y] per experiment.
-        step: the step the objective belongs to.
-        error: its value.
-        block_rows: of the fit; the bound is the best of one, two and four times as many.
-        said: what else there is to say about optimality.
-    """
-    form = step.form
-    if np.any(form.gain) or step.instrumented:
-        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
-    return bounded(records, form.expansion, form.n, form.weights, error, block_rows, said)
-
-
-def bounded(records: list[np.ndarray], expansion: Expansion, n: int, weights: np.ndarray, error: float,
-            block_rows: int, said: str) -> Bound:
-    """Return the bound on a squared error of the simulator with measured feedback, or none with the reason.
 
     Args:
         records: raw channels [u | y] per experiment.
         expansion: the signals.
         n: order of the model.
         weights: (l,) by which every output was multiplied in the error.
-        error: its value.
-        block_rows: as in `simulation_bound`.
-        said: as in `simulation_bound`.
+        error: its value, a squared error of the simulator with measured feedback.
+        block_rows: of the fit; the bound is the best of one, two and four times as many.
+        said: what else there is to say about optimality.
+        applies: whether no observer gain corrects the state and no instruments stand for the feedback; for anything
+            else the bound does not hold and is not given.
     """
+    if not applies:
+        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
     x = expansion.with_simulated(False)
     count, signals = sum(len(record) for record in records), x.p + x.q + x.l
     longest = max(len(record) for record in records)

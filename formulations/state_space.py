@@ -1,0 +1,239 @@
+"""State-space models by prediction errors: simulation or one-step errors of all outputs minimised.
+
+    x(k+1) = A x + B f(u) + E g(y) + K e,    y(k) = C x + D f(u) + d + e
+
+``criterion="simulation"`` takes K = 0 and the simulation with measured feedback (P2); a noise model is estimated from
+the errors it leaves. ``"prediction"`` estimates K with the other unknowns. Both are procedures: starts from subspace
+fits with several block rows, Gauss-Newton descents on streamed sensitivities, errors weighted anew by their own
+covariance (`optid.identify.prediction_error`) and, at the optimum z0 or under constraints, convex programmes in the
+tangent of the iterate,
+
+    minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the user's constraints,
+
+where R (z - z0) + e0 are the errors to first order in the unknowns z, compressed; directions of z that change no output
+are part of R. Constraints on poles are kept by every iterate through the length of the steps.
+
+Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
+(not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, and the
+affine expressions ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names
+carry the channel, as in ``mu[valve]``. Without feedback the static curves (`shape.gain`, `shape.value_range`, ...) are
+constrained to first order about the iterate as well.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from formulations.subspace_plan import Plan, in_record_units, planned
+from formulations.subspace_procedure import identified
+from optid.data.channels import Transform
+from optid.data.record import Data
+from optid.data.stretches import with_whole_inputs
+from optid.errors import RankError, StructureError
+from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
+from optid.identify.design.expansion import Bases
+from optid.identify.prediction_error.refinement import refine
+from optid.identify.prediction_error.state_errors import STABLE, StateErrors
+from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
+from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.models import HammersteinSS
+from optid.program.expressions import tangent_product
+from optid.program.program import Program, Values
+from optid.program.units import energy_unit, inverse, outer_bases
+from optid.program.view import View
+from optid.solving.solve import Procedure
+from optid.statistics.linearised import Linearised
+from optid.statistics.state_sensitivities import StateUnknowns
+
+Array = np.ndarray
+
+WORDS = {"criterion": ("simulation", "prediction"), "stability": ("stable", "free"),
+         "weighting": ("auto", "scale", "variance", "determinant")}
+
+
+def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
+                   criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
+                   weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+                   stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (),
+                   iterations: int = 100, constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation or prediction error of a Hammerstein state-space model with output feedback.
+
+    Every input acts through one nonlinearity (rank one). The feedback functions are taken in coordinates without a
+    part that is linear in the outputs of the record, which A would repeat.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+
+    Args:
+        data: the record. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
+        nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
+        basis: basis of the input nonlinearity, one per input or one for all.
+        feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
+        criterion: "simulation" (P2: measured feedback, K = 0) or "prediction" (P1: innovation form, K estimated).
+        block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
+            may be estimated as in `formulations.hammerstein_ss.sid`.
+        weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
+            covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
+            likelihood of Gaussian noise) for prediction.
+        offset: estimate a constant; False takes the record as it is.
+        feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
+        stability: "stable" keeps every iterate stable (for prediction, its predictor), with the feedback taken as a
+            given signal; "free" lets the poles go where the errors are smallest, for plants that integrate or grow
+            over the record.
+        initial: models of the same structure to start from besides.
+        iterations: Gauss-Newton steps per descent at most.
+        constraints: rules about poles, builders of CVXPY constraints in the named variables.
+
+    Raises:
+        StructureError: words, orders or starts that do not fit.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
+    """
+    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
+    return _procedure("hammerstein_ss.exact", data, nx, basis, feedback_basis, words, block_rows, offset, feedthrough,
+                      initial, iterations, constraints)
+
+
+def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
+       weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+       stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+       constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation or prediction error of a linear state-space model.
+
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``. Arguments as in `hammerstein_ss`, as
+    are the errors raised.
+    """
+    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
+    return _procedure("ss.exact", data, nx, "linear", None, words, block_rows, offset, feedthrough, initial, iterations,
+                      constraints)
+
+
+def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],
+               block_rows: Any, offset: bool, feedthrough: Any, initial: Any, iterations: Any,
+               constraints: Sequence[Any]) -> Procedure:
+    for what, word in words.items():
+        one_of(what, word, WORDS[what])
+    whole_number("iterations", iterations, 1)
+    in_memory(data, f"{words['criterion']} errors")
+    instruments = "inputs+past" if feedback_basis is None else "simulated"
+    if feedback_basis is not None and words["criterion"] == "prediction":
+        instruments = "simulated+past"
+    # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
+    plan = planned(name, data, nx, None, basis, feedback_basis, instruments, offset=bool(offset),
+                   feedthrough=feedthrough, stability="free", iterations=2 * (feedback_basis is not None))
+    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
+    found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
+    poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
+    for rule in poles:
+        if getattr(rule, "verify", None) is None:
+            raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
+                                 "use it with hammerstein_ss.asivid")
+    given = _block_rows(plan) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
+    others = tuple(rule for rule in constraints if rule not in poles)
+    run = _run(plan, words, given, block_rows is None, found, int(iterations), poles, others)
+    return in_record_units(run, plan)
+
+
+def _block_rows(plan: Plan) -> list[int | None]:
+    """Three numbers of block rows: what the subspace fit would choose, and multiples of what the order needs."""
+    if plan.order is None:
+        return [None]
+    least = plan.order // plan.data.l + 2
+    shortest = min(e.n_samples for e in plan.data.experiments)
+    most = max(shortest // (4 * (plan.data.m + plan.data.l + 1)), least)
+    return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
+
+
+def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None], imputes: bool,
+         found: dict[str, HammersteinSS], iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...]
+         ) -> Procedure:
+    refusal, nx = None, plan.order
+    for rows in block_rows:
+        try:
+            start = replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows, imputes=imputes)
+            evidence = yield from quietly(identified(start))
+        except (RankError, StructureError, np.linalg.LinAlgError) as error:
+            refusal = refusal or error
+            continue
+        if evidence.model is not None:
+            nx = nx or int(evidence.figures["order"])
+            found[f"{evidence.figures['block rows']} block rows"] = evidence.model
+    if nx is None or not found:
+        raise refusal or RankError("no subspace fit has a point to start from; use another order")
+    expansion, data = plan.expansion(), with_whole_inputs(plan.data, 2 * nx + 1)
+    unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), words["criterion"] == "prediction",
+                             plan.offset)
+    # similarity takes away the freedom of as many unknowns as A has entries
+    enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
+    variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
+    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
+                         STABLE if words["stability"] == "stable" else np.inf, tuple(rule.verify for rule in poles))
+    starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
+    if not starts:
+        raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
+    errors, best, figures = search_states(errors, starts, words["weighting"], iterations)
+    fit = _Fit(plan.name, errors, constraints, plan.units)
+    evidence = yield from refine(fit, best, {"order": nx, **figures}, fit.signed(best.x))
+    return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit(TangentFit):
+    criterion: StateErrors
+    units: Transform
+
+    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+        """State the programme of the step from z0."""
+        variables, values = self.places.variables(), self.places.values(z0)
+        r = cp.Variable(z0.size, name="residual")
+        step = self.places.stacked(variables) - z0
+
+        matrix, errors = at.whole
+        objective = cp.sum_squares(r) + at.remainder
+        if damping:
+            sizes = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
+            objective = objective + cp.sum_squares(cp.multiply(sizes, step))
+
+        residual = matrix @ step + errors
+        structural = {"residual": (r == residual,)}
+        expansion, units = self.criterion.unknowns.expansion, self.units
+        view = View({**variables, **self._products(variables, values)}, iterate=True, gauge="norm",
+                    channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
+                    bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
+        program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
+                          {**values, "residual": errors}, self.recover, view, frozenset(structural),
+                          derived={"residual": residual}, scale=self.criterion.energy)
+        return program.subject_to(*self.constraints)
+
+    def recover(self, values: Values) -> HammersteinSS:
+        """Return the model of the values of the variables, in the units of the programme."""
+        unknowns = self.criterion.unknowns
+        found = self.criterion.at(unknowns.unpack(self.places.pack(values)))
+        return found.regauge("norm") if any(unknowns.free) and not self.constraints else found
+
+    def _products(self, variables: Mapping[str, cp.Variable], values: Mapping[str, Array]) -> dict[str, cp.Expression]:
+        """Every Theta = mu bᵀ (P, n + l) to first order and, without feedback, the coefficients of the static curves.
+
+        These are ``static = mu (C (I - A)^-1 B + D)ᵀ`` (P, l).
+        """
+        expansion, n, found = self.criterion.unknowns.expansion, self.criterion.unknowns.n, {}
+        left = np.eye(n) - values["A"]
+        static = not expansion.feedback and np.linalg.cond(left) <= 1e12
+        to_state = np.linalg.inv(left) if static else left
+        for c in range(expansion.m):
+            mu, b = self.criterion.key("mu", c), self.criterion.key("b", c)
+            vectors: dict[str, tuple[Any, Any]] = {"Theta": (variables[b], values[b])}
+            if static:
+                seen, rest = values["C"] @ to_state, to_state @ values[b][:n]
+                gain = seen @ variables[b][:n] + (variables["C"] - values["C"]) @ rest + (
+                    seen @ (variables["A"] - values["A"]) @ rest)
+                at = seen @ values[b][:n]
+                direct = values[b].size > n
+                vectors["static"] = (gain + variables[b][n:], at + values[b][n:]) if direct else (gain, at)
+            for word, (vector, at) in vectors.items():
+                found[self.criterion.key(word, c)] = (
+                    tangent_product(variables[mu], vector, values[mu], at) if mu in variables
+                    else cp.reshape(vector, (1, at.size), order="F"))
+        return found

@@ -1,0 +1,204 @@
+"""Levenberg-Marquardt descents on a sum of squared errors, in the scaling of Moré (1978), and comparison of starts."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.statistics.linearised import Linearised
+from optid.statistics.unknowns import Unknowns
+
+STATIONARY = 1e-12
+"""Share of the sum of squares that a full step would still gain, below which a descent has arrived."""
+
+EXACT = 1e-24
+"""Sum of squared errors, as a share of the energy of the record, that counts as zero."""
+
+STEPS = 100
+
+COMPARED = 1e-6
+"""Relative gain of a full step below which a start counts as arrived; only the best of them descends further."""
+
+AGREE = 1e-4
+"""Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
+
+EXPLAINED = 0.1
+"""Share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
+where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best."""
+
+BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
+          "constraint such as stable:0.999")
+
+
+class Criterion(ABC):
+    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states.
+
+    Attributes:
+        data: the record.
+        unknowns: the order of x.
+        gauge: how the scale between mu and b is fixed.
+        energy: sum of squares of the outputs about their means.
+        unit: what one unit of the sum of squares is in units of the record.
+    """
+
+    data: Data
+    unknowns: Unknowns
+    gauge: str
+    energy: float
+    unit: float = 1.0
+
+    @property
+    @abstractmethod
+    def errors(self) -> str:
+        """What they are called: "simulation errors" or "prediction errors"."""
+
+    @abstractmethod
+    def key(self, name: str, number: int) -> str:
+        """Name a quantity of a channel, such as "mu" of input 0."""
+
+    @abstractmethod
+    def linearise(self, x: Array) -> Linearised:
+        """Return the errors near x."""
+
+    @abstractmethod
+    def admissible(self, x: Array) -> bool:
+        """Whether the errors exist at x: its filters are stable."""
+
+    def scale(self, x: Array, b: str) -> float:
+        """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""
+        return float(np.linalg.norm(x[self.unknowns.slices[b]]))
+
+    def normalised(self, x: Array) -> Array:
+        """Return the same model in the gauge."""
+        x, at = np.array(x), self.unknowns.slices
+        for mu, b in self.unknowns.products:
+            if factor := self.scale(x, b):
+                x[at[mu]], x[at[b]] = x[at[mu]] * factor, x[at[b]] / factor
+            else:  # a channel without effect: any direction will do
+                x[at[mu]], x[at[b]] = 0.0, 1 / np.sqrt(x[at[b]].size)
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where a descent arrived.
+
+    Attributes:
+        x: the unknowns.
+        at: the errors there.
+        steps: number of linearisations.
+        converged: whether a full step would gain no more than `STATIONARY`.
+        reason: why it stopped where it did not converge.
+        start: name of the start it came from.
+        border: whether it stopped because every better point is inadmissible.
+    """
+
+    x: Array
+    at: Linearised
+    steps: int
+    converged: bool
+    reason: str = ""
+    start: str = ""
+    border: bool = False
+
+    @property
+    def value(self) -> float:
+        """Sum of squared errors."""
+        return self.at.value
+
+
+def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterations: int = STEPS,
+            tolerance: float = STATIONARY, start: str = "") -> Descent:
+    """Lower the sum of squares from a point by Levenberg-Marquardt steps; every iterate is admissible.
+
+    Args:
+        criterion: the errors.
+        x: an admissible start.
+        held: (p,) marks of shared unknowns that stay.
+        iterations: at most.
+        tolerance: relative gain of a full step below which it stops.
+        start: name for the record.
+    """
+    x = criterion.normalised(x)
+    at = criterion.linearise(x)
+    p = len(at.pull)
+    free = np.ones(p, dtype=bool) if held is None else np.logical_not(held)
+    scale, least = np.zeros(int(free.sum())), EXACT * criterion.energy
+    damping, rejected, blocked = 1e-3, 0, False
+    for count in range(1, iterations + 1):
+        root = at.root[:, free]
+        gain = _gain(root, at)
+        if gain <= tolerance * at.value or at.value <= least:
+            return Descent(x, at, count, True, start=start)
+        scale = np.maximum(scale, np.linalg.norm(root, axis=0))
+        weights = np.where(scale > 0, scale, 1.0)
+        step = np.zeros(p)
+        stacked = np.vstack([root / weights, np.sqrt(damping) * np.eye(len(scale))])
+        pull = np.concatenate([-at.pull, np.zeros(len(scale))])
+        step[free] = np.linalg.lstsq(stacked, pull, rcond=1e-15)[0] / weights
+        moved = criterion.normalised(np.concatenate([x[:p] + step, x[p:] + at.follow(step)]))
+        expected = at.reach - float(np.sum((at.root @ step + at.pull) ** 2))
+        new = criterion.linearise(moved) if criterion.admissible(moved) else None
+        ratio = (at.value - new.value) / max(expected, 1e-300) if new is not None else -1.0
+        if new is not None and ratio > 1e-3 and np.isfinite(new.value):
+            x, at, rejected, blocked = moved, new, 0, False
+            damping = 0.1 * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
+            damping = damping if damping > 1e-14 else 0.0
+            continue
+        rejected, blocked = rejected + 1, blocked or new is None
+        damping = max(8.0 * damping, 1e-6)
+        if rejected > 20 or damping > 1e12:
+            # at this size of the gain rounding decides whether a step descends
+            settled = gain <= 1e3 * tolerance * at.value or at.value <= 1e4 * least
+            # what a descent creeps along without arriving is the border of the admissible set, also between refusals
+            reason = BORDER if blocked and not settled else "no step descends"
+            return Descent(x, at, count, settled, reason, start, not settled)
+    return Descent(x, at, iterations, False, f"{iterations} steps did not suffice", start)
+
+
+def _gain(root: Array, at: Linearised) -> float:
+    """By how much a full undamped step over the free unknowns would lower the sum of squares of the linear model."""
+    size = np.linalg.norm(root, axis=0)
+    used = root[:, size > 0] / size[size > 0]
+    basis, triangle = np.linalg.qr(used)
+    diagonal = np.abs(np.diag(triangle))
+    if diagonal.size and np.min(diagonal) <= 1e-12:  # columns that add no direction must not add their rounding
+        basis = np.linalg.svd(used, full_matrices=False)[0][:, : np.linalg.matrix_rank(triangle, tol=1e-12)]
+    return float(np.sum((basis.T @ at.pull) ** 2)) + at.reach - float(at.pull @ at.pull)
+
+
+def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iterations: int = STEPS, *,
+            enough: int | None = None) -> list[Descent]:
+    """Descend from every start; the best comes first, those that end at the border of stability last.
+
+    There they are no local optima: an unstable model would be better still.
+
+    Args:
+        criterion: the errors.
+        starts: (name, point) pairs; they may be estimated as they are asked for.
+        iterations: at most, for each.
+        enough: number of starts after which, when all of them ended at the same optimum and it leaves little of the
+            record unexplained, no more are asked for.
+    """
+    found: list[Descent] = []
+    for name, x in starts:
+        if criterion.admissible(x):
+            found.append(descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name))
+            found.sort(key=lambda one: (one.border, one.value))
+        if len(found) == enough and not any(one.border for one in found) and (
+                found[0].value <= EXPLAINED * criterion.energy):
+            if agreement(found, 1e-12 * criterion.energy)[0] == enough:
+                break
+    return found
+
+
+def agreement(found: Sequence[Descent], floor: float) -> tuple[int, str]:
+    """Return how many descents share the best value, and a sentence that says so."""
+    best = found[0]
+    same = [one for one in found if abs(one.value - best.value) <= AGREE * best.value + floor]
+    sentence = f"{len(same)} of {len(found)} starts arrive there ({', '.join(one.start for one in same)})"
+    out = [one for one in found if one.border and one not in same and one.value < best.value]
+    return len(same), sentence + (f"; {len(out)} with a smaller error end at the border of stability" if out else "")

@@ -1,0 +1,189 @@
+"""Starts of the plant: equation error, Steiglitz-McBride, refined instruments, subspace, perturbed poles.
+
+All of them give coefficients of a stable A; poles outside the unit circle are reflected into it. The numerators and
+nonlinearities that belong to a given A follow by a few steps in which A is held.
+"""
+
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.bases import Linear, fitted_bases
+from optid.data.record import Data
+from optid.errors import DataWarning, OptidError
+from optid.identify.prediction_error.descent import Descent, descend
+from optid.identify.prediction_error.transfer_errors import TransferErrors
+from optid.identify.subspace.methods import default_block_rows, project
+from optid.identify.subspace.realisation import realise
+from optid.models.layout import Layout
+from optid.models.roots import contained, roots_of
+from optid.statistics.expansion import expand
+from optid.statistics.regression import collect
+from optid.statistics.sensitivities import instruments
+from optid.statistics.unknowns import TransferPoint, TransferUnknowns
+from optid.structures.bilinear import minimise
+from optid.structures.rank_one import RankOne
+
+PASSES = 8
+"""Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""
+
+WIDE = 6
+"""Functions, over all inputs, up to which the subspace start is worth its cost."""
+
+RADIUS = 0.98
+"""Poles of a start lie inside this radius, so that its simulation forgets within the record."""
+
+
+def plant_starts(criterion: TransferErrors, count: int, seed: int) -> Iterator[tuple[str, Array]]:
+    """Yield starts one by one, each estimated when it is asked for: those of other methods first, then moved poles."""
+    at, na = criterion.unknowns.slices["a"], criterion.unknowns.layout.na
+    base = arx_start(criterion)
+    yield "ARX", base.x
+    done = 1
+    for name in ("Steiglitz-McBride", "instruments", "subspace"):
+        if done == count:
+            return
+        if name == "subspace":
+            a = _subspace(criterion.data, criterion.unknowns.layout)
+            one = None if a is None else with_poles(criterion, base.x, a, name)
+        else:
+            one = iterated(criterion, base.x, name)
+        if one is not None:
+            done += 1
+            yield name, one.x
+    rng = np.random.default_rng(seed)
+    for i in range(1, (count - done if na else 0) + 1):
+        yield f"perturbed {i}", with_poles(criterion, base.x, _perturbed(rng, base.x[at]), "").x
+
+
+def arx_start(criterion: TransferErrors) -> Descent:
+    """Return the model of the equation error with its poles contained, a guess where the rows do not suffice."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # rows lost here are not lost to the simulation error
+            point = equation_error(criterion.data, criterion.unknowns)
+    except OptidError:
+        point = _guess(criterion.unknowns)
+    x = criterion.normalised(criterion.unknowns.pack(point))
+    return with_poles(criterion, x, contained(point.a, RADIUS), "ARX")
+
+
+def equation_error(data: Data, unknowns: TransferUnknowns, noise: int = 0) -> TransferPoint:
+    """Return the rank-one least squares of the equation error (ARX).
+
+    Args:
+        data: the record, in the units of the unknowns.
+        unknowns: what is wanted; initial states are zero.
+        noise: lags of a last channel of the record that holds innovations, whose coefficients are those of C.
+
+    Raises:
+        StructureError, RankError: the record does not determine them.
+    """
+    layout = unknowns.layout
+    if noise:
+        layout = Layout(layout.na, (*layout.nb, noise), (*layout.nk, 1), fitted_bases(data, (*layout.bases, Linear())),
+                        layout.outputs, tuple(data.inputs))
+    root, n, na = collect(data, layout).root, layout.n_columns, layout.na
+    order = [*range(na), n - 1, *range(na, n - 1), n]  # vec Theta last
+    triangle = np.triu(np.linalg.qr(root[:, order], mode="r"))
+    triangle = triangle * np.where(np.diag(triangle) < 0, -1.0, 1.0)[:, None]
+    blocks = tuple((basis.size, nb) for basis, nb in zip(layout.bases, layout.nb))
+    point = minimise(RankOne(triangle[:n, :n], triangle[:n, n], float(triangle[n, n] ** 2), blocks, na + 1,
+                             float(np.sum(root[:, n] ** 2))), count=4).point
+    pairs = [(np.array(mu, dtype=float), np.ravel(np.array(b, dtype=float))) for mu, b in zip(point.mus, point.bs)]
+    c = pairs.pop() if noise else (np.ones(1), np.zeros(unknowns.nc))
+    pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
+    x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
+    return TransferPoint(a, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), float(point.w[na]), x0,
+                         contained(c[0][0] * c[1], RADIUS), a)
+
+
+def with_poles(criterion: TransferErrors, x: Array, a: Array, start: str) -> Descent:
+    """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
+    unknowns, moved = criterion.unknowns, x.copy()
+    moved[unknowns.slices["a"]] = a
+    held = np.zeros(unknowns.shared, dtype=bool)
+    held[unknowns.slices["a"]] = True
+    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3, start=start)
+
+
+def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
+    """Return the best point on the way of "Steiglitz-McBride" or of the refined instrumental variable ("instruments").
+
+    Both linearise as Gauss-Newton does in everything but a, whose columns hold the measured output: as regressors in
+    the first case, as regressors against simulated instruments in the second (Steiglitz and McBride 1965; Young 1976).
+    Neither descends by rule, so the best pass counts. None without poles.
+    """
+    unknowns = criterion.unknowns
+    p, na = unknowns.shared, unknowns.layout.na
+    at, best = unknowns.slices["a"], None
+    for _ in range(PASSES if na else 0):
+        gram = instruments(criterion.data, unknowns, unknowns.unpack(x), functions=criterion.functions)
+        regressors = np.arange(p)
+        regressors[at] = p + np.arange(na)
+        tested = regressors if method == "Steiglitz-McBride" else np.arange(p)
+        normal, right = gram[np.ix_(tested, regressors)], -gram[tested, -1]
+        rows = criterion.gauge_rows(x)
+        size = np.sqrt(np.maximum(np.diag(gram)[regressors], 1e-300))
+        system = np.vstack([normal / np.outer(size, size), rows])
+        step = np.linalg.lstsq(system, np.concatenate([right / size, np.zeros(len(rows))]), rcond=1e-12)[0] / size
+        x = x.copy()
+        x[:p] += step
+        if not np.all(np.isfinite(x)):
+            break
+        found = with_poles(criterion, x, contained(x[at], 0.9999), method)
+        settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
+        best = found if best is None or found.value < best.value else best
+        if settled:
+            break
+        x = found.x
+    return best
+
+
+def _subspace(data: Data, layout: Layout) -> Array | None:
+    """Return A from the subspace of the expanded inputs (past instruments); None where the record does not carry it.
+
+    Wide expansions are left out: their block Hankel matrices cost more than all other starts together.
+    """
+    if not layout.na or sum(basis.size for basis in layout.bases) > WIDE:
+        return None
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    try:
+        expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # as in `arx_start`
+            found = project(records, expansion, default_block_rows(records, expansion, layout.na), instruments="past")
+        poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
+    except (OptidError, np.linalg.LinAlgError):
+        return None
+    a = np.asarray(np.real(np.poly(poles))[1:], dtype=float)
+    return contained(a, RADIUS) if a.size == layout.na and np.all(np.isfinite(a)) else None
+
+
+def _guess(unknowns: TransferUnknowns) -> TransferPoint:
+    """Return a start without any estimate: real poles, identity-like nonlinearities."""
+    layout, mus = unknowns.layout, []
+    for basis, free in zip(layout.bases, unknowns.free):
+        points = basis.grid()
+        line = np.linalg.lstsq(basis.values(points), points - points.mean(), rcond=None)[0]
+        mus.append(line if free else np.ones(1))
+    bs = tuple(np.full(nb, 1 / np.sqrt(nb)) for nb in layout.nb)
+    a = np.asarray(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], dtype=float)
+    return TransferPoint(a, tuple(mus), bs, 0.0, np.zeros((unknowns.experiments, unknowns.memory)))
+
+
+def _perturbed(rng: np.random.Generator, a: Array) -> Array:
+    """Return coefficients of A with its poles moved: in turn nearby, or anywhere in the disc in conjugate pairs."""
+    roots = roots_of(contained(a, RADIUS))
+    if rng.random() < 0.5:
+        upper = roots[np.imag(roots) >= 0]
+        radius = 1 - np.clip((1 - np.abs(upper)) * np.exp(rng.normal(0, 1.0, upper.size)), 1 - RADIUS, 1.0)
+        angle = np.abs(np.angle(upper) + rng.normal(0, 0.1, upper.size))
+        moved = radius * np.exp(1j * np.where(np.imag(upper) > 0, angle, np.angle(upper)))
+        return np.real(np.poly(np.concatenate([moved, np.conj(moved[np.imag(upper) > 0])])))[1:]
+    pairs = len(a) // 2
+    moved = RADIUS * np.sqrt(rng.random(pairs)) * np.exp(1j * np.pi * rng.random(pairs) ** 2)
+    real = RADIUS * np.sqrt(rng.random(len(a) - 2 * pairs))
+    return np.real(np.poly(np.concatenate([moved, np.conj(moved), real])))[1:]

@@ -1,0 +1,203 @@
+"""From the optimum of a descent to a point that a back end confirms: programmes in the tangent of the iterate.
+
+Without constraints one programme at the optimum suffices. With constraints every step is a `Program`, which any back
+end for its class can solve: the linearised errors, the user's constraints in the tangent of the iterate, and, after a
+step that our own figures refuse, a quadratic damping term. Whatever the constraints, the last programme is undamped,
+posed at the final iterate, and solved by the back end that was asked for: that it offers no better point is what
+"locally optimal" means here.
+"""
+
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import StructureError
+from optid.identify.prediction_error.descent import STEPS, Descent
+from optid.identify.prediction_error.tangent_fit import TangentFit, violation
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.linearised import Linearised
+
+CONFIRMED = 1e-8
+"""Share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits
+it."""
+
+STALLED = 1e-5
+"""Share that counts as nothing where programme after programme promises as little: a curved boundary is followed."""
+
+INSIDE = 1e-6
+"""Relative violation up to which a point satisfies the constraints."""
+
+NOWHERE = 1e-9
+"""Relative violation that is rounding; a step to more than that pays for it."""
+
+PATIENCE = 5
+"""Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
+
+PARTS = 10
+"""Halvings of an undamped step that are tried where no damped one descends."""
+
+NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
+
+
+def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array) -> Procedure:
+    """Bring a descent to a point that a back end confirms, under the constraints of the programmes.
+
+    Args:
+        fit: its programmes.
+        found: the unconstrained optimum.
+        figures: what is known already; returned with the evidence.
+        x: where to start: the optimum, in the signs that the constraints ask for, or a point nearer to them.
+
+    Returns:
+        The evidence, or None where a programme has no point: its status says why.
+    """
+    here = _Iterate.of(fit, x)
+    figures = {**figures, "Gauss-Newton steps": found.steps}
+    if here.program.user_constraints:
+        return (yield from _constrained(fit, here, figures))
+    solution = yield here.program
+    if not solution.has_point:
+        return None
+    gain = here.at.value - here.at.after(fit.places.pack(solution.values) - here.x)
+    status, reason = _judged(solution, gain, here.at.value, fit.floor)
+    if not found.converged:
+        status, reason = Status.LIMIT, found.reason
+    return _evidence(fit, here, status, reason, {**figures, "programmes": 1})
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    x: Array
+    at: Linearised
+    program: Program
+    outside: float  # largest violation, relative
+    amount: float  # sum of the absolute violations of the user's constraints
+
+    @classmethod
+    def of(cls, fit: TangentFit, x: Array) -> "_Iterate":
+        x = fit.criterion.normalised(x)
+        at = fit.criterion.linearise(x)
+        program = fit.pose(x, at, 0.0)
+        if not program.user_constraints:
+            return cls(x, at, program, 0.0, 0.0)
+        outside = violation(program)
+        amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
+                     for group in program.user_constraints.values() for member in group)
+        return cls(x, at, program, outside, amount if outside > NOWHERE else 0.0)
+
+    def merit(self, weight: float) -> float:
+        return self.at.value + weight * self.amount
+
+
+def _reached(fit: TangentFit, x: Array) -> _Iterate | None:
+    """Return the iterate at x, None where it is inadmissible or its gauge cannot be reached."""
+    try:
+        return _Iterate.of(fit, x) if fit.criterion.admissible(x) else None
+    except StructureError:
+        return None
+
+
+def _constrained(fit: TangentFit, here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
+    """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
+    floor = fit.floor
+    previous: _Iterate | None = None
+    damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
+    entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
+    for count in range(1, STEPS + 1):
+        solution = yield here.program if not damping else fit.pose(here.x, here.at, damping)
+        if not solution.has_point:
+            if (solution.status is Status.INFEASIBLE and previous is None) or damping > 1e3:
+                return None
+            if solution.status is Status.INFEASIBLE and previous is not None:
+                here, previous = previous, None
+            damping = max(100.0 * damping, 1e-6)  # a nearer point, and a better conditioned programme
+            continue
+        reached = fit.places.pack(solution.values)
+        gain = here.at.value - here.at.after(reached - here.x)
+        weight = max(weight, 2.0 * _largest_dual(here.program, solution))
+        new = _reached(fit, reached)
+        idle += not damping and abs(gain) <= STALLED * here.at.value
+        share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
+        last = abs(gain) if not damping else last
+        if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:
+            status, reason = _judged(solution, gain, here.at.value, floor, share)
+            best = here if new is None or new.outside > INSIDE else new
+            return _evidence(fit, best, status, reason, {**figures, "programmes": count + more})
+        expected = gain + weight * here.amount
+        fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
+        if new is not None and (not entered or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
+            previous, here, growth = here, new, 4.0
+            entered = entered or new.outside <= INSIDE
+            damping *= 0.1 if fall > 0.5 * expected else 1.0
+        else:
+            damping, growth = max(growth * damping, 1e-7), 2.0 * growth
+            if damping > 1e10:
+                shorter, more = (yield from _shortened(fit, here, weight)), more + 1
+                if shorter is not None:
+                    previous, here, damping, growth = here, shorter, 0.0, 4.0
+                    entered = entered or here.outside <= INSIDE
+                    continue
+                reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
+                return (yield from _ended(fit, here, reason, {**figures, "programmes": count + more + 1}))
+        if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
+            damping = 0.0  # only an undamped programme can confirm
+    reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
+              "value")
+    return (yield from _ended(fit, here, reason, {**figures, "programmes": STEPS + more + 1}))
+
+
+def _shortened(fit: TangentFit, here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
+    """Take a part of the undamped step: however damped, programmes end on a boundary that may be curved outwards.
+
+    A part of the way there is off it, where the point to start from is.
+    """
+    solution = yield here.program
+    if not solution.has_point:
+        return None
+    step = fit.places.pack(solution.values) - here.x
+    for part in 0.5 ** np.arange(1, PARTS + 1):
+        new = _reached(fit, here.x + part * step)
+        gain = here.at.value - here.at.after(part * step)
+        if new is not None and gain > 0 and here.merit(weight) - new.merit(weight) >= 1e-3 * gain:
+            return new
+    return None
+
+
+def _ended(fit: TangentFit, here: _Iterate, reason: str, figures: Mapping[str, Any]) -> Procedure:
+    """Judge where the steps ended by one more undamped programme; it may promise what a curved boundary does."""
+    solution = yield here.program
+    floor = fit.floor
+    if not solution.has_point or here.outside > INSIDE:
+        return _evidence(fit, here, Status.LIMIT, reason, figures)
+    gain = here.at.value - here.at.after(fit.places.pack(solution.values) - here.x)
+    if abs(gain) > STALLED * here.at.value + floor:
+        return _evidence(fit, here, Status.LIMIT, reason, figures)
+    return _evidence(fit, here, *_judged(solution, gain, here.at.value, floor, STALLED), figures)
+
+
+def _judged(solution: Solution, gain: float, value: float, floor: float, share: float = CONFIRMED
+            ) -> tuple[Status, str]:
+    """What a back end's answer to the last programme makes of its reference: it must have been solved, and stay."""
+    if solution.status not in (Status.OPTIMAL, Status.LOCAL):
+        return solution.status, solution.reason
+    if abs(gain) > share * value + floor:
+        return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
+                                   f"{abs(gain) / max(value, 1e-300):.0e} of its value")
+    return Status.LOCAL, ""
+
+
+def _evidence(fit: TangentFit, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
+    unknown = NO_BOUND.format(fit.criterion.errors)
+    bound = Bound.none(unknown)
+    reason = unknown if status is Status.LOCAL else reason
+    return Evidence(fit.model(here.x), fit.criterion.unit * here.at.value, bound, status, reason, figures)
+
+
+def _largest_dual(program: Program, solution: Solution) -> float:
+    return max((float(np.max(np.abs(solution.duals[name]), initial=0.0)) for name in program.user_constraints
+                if name in solution.duals), default=0.0)

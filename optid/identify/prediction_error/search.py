@@ -1,0 +1,120 @@
+"""The search for the best optimum of a transfer-function model, and the entry into constraints from there."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import RankError
+from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend
+from optid.identify.prediction_error.plant_starts import with_poles
+from optid.identify.prediction_error.tangent_fit import TangentFit, violation
+from optid.identify.prediction_error.transfer_errors import TransferErrors
+from optid.models.roots import contained
+from optid.statistics.linearised import Linearised
+
+SEARCH = 5_000
+"""Samples, from the middle of the record, on which starts are compared; the winner descends on the whole record."""
+
+SUFFICIENT = 3
+"""Starts of different methods that may make further ones unnecessary without a noise filter, see `descent.best_of`."""
+
+PULLS = (1.0, 0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
+"""Radii tried to bring the poles of a start into the region of the constraints."""
+
+ENTRIES = 3
+"""Different optima from which the constrained iteration may start."""
+
+
+def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterable[tuple[str, Array]]]
+           ) -> tuple[Descent, list[Descent], dict[str, Any]]:
+    """Descend from every start and return the best optimum, the other ones, and the figures of the comparison.
+
+    On long records the starts are compared on a part, and the winner descends on the whole.
+
+    Args:
+        criterion: the errors.
+        starts: criterion -> named starts.
+
+    Raises:
+        RankError: no start has a stable predictor.
+    """
+    part = _part(criterion)
+    found = best_of(part, starts(part), enough=SUFFICIENT if criterion.unknowns.plain else None)
+    if not found:
+        raise RankError(f"no start has a stable {'simulation' if criterion.unknowns.plain else 'predictor'}; use other "
+                        "orders")
+    agreed, sentence = agreement(found, 1e-12 * part.energy)
+    best = found[0]
+    x = np.zeros(criterion.unknowns.size)
+    x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
+    final = descend(criterion, best.x if part is criterion else x, start=best.start)
+    figures: dict[str, Any] = {"starts": sentence}
+    if not criterion.unknowns.plain:
+        figures["starts that agree"] = agreed
+    figures[f"{criterion.errors} of the starts"] = criterion.unit * np.array(
+        sorted((one.value for one in found), reverse=True))
+    others = [one for one in found[1:] if abs(one.value - best.value) > 1e-3 * best.value] if part is criterion else []
+    return replace(final, steps=final.steps + best.steps), others, figures
+
+
+def _part(criterion: TransferErrors) -> TransferErrors:
+    """The middle of a long record, or the record itself where it is short or the middle is mostly missing."""
+    data = criterion.data
+    if data.n_samples <= 2 * SEARCH:
+        return criterion
+    longest = int(np.argmax([e.n_samples for e in data.experiments]))
+    size = data.experiments[longest].n_samples
+    if size < SEARCH:  # many short experiments
+        kept, total = [], 0
+        for i, e in enumerate(data.experiments):
+            if total < SEARCH:
+                kept, total = [*kept, i], total + e.n_samples
+        cut = data.select(experiments=kept)
+    else:
+        first = (size - SEARCH) // 2
+        cut = data.select(experiments=[longest]).window(first, first + SEARCH)
+    if 2 * _complete(cut) < _complete(data):
+        return criterion
+    return replace(criterion, data=cut, unknowns=replace(criterion.unknowns, experiments=cut.n_experiments))
+
+
+def _complete(data: Data) -> float:
+    """Share of the samples of which no channel is missing."""
+    return float(np.mean(np.concatenate([np.isfinite(np.hstack([e.u, e.y])).all(axis=1) for e in data.experiments])))
+
+
+def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
+    """Return where to start under the constraints: the best of the optima whose poles are pulled into the region.
+
+    What belongs to the pulled poles is estimated anew; without constraints on the poles alone they stay.
+
+    Args:
+        fit: the programmes.
+        criterion: the errors.
+        found: optima, the best first.
+    """
+    if not fit.constraints:
+        return fit.signed(found[0].x)
+    at, ends = criterion.unknowns.slices["a"], []
+    for one in found[:ENTRIES]:
+        x = fit.signed(one.x)
+        for radius in PULLS:
+            pulled = x[at] if radius == 1.0 else contained(x[at], radius)
+            if _poles_obey(fit, np.concatenate([pulled, x[at.stop :]]), one.at):
+                again = one if radius == 1.0 else with_poles(replace(criterion, gauge="norm"), x, pulled, one.start)
+                ends.append((again.value, again.x))
+                break
+    return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
+
+
+def _poles_obey(fit: TangentFit, x: Array, at: Linearised) -> bool:
+    """Whether the constraints on a alone hold at the A of x."""
+    program = fit.pose(x, at, 0.0)
+    a = program.variables.get("a")
+    others = [name for name, group in program.user_constraints.items()
+              if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
+    return violation(program.without(*others, "residual", "gauge")) <= 1e-9

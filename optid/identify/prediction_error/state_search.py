@@ -1,0 +1,183 @@
+"""The search for the best optimum of a state-space model, the errors weighted by their own covariance."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.certificate.simulation_bound import simulation_bound
+from optid.errors import DataError, DataWarning, StructureError
+from optid.identify.noise import with_noise
+from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
+from optid.identify.prediction_error.state_errors import StateErrors
+from optid.models import HammersteinSS, NoiseCovariances
+from optid.models.balancing import balancing
+from optid.models.roots import spectral_radius
+from optid.program.solution import Status
+from optid.solving.solve import Evidence, Procedure
+
+ROUNDS = 10
+"""Times the errors are weighted anew at most."""
+
+SAME_WEIGHT = 1e-4
+FINALISTS = 2
+
+RADII = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
+"""Spectral radii tried to make a start stable."""
+
+
+def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: str, iterations: int = STEPS
+                  ) -> tuple[StateErrors, Descent, dict[str, Any]]:
+    """Descend from every start, then weight the errors anew until the weights stay; the best end wins.
+
+    With the determinant every start is weighted by its own errors from the first step on: weights from the outputs
+    lead a third of short records to a zero of the noise on the unit circle, from where no step leads back.
+
+    Args:
+        errors: weighted by the variances of the outputs.
+        starts: admissible starts by name.
+        weighting: "scale" (keep the weights), "variance", "determinant", or "auto": "determinant" for prediction,
+            "variance" for simulation.
+        iterations: of a descent at most.
+
+    Returns:
+        The errors as weighted at last, the best optimum, and the figures of the comparison.
+    """
+    if errors.unknowns.l == 1:
+        weighting = "scale"  # one output has nothing to be weighed against
+    elif weighting == "auto":
+        weighting = "determinant" if errors.unknowns.innovations else "variance"
+    full = weighting == "determinant"
+    if full:
+        weighted = [_weighted(errors, name, x, weighting, iterations) for name, x in starts.items()]
+        found = [one for _, one in weighted]
+        values = np.array([errors.value(one.x) for one in found])
+        sizes = np.array([own.level(one.x, full) for own, one in weighted])
+        smallest = sizes <= sizes.min() + AGREE * errors.unknowns.l
+    else:
+        found = best_of(errors, starts.items(), iterations)
+        values = np.array([one.value for one in found])
+        levels = [errors.level(one.x) if weighting != "scale" else one.value for one in found]
+        order = sorted(range(len(found)), key=lambda i: (found[i].border, levels[i]))
+        weighted = [_weighted(errors, found[i].start, found[i].x, weighting, iterations, found[i].steps)
+                    for i in order[:FINALISTS]]
+        smallest = values <= (1 + AGREE) * values.min() + 1e-14 * errors.energy
+    ends = [(own.level(one.x, full) if weighting != "scale" else one.value, own, one) for own, one in weighted]
+    _, final, best = min(ends, key=lambda end: (end[2].border, end[0]))
+    agreed = [one.start for one, same in zip(found, smallest) if same]
+    figures = {"starts": f"{len(agreed)} of {len(found)} starts arrive at the smallest error ({', '.join(agreed)})",
+               "starts that agree": len(agreed), "errors of the starts": np.sort(values)[::-1]}
+    return final, best, figures
+
+
+def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterations: int, steps: int = 0
+              ) -> tuple[StateErrors, Descent]:
+    """Descend, the errors weighted by their own (co)variance until it stays; steps taken before are counted."""
+    if weighting == "scale":
+        one = descend(errors, x, iterations=iterations, start=start)
+        return errors, replace(one, steps=steps + one.steps)
+    for _ in range(ROUNDS):
+        new = errors.reweighted(x, full=weighting == "determinant")
+        change = np.linalg.norm(new.weight - errors.weight) / np.linalg.norm(new.weight)
+        errors = new
+        one = descend(errors, x, iterations=iterations, start=start)
+        x, steps = one.x, steps + one.steps
+        if change < SAME_WEIGHT:
+            break
+    return errors, replace(one, steps=steps)
+
+
+def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
+    """Return an admissible vector of unknowns near a model; None without one.
+
+    A model whose state is not carried stably is contracted; the initial states are those that fit best.
+    """
+    point = errors.point_of(_balanced(errors, model))
+    still, largest = np.zeros_like(point.K), spectral_radius(point.A)
+    candidates = [point, *([replace(point, K=still)] if errors.unknowns.innovations else []),
+                  *(replace(point, A=point.A * (radius / max(largest, radius)), K=still) for radius in RADII)]
+    for candidate in candidates:
+        x = errors.normalised(errors.unknowns.pack(candidate))
+        if not errors.admissible(x):
+            continue
+        try:
+            at = errors.linearise(x)
+        except (DataError, np.linalg.LinAlgError):
+            continue
+        if np.isfinite(at.value):
+            p = errors.unknowns.shared
+            x[p:] += at.follow(np.zeros(p))
+            return x
+    return None
+
+
+def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
+    """Balance the states for the signals and weights of the fit, so that all entries of A are of one size.
+
+    A model without balanced states stays as it is.
+    """
+    data = errors.data
+    f = model.expanded(np.vstack([e.u for e in data.experiments]))
+    y = np.vstack([e.y for e in data.experiments])
+    g = [np.nanstd(function(y[:, o])) for function, o in zip(model.feedback, model.output_of)]
+    driven = np.hstack([model.B * f.std(axis=0), model.E * np.array(g)])
+    try:
+        return model.transformed(balancing(model.A, driven, np.linalg.cholesky(errors.weight).T @ model.C))
+    except StructureError:
+        return model
+
+
+def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
+    """Add the noise model, and the Hankel bound to a simulation error with one weight per output.
+
+    Args:
+        evidence: of a fit.
+        errors: as they were weighted at last.
+        unit: what one squared unit of the outputs is in units of the record.
+    """
+    weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
+    model, remarks = _with_noise(evidence.model, errors)
+    bound = evidence.bound
+    if not unknowns.innovations and not np.any(weight - np.diag(np.diag(weight))):
+        records = [np.hstack([e.u, e.y]) for e in errors.data.experiments]
+        bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
+                                 2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
+                                 "starts are compared")
+        reason = bound.reason if evidence.status is Status.LOCAL else reason
+    figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
+    return replace(evidence, model=model, bound=bound, reason=reason, figures=figures)
+
+
+def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
+    """Add the covariances of the noise: with K as it was fitted, or with one estimated from the simulation errors.
+
+    The figure besides says why there is no noise model where there is none.
+    """
+    data = errors.data
+    try:
+        if not errors.unknowns.innovations:
+            return with_noise(model, data), {}
+        found: Any = model.predict(data)
+        predicted: Sequence[Array] = found if isinstance(found, tuple) else [found]
+        rest = np.vstack([e.y for e in data.experiments]) - np.vstack(predicted)
+        rest = rest[~np.isnan(rest).any(axis=1)]
+        covariance = rest.T @ rest / max(len(rest), 1)
+        return replace(model, noise=NoiseCovariances.of_innovations(model.K, covariance)), {}
+    except StructureError as reason:
+        return model, {"noise model": f"none: {reason}"}
+
+
+def quietly(procedure: Procedure) -> Procedure:
+    """Run a procedure that only provides a start: its warnings are about an answer nobody sees."""
+    answer: Any = None
+    while True:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            try:
+                program = procedure.send(answer)
+            except StopIteration as stop:
+                return stop.value
+        answer = yield program

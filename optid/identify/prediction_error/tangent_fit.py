@@ -1,0 +1,200 @@
+"""What a formulation hands to the iteration: named variables, the programme of a step, and the model of its values."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from optid.arrays import Array
+from optid.identify.prediction_error.descent import Criterion
+from optid.models.gauges import leading_sign
+from optid.program.judging import measure_violation
+from optid.program.program import Program, Values
+from optid.statistics.linearised import Linearised
+from optid.statistics.unknowns import Unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Named variables, and where each stands in the vector of the unknowns.
+
+    Attributes:
+        unknowns: the order of the vector.
+        names: {variable: part of the vector}, in its order; "x0" is the initial states.
+    """
+
+    unknowns: Unknowns
+    names: Mapping[str, str]
+
+    @classmethod
+    def of(cls, unknowns: Unknowns, name: Callable[[str, int], str]) -> "Places":
+        """Name the parts; ``name`` gives the variable of a part such as "mu" with its number."""
+        found = {}
+        for part, shape in unknowns.shapes.items():
+            kind = part.rstrip("0123456789")
+            if np.prod(shape):
+                found[part if kind == part else name(kind, int(part[len(kind) :]))] = part
+        return cls(unknowns, {**found, "x0": "x0"} if unknowns.memory else found)
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Name the parts of x; initial states are (n,), or (n, experiments)."""
+        unknowns, parts = self.unknowns, self.unknowns.parts(x)
+        states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.memory).T
+        parts["x0"] = states if unknowns.experiments > 1 else states[:, 0]
+        return {name: parts[part] for name, part in self.names.items()}
+
+    def pack(self, values: Mapping[str, Array]) -> Array:
+        """Return x of named values."""
+        return np.concatenate([np.ravel(values[name], order="F" if part == "x0" else "C")
+                               for name, part in self.names.items()]).astype(float)
+
+    def variables(self) -> dict[str, cp.Variable]:
+        """Return new CVXPY variables."""
+        return {name: cp.Variable(value.shape, name=name)
+                for name, value in self.values(np.zeros(self.unknowns.size)).items()}
+
+    def stacked(self, variables: Mapping[str, cp.Variable]) -> cp.Expression:
+        """Return the variables as the vector of the unknowns."""
+        return cp.hstack([variables[name] if variables[name].ndim == 1 else
+                          cp.vec(variables[name], order="F" if part == "x0" else "C")
+                          for name, part in self.names.items()])
+
+
+@dataclass(frozen=True, eq=False)
+class TangentFit(ABC):
+    """A fit by programmes in the tangent of an iterate; a formulation states the programme and its model.
+
+    Attributes:
+        name: of the formulation.
+        criterion: the errors, in the gauge of the programmes.
+        constraints: the user's.
+    """
+
+    name: str
+    criterion: Criterion
+    constraints: tuple[Any, ...]
+
+    @abstractmethod
+    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+        """State the programme of the step from z0, with the user's constraints; ``at`` are the errors near z0."""
+
+    @abstractmethod
+    def recover(self, values: Values) -> Any:
+        """Return the model of the values of the variables."""
+
+    @cached_property
+    def places(self) -> Places:
+        """The named variables in the order of the unknowns."""
+        return Places.of(self.criterion.unknowns, self.criterion.key)
+
+    @property
+    def floor(self) -> float:
+        """Sum of squares below which differences are rounding."""
+        return 1e-14 * self.criterion.energy
+
+    def model(self, x: Array) -> Any:
+        """Return the model of x."""
+        return self.recover(self.places.values(x))
+
+    def signed(self, x: Array) -> Array:
+        """Turn the signs of mu and b to where the constraints are violated least.
+
+        A monotone f or a sign of the gain says which of the two equal descriptions is meant; where it asks for the
+        opposite characteristic, mu or b alone is turned, since no tangent step leads through zero.
+        """
+        x, at = self.criterion.normalised(x), self.criterion.unknowns.slices
+        errors = self.criterion.linearise(x) if self.constraints else None
+        for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
+            if not mu.startswith("mu"):  # the signs of feedback functions stay
+                continue
+            best, chosen = np.inf, x
+            first = leading_sign(x[at[b]])
+            for mu_sign, b_sign in ((first, first), (-first, -first), (-first, first), (first, -first)):
+                turned = np.array(x)
+                turned[at[mu]] *= mu_sign
+                turned[at[b]] *= b_sign
+                outside = 0.0 if errors is None else violation(self.pose(turned, errors, 0.0))
+                if outside < (best if mu_sign == b_sign else 0.5 * best):
+                    best, chosen = outside, turned
+                if best <= 1e-9:
+                    break
+            x = chosen
+        return x
+
+
+def violation(program: Program) -> float:
+    """Return the largest relative violation of the constraints at the iterate of a programme."""
+    program.assign(program.view.reference)
+    return measure_violation(program)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """``‖root z - target‖² + remainder``; ``scale`` is the energy against which a vanishing value is judged."""
+
+    root: Array
+    target: Array
+    remainder: float
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorRows:
+    """The triangular factor ``root`` (n + 1, n + 1) of [sensitivities | errors], and the rows it came from."""
+
+    root: Array
+    rows: int
+    candidates: int
+    condition: float
+    method: str
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedErrors:
+    """The compressed errors near an iterate, for uncertainty, prices and figures.
+
+    Attributes:
+        at: the errors near the iterate.
+        places: where the variables stand in the flattened variables z.
+        reference: (n,) z of the iterate.
+        energy: (1,) sum of squares of the output about its mean.
+        candidates: samples of the record.
+    """
+
+    at: Linearised
+    places: Places
+    reference: Array
+    energy: Array
+    candidates: int
+
+    @cached_property
+    def problem(self) -> LeastSquares:
+        """The sum of squares in z."""
+        root, errors = self.at.whole
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder, float(self.energy[0]))
+
+    @cached_property
+    def statistics(self) -> ErrorRows:
+        """The same as a factor of rows."""
+        size = len(self.reference)
+        root = np.zeros((size + 1, size + 1))
+        root[:size, :size], root[:size, size] = self.problem.root, self.problem.target
+        root[size, size] = np.sqrt(self.problem.remainder)
+        return ErrorRows(root, self.at.rows, self.candidates, self.at.condition, self.at.method)
+
+    def lifted(self, values: Mapping[str, Array]) -> Array:
+        """Return z."""
+        return self.places.pack(values)
+
+    def regression(self, values: Mapping[str, Array]) -> Array:
+        """Return the coefficients (n, 1) of the columns."""
+        return self.lifted(values)[:, None]
+
+    def one_step_fit(self, values: Mapping[str, Array]) -> Array:
+        """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
+        value = self.at.after(self.lifted(values) - self.reference)
+        return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))

@@ -1,0 +1,141 @@
+"""The unknowns of a fit as one vector: parts that all experiments share, then an initial state per experiment."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.models.layout import Layout
+
+
+class Unknowns:
+    """Where every part stands in the vector x; a subclass names the parts.
+
+    Attributes:
+        experiments: number of experiments.
+        memory: size of an initial state.
+        shapes: shape of every shared part in the order of x.
+    """
+
+    experiments: int
+    memory: int
+    shapes: dict[str, tuple[int, ...]]
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where every shared part stands in x; matrices row by row."""
+        found, position = {}, 0
+        for name, shape in self.shapes.items():
+            found[name] = slice(position, position + int(np.prod(shape)))
+            position = found[name].stop
+        return found
+
+    @cached_property
+    def shared(self) -> int:
+        """Number of unknowns that all experiments share: the first entries of x."""
+        return max((at.stop for at in self.slices.values()), default=0)
+
+    @cached_property
+    def products(self) -> tuple[tuple[str, str], ...]:
+        """Parts (mu, b) of free inputs, and (nu, e) of feedback, of which the output shows the product alone."""
+        partner = {"mu": "b", "nu": "e"}
+        return tuple((part, partner[part[:2]] + part[2:]) for part, at in self.slices.items()
+                     if part[:2] in partner and at.stop > at.start)
+
+    def parts(self, x: Array) -> dict[str, Array]:
+        """Return the shared parts of x in their shapes."""
+        return {name: x[at].reshape(self.shapes[name]) for name, at in self.slices.items()}
+
+    @property
+    def size(self) -> int:
+        """Length of x."""
+        return self.shared + self.experiments * self.memory
+
+
+@dataclass(frozen=True, eq=False)
+class TransferPoint:
+    """Values of the unknowns of a transfer-function model.
+
+    Attributes:
+        a: (na,) coefficients of A.
+        mus: (P_c,) coefficients of f_c, one array per input.
+        bs: (nb_c,) coefficients of B_c, one array per input.
+        offset: constant of the equation.
+        x0: (E, n) what the past of every experiment adds to its first n equations.
+        c: (nc,) coefficients of C.
+        d: (nd,) coefficients of D; A where D is A.
+    """
+
+    a: Array
+    mus: tuple[Array, ...]
+    bs: tuple[Array, ...]
+    offset: float
+    x0: Array
+    c: Array = field(default_factory=lambda: np.zeros(0))
+    d: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class TransferUnknowns(Unknowns):
+    """The unknowns of ``A x = sum_c B_c f_c(u_c) + d, y = x + (C/D) e``: [a; mu0; b0; mu1; ...; offset; c; d; x0].
+
+    Attributes:
+        layout: orders and bases of the plant; one output.
+        experiments: number of experiments.
+        free: whether the coefficients of every nonlinearity are unknown; where not, mu is one (`Linear`).
+        constant: whether the offset is unknown; where not, it is zero.
+        nc: order of C.
+        nd: order of D; None where D is A (ARX, ARMAX). Then there are no initial states among the unknowns.
+    """
+
+    layout: Layout
+    experiments: int
+    free: tuple[bool, ...]
+    constant: bool = True
+    nc: int = 0
+    nd: int | None = 0
+
+    @property
+    def apart(self) -> bool:
+        """Whether the noise has poles of its own, or none."""
+        return self.nd is not None
+
+    @property
+    def plain(self) -> bool:
+        """Whether there is no noise filter: C = D = 1."""
+        return self.nc == 0 and self.nd == 0
+
+    @property
+    def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Size n of an initial state among the unknowns."""
+        return self.layout.first_row if self.apart else 0
+
+    @property
+    def skipped(self) -> int:
+        """First samples of a record whose innovation counts as zero."""
+        return 0 if self.apart else self.layout.first_row
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Sizes of "a", "mu0", "b0", "mu1", ..., "offset", "c" and "d"; zero where a part is not unknown."""
+        parts = {"a": self.layout.na}
+        for c, (basis, nb) in enumerate(zip(self.layout.bases, self.layout.nb)):
+            parts |= {f"mu{c}": basis.size if self.free[c] else 0, f"b{c}": nb}
+        parts |= {"offset": int(self.constant), "c": self.nc, "d": self.nd or 0}
+        return {name: (size,) for name, size in parts.items()}
+
+    def pack(self, point: TransferPoint) -> Array:
+        """Return x of a point."""
+        parts = {"a": point.a, "offset": np.full(1, point.offset), "c": point.c, "d": point.d,
+                 **{f"mu{c}": mu for c, mu in enumerate(point.mus)}, **{f"b{c}": b for c, b in enumerate(point.bs)}}
+        shared = [parts[name][: shape[0]] for name, shape in self.shapes.items()]
+        return np.concatenate([*shared, point.x0.ravel()[: self.experiments * self.memory]]).astype(float)
+
+    def unpack(self, x: Array) -> TransferPoint:
+        """Return the point of x."""
+        part, inputs = self.parts(x), range(self.layout.m)
+        return TransferPoint(
+            part["a"], tuple(part[f"mu{c}"] if self.free[c] else np.ones(1) for c in inputs),
+            tuple(part[f"b{c}"] for c in inputs), float(np.sum(part["offset"])),
+            x[self.shared :].reshape(self.experiments, self.memory), part["c"], part["d"] if self.apart else part["a"])
