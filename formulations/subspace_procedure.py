@@ -14,8 +14,8 @@ from formulations.simulation_bound import simulation_bound
 from formulations.state_models import state_model
 from formulations.subspace_plan import BEST, Plan
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.imputation import count_windows, impute
-from optid.identify.subspace.innovations import model_innovations
 from optid.identify.subspace.methods import (
     Projection,
     check_order,
@@ -141,7 +141,7 @@ def completed(plan: Plan, records: list[np.ndarray], expansion: Expansion, gamma
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
     model = _model(plan, step, realisation.factors(solution.values))
-    model, remark = model_innovations(model, data)
+    model, remark = with_noise_or_reason(model, data)
     figures |= _ratios(step)
     if remark:
         figures["noise model"] = remark
@@ -210,7 +210,7 @@ def _estimated(plan: Plan, expansion: Expansion, alpha: int, records: list[np.nd
         projection = _projected(plan, records, expansion, alpha, instruments)
         nx, _ = _order(plan, projection, records, expansion)
         model = preliminary(plan, records, expansion, projection.gamma(nx), projection.scale)
-        return model_innovations(model, plan.data)[0]
+        return with_noise_or_reason(model, plan.data)[0]
 
 
 def _projected(plan: Plan, records: list[np.ndarray], expansion: Expansion, alpha: int, instruments: str

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import between_gaps, runs_of
-from optid.errors import StructureError
-from optid.identify.subspace.innovations import innovation_form
+from optid.errors import DataError, StructureError
+from optid.identify.innovations import innovation_form, regression_lags
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.models.innovation_gain import (
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-10
 """Residuals below this share of the outputs are rounding: there is no noise to describe."""
+
+EXACT = 1e-8
+"""Prediction errors relative to the outputs below which a record shows no noise model."""
 
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
@@ -76,6 +79,27 @@ def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
     """Return the model with the gain and the noise covariances that a record shows, see `estimate_noise`."""
     found = estimate_noise(model, data)
     return replace(model, K=found.K, noise=found.covariances)
+
+
+def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
+    """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
+
+    Args:
+        model: a model in the units of the data.
+        data: the record it was identified on.
+    """
+    outputs = [e.y for e in data.experiments]
+    try:
+        regression_lags([np.count_nonzero(~np.isnan(y)) // model.l for y in outputs], model.nx, model.l)
+        found = with_noise(model, data)
+    except (StructureError, DataError) as reason:
+        return model, f"none: {reason}"
+    except np.linalg.LinAlgError:
+        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
+    spread = np.nanstd(np.concatenate(outputs), axis=0)
+    if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
+        return model, "none: the prediction errors vanish, there is no noise to model"
+    return found, ""
 
 
 def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:

@@ -27,11 +27,8 @@ Expand = Callable[[Array], Array]
 CHUNK = 8192
 """Samples expanded at a time."""
 
-NARROW = 8
-"""Signals up to which a compiled loop is faster than one matrix product per lag."""
-
-SHORT = 5000
-"""Samples up to which it would not make up for its import."""
+WIDE = 128
+"""Signals times samples of the blocks whose products are taken at once."""
 
 FORMED = 2048
 """Windows formed at once where that is the cheapest way."""
@@ -285,15 +282,17 @@ class _Sums:
         """Add the products of the first `count` samples with those up to rows - 1 samples later."""
         part = signals[:count]
         self._total += np.ones(count) @ part
-        if self.d <= NARROW and count > SHORT:
-            from optid.statistics.subspace_kernels import window_products
-
-            found = np.zeros((self.d, self.rows * self.d))
-            window_products(signals.reshape(-1), count, self.d, found)
-            self._middle += found.reshape(self.d, self.rows, self.d).transpose(1, 0, 2)
-            return
-        for lag in range(self.rows):
-            self._middle[lag] += part.T @ signals[lag : lag + count]
+        rows, d = self.rows, self.d
+        step = min(rows, max(1, WIDE // d))  # samples of a block: large products are fast, the diagonals are added up
+        following = -(-(rows - 1) // step)  # blocks that the largest lag reaches
+        blocks = max((count + rows - 1) // step - following, 0)
+        views = [signals[i * step : (i + blocks) * step].reshape(blocks, step * d) for i in range(following + 1)]
+        products = np.concatenate([(views[0].T @ view).reshape(step, d, step, d) for view in views], axis=2)
+        found = sum((products[i, :, i : i + rows] for i in range(step)), np.zeros((d, rows, d)))
+        if blocks * step < count:
+            rest = windows_of(signals[blocks * step : count + rows - 1], rows).reshape(-1, rows * d)
+            found += (part[blocks * step :].T @ rest).reshape(d, rows, d)
+        self._middle += found.transpose(1, 0, 2)
 
     def gram(self) -> Array:
         """Return the Gram matrix of [1; window], symmetric."""

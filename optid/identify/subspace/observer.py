@@ -22,6 +22,7 @@ from optid.errors import RankError
 from optid.statistics.expansion import Expansion
 from optid.statistics.factors import add_to_root, conditioning, root_of_gram
 from optid.statistics.hankel import CONDITION_LIMIT
+from optid.statistics.responses import adjoint_responses
 from optid.structures.rank_one import RankOne
 
 CHUNK = 4096
@@ -190,7 +191,7 @@ def observer_problem(
     for e, record in enumerate(records):
         y = record[:, regressors.y] if targets is None else targets[e]
         candidates += y.size
-        for i, (start, stop) in enumerate(_runs(record, regressors.needed)):
+        for i, (start, stop) in enumerate(runs_of(~np.isnan(record[:, regressors.needed]).any(axis=1))):
             part, used, squares = regressors.compress(record[start:stop], y[start:stop])
             rows += used
             energy += squares
@@ -204,24 +205,14 @@ def observer_problem(
     if rows < form.size + extra:
         raise RankError(f"{rows} equations for {form.size + extra} unknowns of the step for B, D and x0: use a longer "
                         "record, fewer basis functions or a lower order.")
-    feeds, states = regressors.feeds, form.experiments * form.n
     if extra:  # the equations seen through the instruments: what lies outside them is dropped
-        seen = total - feeds
-        keep = np.r_[: seen - feeds, seen:total, total]
-        system = root[:seen][:, keep]
-    else:
-        system = root
-    turned = system[:, :-1] @ regressors.turn(states)
-    triangle = np.triu(np.linalg.qr(np.column_stack([turned, system[:, -1]]), mode="r"))
+        seen = total - regressors.feeds
+        root = root[:seen, np.r_[: seen - regressors.feeds, seen : total + 1]]
+    triangle = np.triu(np.linalg.qr(root[:, [*regressors.columns(form.experiments * form.n), -1]], mode="r"))
     size = form.size
     remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
     problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear, energy)
     return ObserverProblem(form, problem, rows, candidates, bool(extra))
-
-
-def _runs(record: Array, needed: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the first and last (exclusive) sample of every stretch in which the channels needed are complete."""
-    return runs_of(~np.isnan(record[:, needed]).any(axis=1))
 
 
 class _Regressors:
@@ -237,10 +228,8 @@ class _Regressors:
         self.common = form.l * form.offset + form.l * x.p + form.n * x.p + self.feeds
         self.needed = np.zeros(x.m + x.l * (1 + x.simulated), dtype=bool)
         self.needed[: x.m] = True
-        if x.q or self.injected:
-            self.needed[self.y] = True
-        if instruments:
-            self.needed[x.m + x.l :] = True
+        self.needed[self.y] = x.q > 0 or self.injected
+        self.needed[x.m + x.l :] = instruments
 
     def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
         """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy.
@@ -258,34 +247,28 @@ class _Regressors:
 
     def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
         """Yield the weighted rows of a run with their target, some samples of one output at a time."""
-        from optid.statistics.subspace_kernels import adjoint_responses
-
-        form = self.form
-        inner, state = np.ascontiguousarray(form.a - form.gain @ form.c), None
-        for start in range(0, len(run), self.chunk):
-            raw, y = run[start : start + self.chunk], target[start : start + self.chunk]
-            signals = self._signals(raw)
-            if state is None:
-                state = np.zeros((form.l, signals.shape[1], form.n))
-                state[:, 0] = form.c  # C_o F^k, the effect of x0
-            out = np.empty((len(raw), *state.shape))
-            adjoint_responses(inner, np.array(form.c), np.ascontiguousarray(signals), state, out)
+        form, starts = self.form, range(0, len(run), self.chunk)
+        parts = (self._signals(run[start : start + self.chunk]) for start in starts)
+        state = np.zeros((form.l, self._signals(run[:1]).shape[1], form.n))
+        state[:, 0] = form.c  # C_o F^k, the effect of x0
+        responses = adjoint_responses(form.a - form.gain @ form.c, form.c, state, parts)
+        for start, (signals, out) in zip(starts, responses):
+            y = target[start : start + self.chunk]
             for o in range(form.l):
                 present = ~np.isnan(y[:, o])
-                rows = self._rows(o, signals, out[:, o], y[:, o])
-                rows *= form.weights[o]
+                rows = form.weights[o] * self._rows(o, signals, out[:, o], y[:, o])
                 yield rows if present.all() else rows[present]
 
     def _signals(self, raw: Array) -> Array:
         """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
         x = self.form.expansion
-        found = x(raw)
-        parts = [np.zeros((len(raw), 1)), found[:, : x.p]]
+        found, one = x(raw), np.ones((len(raw), 1))
+        parts = [0 * one, found[:, : x.p]]
         if self.extra:
             parts.append(found[:, x.zeta_simulated.start :])
         parts.append(found[:, x.p : x.p + x.q])
         if self.injected:
-            parts += [np.ones((len(raw), 1)), raw[:, self.y]]
+            parts += [one, raw[:, self.y]]
         return np.concatenate(parts, axis=1)
 
     def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
@@ -306,27 +289,18 @@ class _Regressors:
             rows[:, -1] -= np.einsum("kji,ij->k", out[:, past + 1 :], form.gain)
         return rows
 
-    def turn(self, states: int) -> Array:
-        """Return the matrix that carries z to the order [x0 | d | D | B | E] of the rows."""
-        form, x = self.form, self.form.expansion
-        n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
+    def columns(self, states: int) -> NDArray[np.intp]:
+        """Return where the unknowns z stand in the rows [x0 | d | D | B | E], x0 of all experiments."""
+        form = self.form
+        n, l, p = form.n, form.l, form.expansion.p  # noqa: E741
         direct = states + l * form.offset
-        inner, feed = direct + l * p, direct + l * p + n * p
-        turn = np.zeros((feed + n * q, form.size))
-        turn[: form.linear, : form.linear] = np.eye(form.linear)
-        starts = np.cumsum([0, *(functions for functions, _ in form.blocks)])
-        for i, (functions, entries) in enumerate(form.blocks):
-            columns = np.arange(form.size)[form.block(i)].reshape(entries, functions)
-            for b in range(entries):
-                position = starts[i] + np.arange(functions)
-                if i >= x.m:
-                    where = feed + (position - p) * n + b
-                elif b < n:
-                    where = inner + position * n + b
-                else:
-                    where = direct + (b - n) * p + position
-                turn[where, columns[b]] = 1.0
-        return turn
+        found, start = [np.arange(form.linear)], 0
+        for functions, entries in form.blocks:
+            position = start + np.arange(functions)[:, None]
+            inner = direct + l * p + position * n + np.arange(n)
+            found.append(np.hstack([inner, direct + np.arange(entries - n) * p + position]).ravel(order="F"))
+            start += functions
+        return np.concatenate(found)
 
 
 def observer_gain(a: Array, c: Array, noise: float = 1.0) -> Array:
