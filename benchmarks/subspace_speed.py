@@ -27,8 +27,7 @@ import numpy as np
 from scipy.signal import dlsim
 
 from optid import Data, Polynomial, Triangular, fit
-from optid.identify.subspace.methods import positions, project
-from optid.identify.subspace.realisation import realise
+from optid.identify.subspace.projection import positions, project, realise
 from optid.statistics.expansion import expand
 from optid.statistics.hankel import hankel_statistics, windows_of
 from optid.statistics.rq import rq

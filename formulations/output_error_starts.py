@@ -13,8 +13,7 @@ from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
-from optid.identify.subspace.methods import default_block_rows, project
-from optid.identify.subspace.realisation import realise
+from optid.identify.subspace.projection import default_block_rows, project, realise
 from optid.models.roots import contained, roots_of
 from optid.statistics.expansion import expand
 from optid.statistics.sensitivities import PlantPoint, Unknowns, instruments

@@ -29,13 +29,13 @@ from formulations.prediction_error import AGREE, Descent, best_of, descend, refi
 from formulations.simulation_bound import bounded
 from formulations.state_error import STABLE, StateError, entered
 from formulations.state_space_programme import Posing
-from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import identified
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.design.expansion import Bases
 from optid.identify.noise import with_noise
+from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.program.solution import Status
 from optid.program.units import energy_unit, inverse
@@ -137,9 +137,9 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     given = None if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
     in_memory(data, f"{criterion} errors")
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
-    plan = planned(name, data, nx, None, basis, feedback_basis,
-                   "inputs+past" if feedback_basis is None else "simulated", offset=bool(offset),
-                   feedthrough=feedthrough, stability="free", iterations=2 * (feedback_basis is not None))
+    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
+                   instruments="inputs+past" if feedback_basis is None else "simulated", feedthrough=feedthrough,
+                   stability="free", iterations=2 * (feedback_basis is not None))
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
     models = [model.with_transform(inverse(plan.units)) for model in models]
     if criterion == "prediction" and feedback_basis is not None:
@@ -175,7 +175,8 @@ def _run(plan: Plan, block_rows: list[int] | None, criterion: str, weighting: st
             continue
         if evidence.model is not None:
             nx = nx or int(evidence.figures["order"])
-            found[f"{evidence.figures['block rows']} block rows"] = evidence.model
+            model = evidence.extended()[0] if criterion == "prediction" else evidence.model  # K counts there alone
+            found[f"{evidence.figures['block rows']} block rows"] = model
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
     expansion = plan.expansion()

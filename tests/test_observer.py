@@ -6,8 +6,9 @@ import pytest
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import RankError
 from optid.identify.innovations import innovation_form
-from optid.identify.subspace.methods import default_block_rows, simulate_clipped
+from optid.identify.subspace.instruments import simulate_clipped
 from optid.identify.subspace.observer import ObserverForm, observer_gain, observer_problem
+from optid.identify.subspace.projection import default_block_rows
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])

@@ -290,6 +290,8 @@ class Evidence:
         figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
             "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
             which the report draws. The fit prints them in this order.
+        extend: returns the model completed by what only some uses need, such as a noise model, and further figures; it
+            is called when the model of the fit is first asked for.
     """
 
     model: Any
@@ -298,6 +300,11 @@ class Evidence:
     status: Status
     reason: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)
+    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
+
+    def extended(self) -> tuple[Any, dict[str, Any]]:
+        """Return the completed model and what there is to say of it."""
+        return self.extend() if self.extend else (self.model, {})
 
     @classmethod
     def pointless(cls, status: Status, reason: str) -> "Evidence":
@@ -318,6 +325,7 @@ class Outcome:
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
         procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
+        extend: that of the procedure's `Evidence`.
     """
 
     model: Any
@@ -327,6 +335,7 @@ class Outcome:
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
     procedure: bool = False
+    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -366,4 +375,4 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
                                reason=found.reason)
             figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True)
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, found.extend)

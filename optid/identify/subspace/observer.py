@@ -94,13 +94,17 @@ class ObserverForm:
         """Number of unknowns."""
         return self.linear + sum(p * b for p, b in self.blocks)
 
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels in words, those of the feedback last."""
+        x = self.expansion
+        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+
     def names(self) -> list[str]:
         """Name the unknowns in words for messages."""
-        x = self.expansion
-        channels = [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
         named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
         named += ["the offset"] * (self.l * self.offset)
-        for channel, (p, b) in zip(channels, self.blocks):
+        for channel, (p, b) in zip(self.channels, self.blocks):
             named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
         return named
 
@@ -124,11 +128,6 @@ class ObserverProblem:
     instrumented: bool = False
 
     @property
-    def unit(self) -> float:
-        """One: the residuals are relative to the sizes of the outputs."""
-        return 1.0
-
-    @property
     def condition(self) -> float:
         """Estimate of the condition number of the scaled regressors."""
         return conditioning(np.asarray(self.problem.root, dtype=float))
@@ -146,6 +145,16 @@ class ObserverProblem:
                             "before it explain its effect. Use a longer or richer record, fewer functions, a lower "
                             "order, or leave the channel out.")
         return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
+
+    def ratios(self) -> dict[str, float]:
+        """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
+        z, found = self.least_squares(), {}
+        for i, (name, shape) in enumerate(zip(self.form.channels, self.form.blocks)):
+            if min(shape) > 1:
+                values = np.linalg.svd(z[self.form.block(i)].reshape(shape, order="F"), compute_uv=False)
+                name = name if i >= self.form.expansion.m else f"channel {name}"
+                found[f"second over first singular value, {name}"] = float(values[1] / values[0])
+        return found
 
     def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""

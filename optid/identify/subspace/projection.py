@@ -1,4 +1,4 @@
-"""The (A, C) step of the subspace methods: instruments, projection, preliminary models, simulated feedback."""
+"""The (A, C) step of the subspace methods: instruments, projection, range of the observability matrix, order."""
 
 import warnings
 from collections.abc import Sequence
@@ -9,26 +9,66 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
-from optid.identify.subspace.realisation import Range, estimate_range
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import RQ, rq
 
 INSTRUMENTS = ("past", "inputs", "inputs+past", "simulated", "simulated+past")
-GRID = 2001
-"""Points at which the feedback functions are tabulated for simulated instruments, which need not be exact."""
-
-CHUNK = 8192
-"""Samples expanded at a time."""
-
-BEYOND = 0.2
-"""Simulated outputs are clipped to the range of the record, wider by this share of it on either side."""
+WEIGHTINGS = ("moesp", "cva", "plain")
 
 KEPT = 0.5
 """Share of the windows left by missing samples below which the user is told."""
 
 PER_ROW = 2.0
 """Windows per row of the Hankel matrix that are wanted; block rows are chosen so that a record has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Range:
+    """The weighted singular value decomposition behind an estimate of Gamma.
+
+    Attributes:
+        vectors: (rows l, rows l) left singular vectors of W r22.
+        values: singular values, largest first.
+        unweighted: W^-1, (rows l, rows l).
+        l: number of outputs.
+    """
+
+    vectors: Array
+    values: Array
+    unweighted: Array
+    l: int  # noqa: E741 - the field's letter
+
+    @property
+    def rows(self) -> int:
+        """Number of block rows."""
+        return len(self.vectors) // self.l
+
+    def gamma(self, n: int) -> Array:
+        """Return Gamma (rows l, n) in balanced coordinates: columns scaled by the roots of the singular values."""
+        return self.unweighted @ (self.vectors[:, :n] * np.sqrt(self.values[:n]))
+
+
+def estimate_range(blocks: RQ, l: int, weighting: str = "moesp", scale: Array | None = None) -> Range:  # noqa: E741
+    """Decompose the projected outputs.
+
+    Args:
+        blocks: the RQ decomposition.
+        l: number of outputs.
+        weighting: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of the future
+            outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990) or
+            "plain" (outputs in their units: at an order too low the larger ones come first).
+        scale: (l,) size of every output, by which its rows are divided: outputs in small units are not lost.
+    """
+    sizes = np.tile(np.ones(l) if scale is None or weighting == "plain" else scale, len(blocks.r22) // l)
+    r22, unweighted = blocks.r22 / sizes[:, None], np.diag(sizes)
+    if weighting == "cva":
+        whole = np.concatenate([r22, blocks.residual / sizes[:, None]], axis=1)
+        left, values, _ = np.linalg.svd(whole, full_matrices=False)
+        values = np.maximum(values, 1e-8 * values[0])  # directions without noise weigh much, not infinitely much
+        r22, unweighted = (left / values) @ left.T @ r22, unweighted @ (left * values) @ left.T
+    vectors, values, _ = np.linalg.svd(r22)
+    return Range(vectors, values, unweighted, l)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +204,36 @@ def _spread(statistics: HankelStatistics, expansion: Expansion, offset: bool) ->
     return np.sqrt(np.maximum(energy, 1e-300))
 
 
+def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
+    """Return (A, C) from Gamma (rows l, n) by least squares on its shift invariance."""
+    return np.asarray(np.linalg.lstsq(gamma[:-l], gamma[l:], rcond=None)[0], dtype=float), gamma[:l].copy()
+
+
+def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
+    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
+
+    Args:
+        gamma: (rows l, n) in units of the outputs.
+        scale: (l,) sizes of the outputs.
+    """
+    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
+    return realise(scaled, len(scale))[0], gamma[: len(scale)].copy(), scaled
+
+
+def largest_gap(values: Array, largest: int) -> int:
+    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
+
+    Values below the rounding of the decomposition count as that rounding.
+
+    Args:
+        values: singular values, largest first.
+        largest: highest order to consider.
+    """
+    floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
+    ratios = floor[:-1] / floor[1:]
+    return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
+
+
 def default_block_rows(records: Sequence[Array], expansion: Expansion, nx: int | None) -> int:
     """Return block rows that a record can carry: 10, or twice the order, or fewer on a short record.
 
@@ -216,50 +286,3 @@ def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[floa
         shares.append((float(np.sum(part**2) / np.sum(whole**2)), expansion.output_names[family.output]))
         start += family.size
     return min(shares)
-
-
-def simulate_clipped(
-    records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array, ez: Array, d: Array
-) -> list[Array]:
-    """Simulate the outputs from the inputs alone, as instruments: noise free, clipped to the range of the record.
-
-    The functions of a missing input count as zero.
-
-    Args:
-        records: raw channels [u | y], one per experiment.
-        expansion: the signals; its feedback functions may be empty.
-        a: (n, n).
-        c: (l, n).
-        bu: (n, p).
-        du: (l, p).
-        ez: (n, q).
-        d: (l,) offset.
-
-    Returns:
-        (N, l) per experiment.
-    """
-    from optid.statistics.subspace_kernels import clipped_run
-
-    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
-    low = np.nanmin([np.nanmin(record[:, m : m + l], axis=0) for record in records], axis=0)
-    high = np.nanmax([np.nanmax(record[:, m : m + l], axis=0) for record in records], axis=0)
-    low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
-    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
-    start = 0
-    for family in expansion.feedback:
-        e = ez[:, start : start + family.size]
-        grid = np.linspace(low[family.output], high[family.output], GRID)
-        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
-        start += family.size
-    simulated = []
-    open_loop = expansion.without_feedback()
-    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
-    for record in records:
-        out, x = np.empty((len(record), l)), np.zeros(n)
-        for first in range(0, len(record), CHUNK):
-            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
-            eta = np.where(np.isnan(eta), 0.0, eta)
-            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
-                        out[first : first + CHUNK])
-        simulated.append(out)
-    return simulated
