@@ -78,8 +78,8 @@ def completed(plan: Plan, found: Observability) -> Procedure:
     model = _model(plan, step, realisation.factors(solution.values))
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
-    return Evidence(model, solution.objective, _bound(plan, step, solution, program.unit, len(gamma) // l), status,
-                    reason, figures | step.ratios(), partial(_with_noise, model, plan.data))
+    return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
+                    status, reason, figures | step.ratios(), partial(_with_noise, model, plan.data))
 
 
 def preliminary(found: Observability) -> HammersteinSS:

@@ -17,7 +17,7 @@ from optid.identify.record_checks import examine, examine_instruments, examine_r
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
-from optid.program.solution import Solution, Status
+from optid.program.solution import Bound, Solution, Status
 from optid.registry import check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 
@@ -29,7 +29,7 @@ class Fit:
     Attributes:
         identified: the identified model as far as it is needed at once, in raw units; None only with
             ``raises=False``. See `model`.
-        solution: status, proof, residuals and times.
+        solved: status, proof, residuals and times, as far as they were needed at once. See `solution`.
         formulation: its name.
         arguments: what it was called with.
         program: the last programme solved.
@@ -41,11 +41,12 @@ class Fit:
         steps: (name, solution) of every programme on the way.
         procedure: whether a procedure of several steps judged the whole: its bound may be that of a step.
         seconds: wall time of the whole call.
+        bound: returns a bound that was not needed at once, or None.
         extend: as in `optid.solving.solve.Evidence`.
     """
 
     identified: Any
-    solution: Solution
+    solved: Solution
     formulation: str
     arguments: Mapping[str, Any] = field(repr=False)
     program: Program = field(repr=False)
@@ -56,7 +57,13 @@ class Fit:
     steps: tuple[tuple[str, Solution], ...] = field(default=(), repr=False)
     procedure: bool = False
     seconds: float = 0.0
+    bound: Callable[[], Bound] | None = field(default=None, repr=False)
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = field(default=None, repr=False)
+
+    @cached_property
+    def solution(self) -> Solution:
+        """Status, proof, residuals and times."""
+        return self.solved if self.bound is None else replace(self.solved, bound=self.bound())
 
     @cached_property
     def _extended(self) -> tuple[Any, dict[str, Any]]:
@@ -239,12 +246,12 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     if "condition of R11" in figures:
         findings = findings + examine_instruments(figures["condition of R11"])
     findings = findings + examine_residuals(figures)
-    return Fit(identified=_in_raw_units(model, data), solution=outcome.solution, formulation=name, arguments=arguments,
+    return Fit(identified=_in_raw_units(model, data), solved=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),
                        *price_earlier_steps(outcome.constrained, outcome.program)),
                findings=tuple(findings), measured=figures, steps=outcome.steps, procedure=outcome.procedure,
-               seconds=time.perf_counter() - started, extend=outcome.extend)
+               seconds=time.perf_counter() - started, bound=outcome.bound, extend=outcome.extend)
 
 
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:

@@ -284,7 +284,8 @@ class Evidence:
     Attributes:
         model: the model.
         objective: value of the procedure's own objective.
-        bound: bound on that objective, with the reason where there can be none.
+        bound: bound on that objective, with the reason where there can be none; or a function that returns it, called
+            when the solution of the fit is first asked for.
         status: status of the procedure as a whole.
         reason: one sentence for people.
         figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
@@ -296,7 +297,7 @@ class Evidence:
 
     model: Any
     objective: float
-    bound: Bound
+    bound: Bound | Callable[[], Bound]
     status: Status
     reason: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -325,6 +326,7 @@ class Outcome:
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
         procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
+        bound: that of the procedure's `Evidence` where it is a function; the solution has no bound then.
         extend: that of the procedure's `Evidence`.
     """
 
@@ -335,6 +337,7 @@ class Outcome:
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
     procedure: bool = False
+    bound: Callable[[], Bound] | None = None
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
 
 
@@ -372,7 +375,9 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-            solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
-                               reason=found.reason)
+            later = found.bound if callable(found.bound) else None
+            solution = replace(solution, objective=found.objective, bound=None if later else found.bound,
+                               status=found.status, reason=found.reason)
             figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, found.extend)
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, later,
+                           found.extend)

@@ -51,7 +51,9 @@ def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterabl
             starts[step:] += starts[:-step] @ decay
             step, decay = 2 * step, decay @ decay
         starts[np.abs(starts) < TINY] = 0.0
-        within = within[..., :BLOCK, :] + (starts @ free).reshape(blocks, d, l, BLOCK, n)
-        found = within.transpose(0, 3, 2, 1, 4).reshape(-1, l, d, n)
+        found = np.empty((blocks, BLOCK, l, d, n))
+        np.add(within[..., :BLOCK, :], (starts @ free).reshape(blocks, d, l, BLOCK, n),
+               out=found.transpose(0, 3, 2, 1, 4))
+        found = found.reshape(-1, l, d, n)
         state = found[len(part)].transpose(1, 0, 2)
         yield part, found[: len(part)]

@@ -25,7 +25,7 @@ from optid.statistics.hankel import CONDITION_LIMIT
 from optid.statistics.responses import adjoint_responses
 from optid.structures.rank_one import RankOne
 
-CHUNK = 4096
+CHUNK = 8192
 """Samples whose regressors are formed at once."""
 
 MANY = 10
@@ -265,7 +265,8 @@ class _Regressors:
             y = target[start : start + self.chunk]
             for o in range(form.l):
                 present = ~np.isnan(y[:, o])
-                rows = form.weights[o] * self._rows(o, signals, out[:, o], y[:, o])
+                rows = self._rows(o, signals, out[:, o], y[:, o])
+                rows *= form.weights[o]
                 yield rows if present.all() else rows[present]
 
     def _signals(self, raw: Array) -> Array:
