@@ -87,10 +87,10 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
         fresh = nuclear_programme(structured, structured.penalty(weight))
         # the Gram matrix is decomposed anew: it belongs to the time of one solve
         for name in ("gram", "groups", "index", "known", "data"):
-            fresh.nuclear.problem.__dict__.pop(name, None)
-        if fresh.nuclear.problem.predictor is not None:
+            fresh.structure.problem.__dict__.pop(name, None)
+        if fresh.structure.problem.predictor is not None:
             for name in ("stacked", "gram", "inverse", "places"):
-                fresh.nuclear.problem.predictor.__dict__.pop(name, None)
+                fresh.structure.problem.predictor.__dict__.pop(name, None)
         clock = time.process_time()
         answer = find("admm").run(fresh, Settings(accuracy=accuracy))
         times.append(time.process_time() - clock)

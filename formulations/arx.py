@@ -15,8 +15,9 @@ from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.models import HammersteinARX
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
+from optid.structures.least_squares import LeastSquaresStructure
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
@@ -59,4 +60,4 @@ def _arx(problem: EquationError, constraints: Sequence[Any]) -> Program:
     return residual_programme(
         problem, "arx", {**linear, **numerators}, problem.residual(linear, list(numerators.values())), start={},
         recover=recover, view=problem.view({**linear, **numerators}, "linear"),
-        least_squares=RankOneForm(problem.problem, (*linear, *keys), ())).subject_to(*constraints)
+        structure=LeastSquaresStructure(problem.problem, (*linear, *keys), ())).subject_to(*constraints)

@@ -31,9 +31,10 @@ from optid.errors import StructureError
 from optid.models import HammersteinARX
 from optid.models.gauges import gauge_factor
 from optid.program.judging import measure_violation
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.bilinear import starts
+from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
 from optid.structures.rank_one import Core, reduce
 from optid.structures.whitening import leading_pair
 
@@ -100,7 +101,7 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
         problem, "hammerstein_arx.exact", variables, problem.residual(linear, thetas),
         constraints={"gauge": tuple(gauges)}, start=start, recover=lambda values: None,
         view=problem.view(expressions, "exact", gauge),
-        rank_one=RankOneForm(problem.problem, tuple(linear), tuple(blocks), gauge),
+        structure=RankOneStructure(problem.problem, tuple(linear), tuple(blocks), gauge),
         certify=certify_rank_one)
     program = program.subject_to(*constraints)
     signed = _speaks_of_factors(program, {variables[name].id for names in blocks for name in names})
@@ -238,7 +239,7 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
         start={}, recover=partial(_split_model, problem, reduce(problem.problem), keys, gauge, svd),
         view=problem.view({**linear, **thetas}, "relaxed"),
         parameters={"weight": tau} if nuclear else {},
-        least_squares=None if nuclear else RankOneForm(problem.problem, (*linear, *keys), ()),
+        structure=None if nuclear else LeastSquaresStructure(problem.problem, (*linear, *keys), ()),
         certify=partial(certify_nuclear, problem.problem, np.array(heights) / problem.unit) if nuclear else None)
     return program.subject_to(*constraints)
 

@@ -32,12 +32,12 @@ from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.low_rank import Structured, choose_weight, order_of, rank_of, structure
 from optid.identify.subspace.observability import Observability, prepared
 from optid.identify.subspace.plan import Plan, in_record_units, planned
-from optid.program.program import NuclearForm, Program, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import energy_unit
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.nuclear_norm import NuclearProblem, Predictor
+from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem, Predictor
 
 FORMS = ("predictor", "projection", "instruments")
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
@@ -172,8 +172,8 @@ def nuclear_programme(structured: Structured, penalty: float, units: Transform |
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,
         structural=frozenset(constraints), parameters={"weight": weight},
-        derived={"X": matrix, "residual": misfit}, nuclear=NuclearForm(problem), certify=partial(certify, problem),
-        scale=penalty * float(np.sum(problem.data**2)))
+        derived={"X": matrix, "residual": misfit}, structure=NuclearNormStructure(problem),
+        certify=partial(certify, problem), scale=penalty * float(np.sum(problem.data**2)))
 
 
 def _explained(problem: NuclearProblem, predictor: Predictor, theta: cp.Variable) -> Any:

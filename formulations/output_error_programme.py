@@ -18,11 +18,12 @@ from optid.models.gauges import leading_sign
 from optid.models.hammerstein_tf import HammersteinTF
 from optid.models.roots import contained
 from optid.program.judging import measure_violation
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
 from optid.statistics import Layout
 from optid.statistics.linearised import Linearised
+from optid.structures.least_squares import LeastSquaresStructure
 
 Array = np.ndarray
 
@@ -195,8 +196,8 @@ class Posing:
                     bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))),
                     gauge=self.criterion.gauge, reference=values, units=units)
         start = {**(self.usual or values), "residual": at.whole[1]}
-        least = None if damping else RankOneForm(compressed.problem, tuple(self.places), ())
-        program = Program(name=self.name, objective=cp.Minimize(objective), constraints=structural, least_squares=least,
+        least = None if damping else LeastSquaresStructure(compressed.problem, tuple(self.places), ())
+        program = Program(name=self.name, objective=cp.Minimize(objective), constraints=structural, structure=least,
                           variables={**variables, "residual": r}, start=start, recover=self.recover, view=view,
                           structural=frozenset(structural), derived={"residual": residual},
                           scale=self.criterion.energy, compressed=compressed, unit=energy_unit(units))

@@ -27,9 +27,10 @@ from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.data.channels import Transform
 from optid.identify.subspace.realisation import Realisation
-from optid.program.program import Program, RankOneForm
+from optid.program.program import Program
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
+from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
 
 RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
@@ -56,12 +57,12 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
         thetas = [cp.outer(mu, b) for mu, b in zip(mus, bs)]
         variables = linear | {one.name(): one for pair in zip(mus, bs) for one in pair}
         gauge = {"gauge": tuple(cp.sum_squares(b) == 1 for b in bs)}
-        form_of = {"rank_one": RankOneForm(problem, tuple(linear), tuple((mu, b) for mu, b, _ in names), "norm"),
-                   "certify": partial(certify_rank_one, max_size=RELAXED)}
+        structure = RankOneStructure(problem, tuple(linear), tuple((mu, b) for mu, b, _ in names), "norm")
+        certify = partial(certify_rank_one, max_size=RELAXED)
     else:
         thetas = [cp.Variable(shape, name=theta) for (_, _, theta), shape in zip(names, form.blocks)]
         variables = linear | {theta.name(): theta for theta in thetas}
-        gauge, form_of = {}, {"least_squares": RankOneForm(problem, tuple(variables), ())}
+        gauge, structure, certify = {}, LeastSquaresStructure(problem, tuple(variables)), None
     error = problem.root @ cp.hstack([flat(part) for part in (*linear.values(), *thetas)]) - problem.target
     residual = cp.Variable(error.size, name="residual")
     structural = {"residual": (residual == error,), **gauge}
@@ -70,8 +71,8 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
         name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
         {**variables, "residual": residual}, realisation.start(), realisation.factors,
         _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
-        scale=problem.scale, compressed=realisation.step, unit=1.0 if relative else energy_unit(units), **form_of,
-    ).subject_to(*constraints)
+        scale=problem.scale, compressed=realisation.step, unit=1.0 if relative else energy_unit(units), structure=structure,
+        certify=certify).subject_to(*constraints)
 
 
 def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]

@@ -246,7 +246,7 @@ def test_alternating_agrees_with_a_search_over_the_angle_and_reports_multipliers
 
 
 def test_alternating_keeps_its_half_steps_compiled(monkeypatch):
-    from optid.backends import alternating
+    from optid.solving import alternating
 
     compiled, seen = [], alternating.solve
 

@@ -28,6 +28,7 @@ from optid.faults.search.atoms import atoms_of, signatures
 from optid.program.solution import Status
 from optid.registry import fault_formulation
 from optid.solving.solve import solve
+from optid.structures.group_sparse import GroupSparseStructure
 
 LOAD = np.array([0.3, -0.2, 0.5])
 N = 40
@@ -180,7 +181,7 @@ def liar(shift):
         moved = {name: value + shift for name, value in answer.values.items()}
         return Answer(Status.OPTIMAL, "optimal", moved, answer.duals)
 
-    return BackEnd("liar", frozenset({"group-sparse"}), run)
+    return BackEnd("liar", frozenset(), run, structures=(GroupSparseStructure,))
 
 
 def test_a_solver_that_lies_is_not_believed(found, limits):
@@ -201,7 +202,7 @@ def test_lying_multipliers_give_no_false_bound(found, limits):
             answer = replace(answer, duals={"residual": wild * answer.duals["residual"]})
         return answer
 
-    result = signature_estimate(s, limits, solver=BackEnd("wild", frozenset({"group-sparse"}), run))
+    result = signature_estimate(s, limits, solver=BackEnd("wild", frozenset(), run, structures=(GroupSparseStructure,)))
     assert result.certified and result.bound <= truth * (1 + 1e-9)
 
 
@@ -234,7 +235,8 @@ def test_wild_multipliers_of_a_user_constraint_give_no_false_bound(found, limits
     Answer(Status.OPTIMAL, "optimal", {"residual": np.zeros(2 * N)})])
 def test_a_solver_without_a_point_gives_no_certificate(found, limits, answer):
     s = two(found)
-    result = signature_estimate(s, limits, solver=BackEnd("none", frozenset({"group-sparse"}), lambda *_: answer))
+    mute = BackEnd("none", frozenset(), lambda *_: answer, structures=(GroupSparseStructure,))
+    result = signature_estimate(s, limits, solver=mute)
     assert not result.certified and not result.active and result.status and np.isinf(result.gap)
     search = polish(s, limits, result)
     assert search.best is None and not search.certified
@@ -245,7 +247,8 @@ def test_a_solver_that_raises_is_an_outcome(found, limits):
     def run(program, settings):
         raise ZeroDivisionError("boom")
 
-    result = signature_estimate(two(found), limits, solver=BackEnd("bad", frozenset({"group-sparse"}), run))
+    bad = BackEnd("bad", frozenset(), run, structures=(GroupSparseStructure,))
+    result = signature_estimate(two(found), limits, solver=bad)
     assert not result.certified and "boom" in result.status
 
 

@@ -12,12 +12,13 @@ from formulations import hammerstein_arx
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, SolverFailed, StructureError
 from optid.program.solution import Status
+from optid.program.structure import Structure
 
 STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
 
 
 def mine(run):
-    return BackEnd("mine", frozenset({"NLP", "QP", "SDP", "rank-one"}), run)
+    return BackEnd("mine", frozenset({"NLP", "QP", "SDP"}), run, structures=(Structure,))
 
 
 def truth(program, settings):

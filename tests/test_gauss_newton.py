@@ -108,7 +108,7 @@ def test_three_channels_with_constraints():
 def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
     """Against finite differences, at a point with multipliers for a bilinear constraint."""
     program = program_of(record(), [shape.gain(1.0, at=0.1)])
-    form = program.rank_one
+    form = program.structure
     at = Coordinates(program, form)
     rng = np.random.default_rng(0)
     x, pull = rng.normal(size=at.size), rng.normal(size=len(form.problem.target))

@@ -68,7 +68,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     """At random points of the factored problem both readings have the same left-hand sides."""
     rules = [shape.slope(0.5, 2.0), shape.dead_zone(-0.3, 0.3), lambda v: {"a": 2 * v["a"][0] - v["a"][1] <= 3}]
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS, constraints=rules, gauge=gauge)
-    lifted = lift_exact(program, program.rank_one)
+    lifted = lift_exact(program, program.structure)
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear()
     rng = np.random.default_rng(1)
@@ -88,9 +88,9 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
 def test_products_of_two_cones():
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS,
                                                       constraints=[shape.monotone(), shape.sign("b")])
-    lifted = lift_exact(program, program.rank_one)
+    lifted = lift_exact(program, program.structure)
     assert set(lifted.cones) == set(lifted.directions) == {0}
-    assert lifted.add_products(program.rank_one.problem) == [] and set(lifted.cones) == {0}
+    assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
     rows, right, equal = lifted.linear()
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
@@ -102,7 +102,7 @@ def test_products_of_two_cones():
 
 def test_places_read_bilinear_constraints_only():
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS)
-    where, v = places(program, program.rank_one), program.view.inner
+    where, v = places(program, program.structure), program.view.inner
     rows, right = where.rows(v["Theta"][2, 1] - 3 * v["a"][1] <= 4)
     assert rows.shape == (1, 15) and right == pytest.approx([4])
     assert dict(zip(*[part.tolist() for part in (np.flatnonzero(rows), rows[rows != 0])])) == {1: -3.0, 11: 1.0}

@@ -9,13 +9,15 @@ import pytest
 
 import optid
 from formulations.nuclear_subspace import certify, nuclear_programme
-from optid.backends import Answer, Settings, choose, find
+from optid.backends import Answer, Settings, find
+from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.identify.subspace.low_rank import held_out_fit, order_of, structure
 from optid.identify.subspace.observability import prepared
 from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
 from optid.solving.solve import solve
+from optid.structures.nuclear_norm import NuclearNormStructure
 
 A = np.array([[0.8, 0.4], [-0.4, 0.8]])
 B, C = np.array([[1.0, 0.2], [0.5, -0.7]]), np.array([[1.0, 0.3], [-0.2, 0.8]])
@@ -157,10 +159,10 @@ def test_the_programme_chooses_the_admm_unless_something_else_is_asked_of_it():
     bounded = program.subject_to(lambda view: {"ceiling": view["output"] <= 4.0})
     assert choose(bounded)[0].name == "clarabel"
     assert "takes no further constraints ('ceiling')" in find("admm").refuses(bounded)
-    assert "admm solves nuclear" in find("admm").refuses(replace(program, nuclear=None))
+    assert "admm solves nuclear" in find("admm").refuses(replace(program, structure=None))
     free, held = solve(program), solve(bounded)
     assert held.status in (Status.OPTIMAL, Status.LOCAL) and held.objective >= free.objective - 1e-7
-    answer = find("admm").run(replace(program, nuclear=None), Settings())
+    answer = find("admm").run(replace(program, structure=None), Settings())
     assert answer.status is Status.FAILED and "no nuclear-norm structure" in answer.word
 
 
@@ -176,7 +178,7 @@ def test_weights_are_parameters_of_one_programme():
 
 def test_an_iteration_limit_is_reported():
     def hasty(program, settings):
-        if program.nuclear is None:
+        if not isinstance(program.structure, NuclearNormStructure):
             return find("clarabel").run(program, settings)
         return find("admm").run(program, replace(settings, options={"limit": 3}))
 

@@ -8,7 +8,8 @@ from scipy.signal import cont2discrete, lfilter
 
 import optid
 import optid.solving.solve
-from optid.backends import Answer, choose
+from optid.backends import Answer
+from optid.backends.choice import choose
 from optid.errors import SolverFailed
 from optid.program.solution import Status
 
@@ -35,7 +36,7 @@ def test_another_back_end_solves_the_programmes_and_that_is_said_once(monkeypatc
     fit = optid.fit(data, "oe.exact", na=2, nb=2, constraints=["stable:0.999"])
     count = len(fit.steps)
     assert fit.figures["solver fallback"].startswith(f"clarabel gave no usable answer for {count} of {count} program")
-    assert fit.solution.solver in optid.backends.FALLBACKS and fit.solution.failed == "clarabel"
+    assert fit.solution.solver in optid.backends.choice.FALLBACKS and fit.solution.failed == "clarabel"
     assert fit.solution.objective == pytest.approx(expected.solution.objective, rel=1e-6)
     assert "solver fallback" not in expected.figures and str(fit).count("gave no usable answer") == 1
 
@@ -53,6 +54,6 @@ def test_a_solver_that_was_asked_for_is_not_replaced(monkeypatch):
     with pytest.raises(SolverFailed, match="clarabel gave no usable answer .*numbers ran out"):
         optid.fit(level(), "oe.exact", na=2, nb=2, solver=replace(optid.backends.find("clarabel"), run=run))
     monkeypatch.setattr(optid.solving.solve, "choose", failing)
-    monkeypatch.setattr(optid.backends, "FALLBACKS", ())
+    monkeypatch.setattr(optid.backends.choice, "FALLBACKS", ())
     with pytest.raises(SolverFailed, match="clarabel gave no usable answer .*numbers ran out"):
         optid.fit(level(), "oe.exact", na=2, nb=2)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
 
-from optid import backends
-from optid.backends import Answer, BackEnd, Settings, back_ends
+from optid.backends import Answer, BackEnd, Settings, back_ends, choice
 from optid.errors import LookupFailed, SolverMissing, StructureError
 from optid.program.solution import Bound, Status
 from optid.solving.solve import run, solve
@@ -191,7 +190,7 @@ def test_name_is_accepted_in_any_case():
 def test_missing_solver_comes_with_the_pip_line(monkeypatch):
     known = {**back_ends(), "absent": BackEnd("absent", EVERYTHING, RAISING.run, False, "absent-solver"),
              "vendor": BackEnd("vendor", EVERYTHING, RAISING.run, False)}
-    monkeypatch.setattr(backends, "back_ends", lambda: known)
+    monkeypatch.setattr(choice, "back_ends", lambda: known)
     with pytest.raises(SolverMissing, match="pip install absent-solver"):
         solve(projection(), "absent")
     with pytest.raises(SolverMissing, match="vendor's package"):
@@ -296,12 +295,12 @@ def test_a_broken_plug_in_does_not_take_the_others_away(monkeypatch):
         def load(self):
             raise ImportError("no module named their_package")
 
-    shipped = list(backends.entry_points(group=backends.GROUP))
-    monkeypatch.setattr(backends, "entry_points", lambda group: [*shipped, Point()])
-    backends.back_ends.cache_clear()
+    shipped = list(choice.entry_points(group=choice.GROUP))
+    monkeypatch.setattr(choice, "entry_points", lambda group: [*shipped, Point()])
+    choice.back_ends.cache_clear()
     try:
-        assert backends.find("clarabel").installed
+        assert choice.find("clarabel").installed
         with pytest.raises(SolverMissing, match="'theirs' cannot be loaded: their_package:back_end fails: ImportError"):
-            backends.find("theirs")
+            choice.find("theirs")
     finally:
-        backends.back_ends.cache_clear()
+        choice.back_ends.cache_clear()

@@ -12,6 +12,7 @@ from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
 from optid.errors import StudyError
 from optid.program.solution import Status
+from optid.structures.least_squares import RankOneStructure
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import cell as cells
 from optid.studies.execution import memory
@@ -35,8 +36,8 @@ def one(solver="gauss_newton", formulation="hammerstein_arx.exact", *, entry=Non
 def solver(monkeypatch):
     """Register a back end for the test."""
 
-    def register(run, classes=("rank-one",)):
-        monkeypatch.setitem(back_ends(), "mine", BackEnd("mine", frozenset(classes), run))
+    def register(run, classes=(), structures=(RankOneStructure,)):
+        monkeypatch.setitem(back_ends(), "mine", BackEnd("mine", frozenset(classes), run, structures=structures))
         return "mine"
 
     return register

@@ -10,9 +10,10 @@ from optid.backends import Answer, BackEnd, Settings
 from optid.conformance.zoo import Case, cases, pose
 from optid.program.program import Program
 from optid.program.solution import Status
+from optid.program.structure import Structure
 
 CASES: dict[str, Case] = {case.name: case for case in cases()}
-EVERYTHING = frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one"})
+EVERYTHING = frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"})
 
 
 def case(name: str) -> Case:
@@ -26,7 +27,7 @@ def claiming(values: dict, status: Status = Status.OPTIMAL, duals: dict | None =
     def run(program: Program, settings: Settings) -> Answer:
         return Answer(status, word, {k: np.asarray(v, dtype=float) for k, v in values.items()}, duals or {})
 
-    return BackEnd("liar", EVERYTHING, run)
+    return BackEnd("liar", EVERYTHING, run, structures=(Structure,))
 
 
 def _raise(program: Program, settings: Settings) -> Answer:
@@ -43,8 +44,8 @@ def _hang(program: Program, settings: Settings) -> Answer:
         time.sleep(0.01)
 
 
-RAISING = BackEnd("raising", EVERYTHING, _raise)
-ABORTING = BackEnd("aborting", EVERYTHING, _abort)
-HANGING = BackEnd("hanging", EVERYTHING, _hang)
+RAISING = BackEnd("raising", EVERYTHING, _raise, structures=(Structure,))
+ABORTING = BackEnd("aborting", EVERYTHING, _abort, structures=(Structure,))
+HANGING = BackEnd("hanging", EVERYTHING, _hang, structures=(Structure,))
 
 __all__ = ["ABORTING", "CASES", "EVERYTHING", "HANGING", "RAISING", "Case", "case", "claiming", "pose"]

@@ -34,6 +34,7 @@ import numpy as np
 
 from optid.backends import Answer, BackEnd, find
 from optid.program.solution import Status
+from optid.structures.least_squares import RankOneStructure
 
 
 def _segfaults(program, settings):
@@ -80,7 +81,7 @@ def _silent(program, settings):
 
 
 def family():
-    return [BackEnd(name, frozenset({"rank-one"}), globals()["_" + name])
+    return [BackEnd(name, frozenset(), globals()["_" + name], structures=(RankOneStructure,))
             for name in ("segfaults", "aborts", "leaves", "endless", "hungry", "nan", "lies", "raises", "silent",
                          "slow")]
 '''

@@ -12,8 +12,9 @@ import numpy as np
 
 from optid.program.gradients import flat_value, jacobians
 from optid.program.judging import multiplier_terms
-from optid.program.program import GroupForm, Program, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
+from optid.structures.group_sparse import GroupSparseStructure
 
 PROVED = 1e-6
 """Relative gap below which a point counts as optimal."""
@@ -21,8 +22,8 @@ PROVED = 1e-6
 
 def certify(program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the best bound from the residual at the point and from the multipliers that the solver gave."""
-    form = program.group
-    assert form is not None
+    form = program.structure
+    assert isinstance(form, GroupSparseStructure)
     penalty = float(np.asarray(program.parameters[form.penalty].value))
     program.assign({name: value for name, value in values.items() if name not in program.derived})
     objective = float(np.asarray(program.objective.expr.value))
@@ -52,7 +53,7 @@ def _bound(problem, v: np.ndarray, penalty: float, slope: np.ndarray, constant: 
     return scale * along - 0.5 * scale**2 * square, scale * v
 
 
-def _lagrangian(program: Program, form: GroupForm, duals: Values) -> tuple[np.ndarray, float]:
+def _lagrangian(program: Program, form: GroupSparseStructure, duals: Values) -> tuple[np.ndarray, float]:
     """Return c (p,) and k of the user's affine constraints; one that is no help counts with multiplier zero."""
     slope, constant = np.zeros(problem_size(form)), 0.0
     for name, group in program.user_constraints.items():
@@ -68,13 +69,13 @@ def _lagrangian(program: Program, form: GroupForm, duals: Values) -> tuple[np.nd
     return slope, constant
 
 
-def problem_size(form: GroupForm) -> int:
+def problem_size(form: GroupSparseStructure) -> int:
     """Return the number of coefficients."""
     return int(form.problem.edges[-1])
 
 
-def _affine(terms: Iterable[tuple[cp.Expression, np.ndarray]], variables: Mapping[str, cp.Variable], form: GroupForm
-            ) -> tuple[np.ndarray, float] | None:
+def _affine(terms: Iterable[tuple[cp.Expression, np.ndarray]], variables: Mapping[str, cp.Variable],
+            form: GroupSparseStructure) -> tuple[np.ndarray, float] | None:
     """Return slope and constant of a sum of weighted affine expressions of the coefficients; None for others."""
     known = {variables[name].id: name for name in form.blocks}
     slopes = {name: np.zeros(shape) for name, shape in form.blocks.items()}

@@ -22,11 +22,11 @@ from formulations.faults.group_bound import certify
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
 from optid.faults.search.scanning import Scan
-from optid.program.program import GroupForm, Program
+from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.group_sparse import GroupProblem
+from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
 PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
 """Penalties tried, as shares of the one at which nothing is left."""
@@ -140,13 +140,14 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
     level = cp.Parameter(nonneg=True, name="lambda", value=0.1 * float(np.abs(columns.T @ problem.r).max()))
     changes, residual = cp.Variable((count, 1), name="changes"), cp.Variable(problem.r.size, name="residual")
     misfit = problem.r - columns @ changes[:, 0]
-    form = GroupForm(GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count)), {"changes": (count, 1)})
+    form = GroupSparseStructure(GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count)),
+                                {"changes": (count, 1)})
     view = View({"f": shapes @ changes[:, 0], "changes": changes[:, 0]}, kind="profile")
     return Program(
         f"fault.profile {prior}", cp.Minimize(0.5 * cp.sum_squares(residual) + level * cp.norm1(changes)),
         {"residual": (residual == misfit,)}, {"changes": changes, "residual": residual},
         {"changes": _one(columns, problem.r)[:, None]}, dict, view, structural=frozenset({"residual"}),
-        parameters={"lambda": level}, derived={"residual": misfit}, group=form, certify=certify,
+        parameters={"lambda": level}, derived={"residual": misfit}, structure=form, certify=certify,
         scale=0.5 * float(problem.r @ problem.r))
 
 

@@ -23,11 +23,11 @@ from optid.faults.search.atoms import Atoms, atoms_of
 from optid.faults.search.calibration import Thresholds
 from optid.faults.search.scanning import Scan
 from optid.faults.search.sparse import ActiveGroup, SparseResult
-from optid.program.program import GroupForm, Program
+from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.group_sparse import GroupProblem
+from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
 
 def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constraints: Sequence[Any] = ()) -> Procedure:
@@ -78,7 +78,7 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
     norms: Any = sum(np.sqrt(atom.threshold) * _lengths(a) for atom, a in zip(atoms, variables.values()))
     edges = np.concatenate([[0], np.cumsum(np.concatenate([[a.dimension] * a.onsets.size for a in atoms]))])
     weights = np.concatenate([np.full(atom.onsets.size, np.sqrt(atom.threshold)) for atom in atoms])
-    form = GroupForm(GroupProblem(np.hstack(designs), r, edges, weights),
+    form = GroupSparseStructure(GroupProblem(np.hstack(designs), r, edges, weights),
                      {name: a.shape for name, a in variables.items()})
     residual, misfit = cp.Variable(r.size, name="residual"), r - fit
     sizes = {f"size[{atom.label}]": _sizes(atom, a) for atom, a in zip(atoms, variables.values())}
@@ -87,7 +87,7 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
         {"residual": (residual == misfit,)}, {**variables, "residual": residual},
         {name: _alone(atom, r) for name, atom in zip(variables, atoms)}, dict,
         View({**variables, **sizes}, kind="signature"),
-        structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, group=form,
+        structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, structure=form,
         certify=partial(certify), scale=0.5 * float(r @ r))
 
 
@@ -119,8 +119,8 @@ def sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], 
         atoms: as there.
         count: samples of the window.
     """
-    form = program.group
-    assert form is not None
+    form = program.structure
+    assert isinstance(form, GroupSparseStructure)
     problem, penalty = form.problem, float(np.asarray(program.parameters["lambda"].value))
     free = not program.user_constraints
     certified = bool(solution.has_point and solution.proof and solution.status in (Status.OPTIMAL, Status.LOCAL))

@@ -2,19 +2,20 @@
 
 import numpy as np
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.nuclear_admm import minimise
 from optid.program.program import Program
 from optid.program.solution import Status
+from optid.structures.nuclear_norm import NuclearNormStructure
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `NuclearForm` and no further constraints.
+    """Solve a programme that carries a `NuclearNormStructure` and no further constraints.
 
     Options: ``limit`` (iterations at most, default 20,000).
     """
-    form = program.nuclear
-    if form is None:
+    form = program.structure
+    if not isinstance(form, NuclearNormStructure):
         return Answer(Status.FAILED, "the programme carries no nuclear-norm structure")
     weight = float(np.asarray(program.parameters[form.weight].value))
     # half of what the judgement allows at this accuracy

@@ -2,19 +2,20 @@
 
 import numpy as np
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.group_descent import minimise
 from optid.program.program import Program
 from optid.program.solution import Status
+from optid.structures.group_sparse import GroupSparseStructure
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `GroupForm` and no further constraints.
+    """Solve a programme that carries a `GroupSparseStructure` and no further constraints.
 
     Options: ``limit`` (rounds at most, default 2,000).
     """
-    form = program.group
-    if form is None:
+    form = program.structure
+    if not isinstance(form, GroupSparseStructure):
         return Answer(Status.FAILED, "the programme carries no group-sparse structure")
     penalty = float(np.asarray(program.parameters[form.penalty].value))
     if not penalty > 0:

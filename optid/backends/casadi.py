@@ -16,7 +16,7 @@ import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Smooth, by_name, cache, smooth
 from optid.errors import StructureError
 from optid.program.gradients import MOVES, sources

@@ -8,7 +8,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from optid.backends import Answer, BackEnd
+from optid.backends.back_end import Answer, BackEnd
+from optid.structures.group_sparse import GroupSparseStructure
+from optid.structures.least_squares import RankOneStructure
+from optid.structures.nuclear_norm import NuclearNormStructure
 
 CONIC: dict[str, tuple[str, str, str]] = {
     "clarabel": ("LP QP SOCP SDP conic", "clarabel", "clarabel"),
@@ -56,34 +59,37 @@ WARM = {"clarabel", "daqp", "osqp", "piqp", "proxqp", "scs"}
 def back_ends() -> list[BackEnd]:
     """Return all of them, installed or not."""
     return [
-        *(BackEnd(name, frozenset(classes.split()), partial(_run, "conic:solve_with", name), _is_installed(package),
-                  pip, duals=name not in WITHOUT_DUALS, warm=name in WARM, about="through CVXPY")
+        *(BackEnd(name, frozenset(classes.split()), partial(_run, "optid.backends.conic:solve_with", name),
+                  installed=_is_installed(package), pip=pip, duals=name not in WITHOUT_DUALS,
+                  warm=name in WARM, about="through CVXPY")
           for name, (classes, package, pip) in CONIC.items()),
-        BackEnd("ipopt", frozenset({"LP", "QP", "NLP"}), partial(_run, "casadi:solve_with", "ipopt"),
-                _is_installed("casadi"), "casadi", warm=True,
+        BackEnd("ipopt", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", "ipopt"),
+                installed=_is_installed("casadi"), pip="casadi", warm=True,
                 about="interior point with exact Hessians, through CasADi; large sparse programmes"),
-        BackEnd("fatrop", frozenset({"LP", "QP", "NLP"}), partial(_run, "casadi:solve_with", "fatrop"),
-                _is_installed("casadi"), "casadi", warm=True,
+        BackEnd("fatrop", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", "fatrop"),
+                installed=_is_installed("casadi"), pip="casadi", warm=True,
                 about="interior point with exact Hessians, through CasADi; blind to infeasibility"),
-        BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "uno:run"),
-                _is_installed("unopy") and _is_installed("sparsediffpy"), "unopy sparsediffpy", warm=True,
+        BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.uno:run"),
+                installed=_is_installed("unopy") and _is_installed("sparsediffpy"), pip="unopy sparsediffpy", warm=True,
                 about="SQP through CVXPY's derivative engine; small dense programmes"),
-        BackEnd("gauss_newton", frozenset({"rank-one"}), partial(_run, "gauss_newton:run"), warm=True,
-                thorough={"starts": 32, "directions": 16, "descents": 12},
+        BackEnd("gauss_newton", frozenset(), partial(_run, "optid.backends.gauss_newton:run"),
+                structures=(RankOneStructure,), warm=True, thorough={"starts": 32, "directions": 16, "descents": 12},
                 about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints"),
-        BackEnd("alternating", frozenset({"rank-one"}), partial(_run, "alternating:run"), warm=True,
+        BackEnd("alternating", frozenset(), partial(_run, "optid.solving.alternating:run"),
+                structures=(RankOneStructure,), warm=True,
                 about="alternating convex half-steps for rank-one least squares, through any convex back end"),
-        BackEnd("admm", frozenset({"nuclear"}), partial(_run, "admm:run"),
+        BackEnd("admm", frozenset(), partial(_run, "optid.backends.admm:run"), structures=(NuclearNormStructure,),
                 about="own ADMM for nuclear-norm subspace fits; stops by the duality gap"),
-        BackEnd("block_descent", frozenset({"group-sparse"}), partial(_run, "block_descent:run"), warm=True,
+        BackEnd("block_descent", frozenset(), partial(_run, "optid.backends.block_descent:run"),
+                structures=(GroupSparseStructure,), warm=True,
                 about="own active-set block descent for group-sparse programmes; stops by the duality gap"),
     ]
 
 
 def _run(target: str, *arguments: Any) -> Answer:
-    """Call the function "module:name" below `optid.backends`, with a solver's word where one is given first."""
+    """Call the function "module:name", with a solver's word where one is given first."""
     module, _, function = target.partition(":")
-    return getattr(import_module(f"optid.backends.{module}"), function)(*arguments)
+    return getattr(import_module(module), function)(*arguments)
 
 
 def _is_installed(package: str) -> bool:

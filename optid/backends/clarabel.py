@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from optid.backends import Settings
+from optid.backends.back_end import Settings
 from optid.backends.conic import tolerances
 from optid.program.solution import Status
 

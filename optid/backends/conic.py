@@ -5,7 +5,7 @@ from typing import Any
 
 import cvxpy as cp
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
 from optid.program.program import Program
 from optid.program.solution import Status

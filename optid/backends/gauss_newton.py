@@ -9,7 +9,8 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import nnls
 
-from optid.backends import Answer, Settings, find
+from optid.backends.back_end import Answer, Settings
+from optid.backends.choice import find
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.certificate.infeasibility import satisfiable
 from optid.certificate.ladder import certify
@@ -19,9 +20,10 @@ from optid.models.gauges import gauge_factor
 from optid.program.gradients import flat_value
 from optid.program.judging import measure_violation, term_size
 from optid.program.limits import EQUALITIES, INEQUALITIES
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
+from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.rank_one import Point, reduce
 
 STEPS = 100
@@ -30,13 +32,13 @@ DESCENTS = 2  # how many of these are followed to the end
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `RankOneForm`.
+    """Solve a programme that carries a `RankOneStructure`.
 
     Options: ``inner`` (conic back end of the step QPs, default clarabel), ``starts`` (number of starts, default 8),
     ``seed`` of the random ones; under constraints ``directions`` (different b that are settled first, default 4) and
     ``descents`` (how many of these are then followed to their end, default 2).
     """
-    form = program.rank_one
+    form = rank_one_of(program)
     if form is None:
         return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
     options = dict(settings.options)
@@ -47,7 +49,7 @@ def run(program: Program, settings: Settings) -> Answer:
     return whole.solve(count, seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
 
 
-def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -> Answer:
+def _unconstrained(program: Program, form: RankOneStructure, count: int, seed: int) -> Answer:
     found = _minimum(program, form, count, seed)
     values = to_values(program, form, found.point)
     r = form.problem.root @ found.point.lift() - form.problem.target
@@ -56,7 +58,7 @@ def _unconstrained(program: Program, form: RankOneForm, count: int, seed: int) -
                   "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
 
 
-def _minimum(program: Program, form: RankOneForm, count: int, seed: int) -> LocalSolution:
+def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:
     """Descend from the programme's start, and from others where the instant proof fails there."""
     found = minimise(form.problem, start_point(form, program.start)) if program.start else None
     if found is not None and certify(form.problem, found.point, effort="instant").bound.proved:
@@ -65,14 +67,14 @@ def _minimum(program: Program, form: RankOneForm, count: int, seed: int) -> Loca
     return found if found is not None and found.value <= others.value else others
 
 
-def start_point(form: RankOneForm, start: Values) -> Point:
+def start_point(form: RankOneStructure, start: Values) -> Point:
     """Read a point from named values."""
     w = np.concatenate([np.ravel(start[name], order="F") for name in form.linear] or [np.zeros(0)])
     return Point(w, tuple(np.asarray(start[mu], dtype=float) for mu, _ in form.blocks),
                  tuple(np.ravel(start[b], order="F") for _, b in form.blocks))
 
 
-def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
+def to_values(program: Program, form: RankOneStructure, point: Point) -> dict[str, np.ndarray]:
     """Name the parts of a point, in the programme's gauge."""
     values: dict[str, np.ndarray] = {}
     position = 0
@@ -92,7 +94,7 @@ def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np
 class _Constrained:
     """The constrained iteration on one programme."""
 
-    def __init__(self, program: Program, form: RankOneForm, settings: Settings, inner: str) -> None:
+    def __init__(self, program: Program, form: RankOneStructure, settings: Settings, inner: str) -> None:
         self.program, self.form, self.problem = program, form, form.problem
         self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-11), warm=False)
         self.at = Coordinates(program, form)

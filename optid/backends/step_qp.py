@@ -13,13 +13,14 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
 from optid.program.gradients import affine_parts, flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Status
+from optid.structures.least_squares import RankOneStructure
 from optid.structures.rank_one import Point
 
 
@@ -33,7 +34,7 @@ class Coordinates:
     """
 
     program: Program
-    form: RankOneForm
+    form: RankOneStructure
 
     @property
     def names(self) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Derivatives, Smooth, by_name, derivatives, smooth
 from optid.program.program import Program
 from optid.program.solution import Status

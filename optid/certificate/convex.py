@@ -21,8 +21,9 @@ from scipy.optimize import nnls
 from optid.certificate.lifting import lift_linear
 from optid.program.gradients import flat_value, jacobians
 from optid.program.judging import Lagrangian, has_bounds
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
+from optid.structures.least_squares import LeastSquaresStructure
 
 Array = np.ndarray
 
@@ -49,7 +50,7 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
         objective: its value at the point.
     """
     program.assign(values)
-    form = program.least_squares
+    form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
     if form is None:
         value = _tangent_bound(program, duals, objective)
         found = None if value is None else (value, f"tangent of the Lagrangian, within {REACH:g} times the solution")
@@ -64,7 +65,7 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
     return Bound(value, gap <= CLOSED, method, f"{state}: {words}, relative gap {gap:.1e}")
 
 
-def _least_squares_bound(program: Program, form: RankOneForm, duals: Values, objective: float
+def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float
                          ) -> tuple[float, str] | None:
     words = "least-squares dual"
     best = _quadratic_bound(program, form, duals, objective)
@@ -77,7 +78,7 @@ def _least_squares_bound(program: Program, form: RankOneForm, duals: Values, obj
     return None if best is None else (best, f"{words} of the solver's multipliers")
 
 
-def _quadratic_bound(program: Program, form: RankOneForm, duals: Values, objective: float) -> float | None:
+def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float | None:
     """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
     lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.user_constraints if name in duals})
     if any(name not in duals for name in program.user_constraints) or not lagrangian.known:
@@ -158,7 +159,7 @@ def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
     return float(np.sum(np.abs(gradient) * room))
 
 
-def _own_multipliers(program: Program, form: RankOneForm) -> dict[str, Array] | None:
+def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
     problem = form.problem
     found = lift_linear(program, form.linear, len(problem.target))

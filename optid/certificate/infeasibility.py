@@ -10,6 +10,7 @@ from optid.certificate.lifting import lift_exact, places
 from optid.program.gradients import flat_value, jacobians
 from optid.program.limits import EQUALITIES
 from optid.program.program import Program
+from optid.structures.least_squares import rank_one_of
 
 
 def explain(program: Program) -> str:
@@ -20,7 +21,8 @@ def explain(program: Program) -> str:
     linearisation at the start, and the sentence says so.
     """
     names = list(program.user_constraints)
-    stand_in = {} if program.rank_one is None else places(program, program.rank_one).stand_in
+    form = rank_one_of(program)
+    stand_in = {} if form is None else places(program, form).stand_in
     linearised = [name for name in names
                   if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     conflict = conflicting_subset(program)
@@ -54,7 +56,7 @@ def conflicting_subset(program: Program) -> list[str] | None:
 
 def satisfiable(program: Program, names: Sequence[str]) -> bool:
     """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
-    form = program.rank_one
+    form = rank_one_of(program)
     # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
     found = [c for name in program.structural for c in program.constraints[name] if c.is_dcp()]
     where = None if form is None else places(program, form)

@@ -14,8 +14,9 @@ from cvxpy.constraints.constraint import Constraint
 from optid.certificate.ladder import certify
 from optid.program.gradients import affine_parts
 from optid.program.limits import EQUALITIES, INEQUALITIES
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Bound
+from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.rank_one import Point, RankOne
 
 
@@ -74,7 +75,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     """Certify a point of a rank-one programme under its user constraints.
 
     Args:
-        program: a programme with a `RankOneForm`.
+        program: a programme with a `RankOneStructure`.
         values: the point.
         duals: multipliers by constraint; not needed, because the certificate computes its own.
         max_size: number of multipliers above which the semidefinite relaxation is not attempted.
@@ -82,7 +83,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     Returns:
         The bound, and values to restart from where the relaxation proposes a better point.
     """
-    form = program.rank_one
+    form = rank_one_of(program)
     if form is None:
         return Bound.none(f"no proof: {program.name!r} has no rank-one structure left"), None
     lifted = lift_exact(program, form)
@@ -96,13 +97,13 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     return found.bound, _named(program, form, found.better[0])
 
 
-def _point(form: RankOneForm, values: Values) -> Point:
+def _point(form: RankOneStructure, values: Values) -> Point:
     w = np.concatenate([np.ravel(values[name], order="F") for name in form.linear] or [np.zeros(0)])
     return Point(w, tuple(np.asarray(values[mu]) for mu, _ in form.blocks),
                  tuple(np.ravel(values[b], order="F") for _, b in form.blocks))
 
 
-def _named(program: Program, form: RankOneForm, point: Point) -> Values:
+def _named(program: Program, form: RankOneStructure, point: Point) -> Values:
     found, position = {}, 0
     for name in form.linear:
         size = program.variables[name].size
@@ -175,7 +176,7 @@ class Places:
         return _rows(member.tree_copy(self.stand_in), self.columns, self.size)
 
 
-def places(program: Program, form: RankOneForm) -> Places:
+def places(program: Program, form: RankOneStructure) -> Places:
     """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
     problem = form.problem
     columns, stand_in = _columns(program, form.linear), {}
@@ -186,7 +187,7 @@ def places(program: Program, form: RankOneForm) -> Places:
     return Places(len(problem.target), columns, stand_in)
 
 
-def lift_exact(program: Program, form: RankOneForm) -> Lifted:
+def lift_exact(program: Program, form: RankOneStructure) -> Lifted:
     """Bring the user constraints of a bilinear programme into lifted form."""
     problem = form.problem
     lifted, where = Lifted(len(problem.target)), places(program, form)

@@ -169,7 +169,7 @@ def _as_options(text: str) -> str:
 
 
 def _show(found: Any, posed: str, record: str) -> None:
-    from optid.backends import back_ends
+    from optid.backends.choice import back_ends
     from optid.program.solution import GRADIENT
     from optid.show.wording import number, seconds
     from optid.studies.verdicts.choice import listed

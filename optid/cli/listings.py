@@ -17,12 +17,12 @@ Show = Callable[[], None]
 
 def solvers() -> Show:
     """Return what prints every back end: those that are installed, then those that are a pip line away."""
-    from optid.backends import back_ends
+    from optid.backends.choice import back_ends
 
     order = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
     rows = []
     for back_end in sorted(back_ends().values(), key=lambda b: (not b.installed, b.name)):
-        classes = [name for name in order if name in back_end.classes] + sorted(back_end.classes - set(order))
+        classes = sorted(back_end.accepted, key=lambda word: order.index(word) if word in order else len(order))
         missing = f"pip install {back_end.pip}" if back_end.pip else "from its vendor"
         rows.append(
             (

@@ -24,7 +24,7 @@ def check_names(formulation: str, constraints: Iterable[str] | None, solver: str
         if word != "none":
             entry_point(CONSTRAINTS, word.partition(":")[0])
     if solver != "auto":
-        from optid.backends import find
+        from optid.backends.choice import find
 
         find(solver)
 

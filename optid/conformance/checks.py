@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.backends import BackEnd
+from optid.backends.back_end import BackEnd
 from optid.conformance.zoo import SOLVED, Case, cases
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError

@@ -12,8 +12,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.program.program import GroupForm, NuclearForm, Program, RankOneForm
+from optid.program.program import Program
 from optid.program.view import View
+from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+from optid.structures.least_squares import RankOneStructure
+from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
+from optid.structures.rank_one import RankOne
 
 SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 
@@ -314,18 +318,16 @@ def _rank_one() -> list[Case]:
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
     def bilinear(name: str, start: Mapping[str, Any], extra: Callable[[Any], Mapping[str, Any]]) -> Program:
-        from optid.structures.rank_one import RankOne
-
         a, mu, b = cp.Variable(1, name="a"), cp.Variable(4, name="mu"), cp.Variable(2, name="b")
         r = cp.Variable(root.shape[0], name="r")
         theta = cp.outer(mu, b)
         residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
         constraints = {"residual": r == residual, "gauge": cp.sum_squares(b) == 1, **extra(mu)}
-        form = RankOneForm(RankOne(root, target, remainder, ((4, 2),), 1, float(y @ y)), ("a",), (("mu", "b"),))
+        form = RankOneStructure(RankOne(root, target, remainder, ((4, 2),), 1, float(y @ y)), ("a",), (("mu", "b"),))
         return pose(name, cp.sum_squares(r) + remainder, constraints, [a, mu, b, r],
                     start={"a": np.zeros(1), **start},
                     structural=frozenset({"residual", "gauge"}), derived={"r": residual},
-                    rank_one=form, expressions={"Theta": theta},
+                    structure=form, expressions={"Theta": theta},
                     scale=float(y @ y))
 
     def rank_one_fit() -> Program:
@@ -348,8 +350,6 @@ def _nuclear() -> list[Case]:
     best = (left * kept) @ right
 
     def nuclear_shrinkage() -> Program:
-        from optid.structures.nuclear_norm import NuclearProblem
-
         yhat, inner = cp.Variable(y.shape, name="yhat"), cp.Variable(y.T.shape, name="X")
         r = cp.Variable(y.size, name="r")
         misfit = cp.vec(yhat - y, order="C")
@@ -357,7 +357,8 @@ def _nuclear() -> list[Case]:
         return pose("nuclear_shrinkage", cp.normNuc(inner) + parameter * cp.sum_squares(r),
                     {"structure": inner == yhat.T, "residual": r == misfit}, [yhat, inner, r], start={"yhat": y},
                     structural=frozenset({"structure", "residual"}), derived={"X": yhat.T, "r": misfit},
-                    parameters={"weight": parameter}, nuclear=NuclearForm(NuclearProblem(y, np.arange(9), 1)),
+                    parameters={"weight": parameter},
+                    structure=NuclearNormStructure(NuclearProblem(y, np.arange(9), 1)),
                     scale=weight * float(np.sum(y**2)))
 
     return [Case(nuclear_shrinkage, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
@@ -376,17 +377,15 @@ def _group_sparse() -> list[Case]:
     value = 0.5 * float(rest @ rest) + penalty * sum(w * float(np.linalg.norm(z)) for w, z in zip(weights, shrunk))
 
     def group_shrinkage() -> Program:
-        from optid.structures.group_sparse import GroupProblem
-
         parts = [cp.Variable(z.size, name=f"a{i + 1}") for i, z in enumerate(groups)]
         e, parameter = cp.Variable(12, name="residual"), cp.Parameter(nonneg=True, name="lambda", value=penalty)
         misfit = target - design @ cp.hstack(parts)
         norms: Any = sum(w * cp.norm(part, 2) for w, part in zip(weights, parts))
-        form = GroupForm(GroupProblem(design, target, np.array([0, 1, 2, 5, 7]), weights),
+        form = GroupSparseStructure(GroupProblem(design, target, np.array([0, 1, 2, 5, 7]), weights),
                          {part.name(): part.shape for part in parts})
         return pose("group_shrinkage", 0.5 * cp.sum_squares(e) + parameter * norms, {"residual": e == misfit},
                     [*parts, e], structural=frozenset({"residual"}), derived={"residual": misfit},
-                    parameters={"lambda": parameter}, group=form, scale=0.5 * float(target @ target))
+                    parameters={"lambda": parameter}, structure=form, scale=0.5 * float(target @ target))
 
     return [Case(group_shrinkage, value=value, point={f"a{i + 1}": z for i, z in enumerate(shrunk)},
                  duals={"residual": -rest})]

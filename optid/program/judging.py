@@ -11,10 +11,9 @@ from cvxpy.constraints.second_order import SOC
 from cvxpy.constraints.zero import Equality, Zero
 
 from optid.program.gradients import flat_value, jacobians
-from optid.program.program import Program, RankOneForm, Values
+from optid.program.program import Program, Values
 from optid.program.solution import Residuals
-
-ZERO = 1e-9  # a variable without a start that is smaller than this has no size of its own to measure by
+from optid.program.structure import relative_gradient, variable_size
 
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
@@ -31,55 +30,17 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
     """
     program.assign(values)
     violation, worst = measure_violation(program)
-    form = program.rank_one or program.least_squares
-    if form is not None and not program.user_constraints:
-        objective, stationarity = _rank_one_residuals(program, form)
+    known = program.structure.measure(program) if program.structure and not program.user_constraints else None
+    if known is not None:
+        objective, stationarity = known
         return objective, Residuals(violation, worst, stationarity, 0.0)
     objective = float(np.asarray(program.objective.expr.value))
     stationarity, complementarity = _first_order(program, duals, objective)
     return objective, Residuals(violation, worst, stationarity, complementarity)
 
 
-def _rank_one_residuals(program: Program, form: RankOneForm) -> tuple[float, float]:
-    """Objective and stationarity of an unconstrained rank-one programme from its compressed numbers.
-
-    The gauge has multiplier zero, because moving the scale between mu and b does not change the objective.
-    """
-    problem = form.problem
-    flat = {name: flat_value(variable) for name, variable in program.variables.items()}
-    pairs = [(flat[mu], flat[b]) for mu, b in form.blocks]
-    z = np.concatenate([*(flat[name] for name in form.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
-    r = problem.root @ z - problem.target
-    value = float(r @ r) + problem.remainder
-    pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
-    parts, position = [], 0
-    for name in form.linear:
-        span = slice(position, position + flat[name].size)
-        parts.append((name, pull[span], effort[span]))
-        position = span.stop
-    for (mu_name, b_name), (mu, b) in zip(form.blocks, pairs):
-        span = slice(position, position + mu.size * b.size)
-        block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
-        parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
-        position = span.stop
-    yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
-    for name, gradient, terms in parts:
-        worst = max(worst, _relative(np.abs(gradient), terms, yardstick, _size(program.variables[name], usual)))
-    return value, worst
-
-
 def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
-    """Largest entry of a variable or of its start; one where there is no start and nothing but rounding."""
-    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
-    if variable.id in usual:
-        return max(size, usual[variable.id])
-    return size if size > ZERO else 1.0
-
-
-def _relative(gradient: np.ndarray, terms: np.ndarray, yardstick: float, size: float) -> float:
-    """Largest component of a gradient relative to its terms plus the objective's size per size of the variable."""
-    floor = yardstick / size + terms
-    return float(np.max(gradient / np.where(floor > 0, floor, 1.0), initial=0.0))
+    return variable_size(flat_value(variable), usual.get(variable.id))
 
 
 def value_size(program: Program, objective: float) -> float:
@@ -239,7 +200,7 @@ class Lagrangian:
             part = self.free_part(variable)
             if part is None:
                 return float("nan")
-            worst = max(worst, _relative(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
+            worst = max(worst, relative_gradient(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
         return worst
 
     def free_part(self, variable: cp.Variable) -> np.ndarray | None:

@@ -12,6 +12,7 @@ from cvxpy.constraints.constraint import Constraint
 from optid.errors import StructureError, nearest
 from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
 from optid.program.solution import Bound
+from optid.program.structure import Structure
 from optid.program.view import Values, View
 
 
@@ -44,70 +45,6 @@ def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
 
 
 @dataclass(frozen=True)
-class RankOneForm:
-    """The least-squares structure behind a bilinear programme, for methods that exploit it.
-
-    ``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
-
-    Attributes:
-        problem: the numbers (`optid.structures.rank_one.RankOne`).
-        linear: names of the linear variables in the order of z (each flattened column by column).
-        blocks: (mu name, b name) of every rank-one block.
-        gauge: "norm", "gain" or "b0".
-    """
-
-    problem: Any
-    linear: tuple[str, ...]
-    blocks: tuple[tuple[str, str], ...]
-    gauge: str = "norm"
-
-
-@dataclass(frozen=True)
-class NuclearForm:
-    """The structured nuclear-norm problem behind a convex programme, for methods that exploit it.
-
-    ``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²``; its variables are ``yhat`` = v and, with a predictor, ``T`` = theta;
-    the constraint ``structure`` ties the matrix whose nuclear norm is taken to them.
-
-    Attributes:
-        problem: the numbers (`optid.structures.nuclear_norm.NuclearProblem`).
-        weight: name of the parameter that holds the weight.
-    """
-
-    problem: Any
-    weight: str = "weight"
-
-
-@dataclass(frozen=True)
-class GroupForm:
-    """The group-sparse least-squares structure behind a convex programme, for methods that exploit it.
-
-    ``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
-
-    Attributes:
-        problem: the numbers (`optid.structures.group_sparse.GroupProblem`).
-        blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
-        penalty: name of the parameter that holds lambda.
-        residual: name of the variable of the residual, and of the constraint that defines it.
-    """
-
-    problem: Any
-    blocks: Mapping[str, tuple[int, ...]]
-    penalty: str = "lambda"
-    residual: str = "residual"
-
-    def flat(self, values: Values) -> np.ndarray:
-        """Return a from named values."""
-        return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
-
-    def shaped(self, a: np.ndarray) -> dict[str, np.ndarray]:
-        """Return named values from a, the residual included."""
-        cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
-        parts = {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
-        return {**parts, self.residual: self.problem.target - self.problem.design @ a}
-
-
-@dataclass(frozen=True)
 class Program:
     """One optimisation problem with named parts, independent of who solves it.
 
@@ -123,12 +60,7 @@ class Program:
         parameters: {name: CVXPY parameter} that may change between solves without recompiling.
         derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
             variables; they are recomputed at every point before it is judged.
-        rank_one: least-squares structure for Gauss-Newton and the certificate, or None.
-        nuclear: nuclear-norm structure for the ADMM, or None.
-        group: group-sparse structure for the block descent, or None.
-        least_squares: a `RankOneForm` without products, where the objective without the user's constraints is such a
-            sum of squares and the structural constraints only fix directions that do not change it; it is judged from
-            these numbers then.
+        structure: what special methods, judging and proofs may use of it, or None.
         certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
@@ -148,10 +80,7 @@ class Program:
     structural: frozenset[str] = frozenset()
     parameters: Mapping[str, cp.Parameter] = field(default_factory=dict)
     derived: Mapping[str, cp.Expression] = field(default_factory=dict)
-    rank_one: RankOneForm | None = None
-    nuclear: NuclearForm | None = None
-    group: GroupForm | None = None
-    least_squares: RankOneForm | None = None
+    structure: Structure | None = None
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
     note: str = ""
@@ -285,7 +214,7 @@ class Program:
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, limits=limits,
-                       rank_one=None, nuclear=None, group=None, least_squares=None, certify=None,
+                       structure=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
@@ -314,7 +243,7 @@ class Program:
         rest = {key: group for key, group in self.constraints.items() if key != name}
         objective = cp.Minimize(self.objective.expr + weight / self.unit * penalty)
         return replace(self, objective=objective, constraints=rest,
-                       rank_one=None, nuclear=None, least_squares=None, certify=None,
+                       structure=None, certify=None,
                        note=f"constraint {name!r} is a penalty here")
 
     def without(self, *names: str) -> "Program":

@@ -21,6 +21,7 @@ from optid.models.responses import response_pairs, step_length
 from optid.show import panels, summary
 from optid.show.estimates import uncertainty
 from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
+from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -140,7 +141,7 @@ def noise(fit: "Fit") -> Figure:
 def certificate(fit: "Fit") -> Figure:
     """Draw how far the proof of global optimality went: the ladder of proofs and the gap that is left."""
     bound = fit.solution.bound
-    ladder = fit.program.rank_one is not None and bound is not None and bound.method in RUNGS
+    ladder = rank_one_of(fit.program) is not None and bound is not None and bound.method in RUNGS
     figure = Figure(figsize=(9.0, 2.7 if ladder else 1.9), layout="constrained")
     axes = figure.subplots(2 if ladder else 1, 1, height_ratios=[1, 1.35] if ladder else None, squeeze=False)[:, 0]
     if ladder and bound is not None:

@@ -6,7 +6,7 @@ import time
 import warnings
 from multiprocessing.connection import Connection
 
-from optid.backends import Answer, BackEnd, Settings
+from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.errors import StructureError
 from optid.program.program import Program
 from optid.program.solution import Status

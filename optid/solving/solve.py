@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.backends import Answer, BackEnd, Settings, choose, fallbacks, find
+from optid.backends.back_end import Answer, BackEnd, Settings
+from optid.backends.choice import choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.errors import SolverRefused, StructureError
@@ -15,6 +16,7 @@ from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
 from optid.solving.isolated import run_isolated
+from optid.structures.least_squares import rank_one_of
 
 Procedure = Generator[Program, Solution, Any]
 
@@ -190,7 +192,7 @@ def _overflowed(program: Program) -> bool:
 
 def _contradictory(program: Program) -> bool:
     """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
-    return program.rank_one is not None and bool(program.user_constraints) and not satisfiable(
+    return rank_one_of(program) is not None and bool(program.user_constraints) and not satisfiable(
         program, list(program.user_constraints))
 
 

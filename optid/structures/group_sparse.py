@@ -7,13 +7,16 @@ D is strongly concave, so that the best v lies within sqrt(2 (P - D)) of any fea
 below lambda w_g on that whole ball is zero in every minimiser (the gap-safe sphere of Ndiaye et al. 2017).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.program.structure import Structure
 
 SPREAD = 1e-8
 """Columns of a group may differ from an orthogonal set of one length by this much."""
@@ -106,3 +109,36 @@ class GroupProblem:
         rounding = 1e-14 * float(self.target @ self.target)
         radius = np.sqrt(2 * max(gap, 0.0) + rounding)
         return self.norms(self.design.T @ point) + radius * self.lengths < penalty * self.weights
+
+
+@dataclass(frozen=True, eq=False)
+class GroupSparseStructure(Structure):
+    """``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
+
+    Attributes:
+        problem: the numbers.
+        blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
+        penalty: name of the parameter that holds lambda.
+        residual: name of the variable of the residual, and of the constraint that defines it.
+    """
+
+    word: ClassVar[str] = "group-sparse"
+    problem: GroupProblem
+    blocks: Mapping[str, tuple[int, ...]]
+    penalty: str = "lambda"
+    residual: str = "residual"
+
+    @property
+    def about(self) -> str:
+        """What the programme is and how large."""
+        return f"{self.problem.weights.size} groups"
+
+    def flat(self, values: Mapping[str, Array]) -> Array:
+        """Return a from named values."""
+        return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
+
+    def shaped(self, a: Array) -> dict[str, Array]:
+        """Return named values from a, the residual included."""
+        cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
+        parts = {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
+        return {**parts, self.residual: self.problem.target - self.problem.design @ a}

@@ -9,10 +9,12 @@ decomposed once for all weights and step sizes.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.program.structure import Structure
 
 RANK = 1e-11  # eigenvalues below this part of the largest are none
 
@@ -358,3 +360,25 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
             found.append(offset + np.flatnonzero(whole))
         offset += length
     return np.concatenate(found) if found else np.zeros(0, dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class NuclearNormStructure(Structure):
+    """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
+
+    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix of the
+    nuclear norm to them.
+
+    Attributes:
+        problem: the numbers.
+        weight: name of the parameter that holds the weight.
+    """
+
+    word: ClassVar[str] = "nuclear"
+    problem: NuclearProblem
+    weight: str = "weight"
+
+    @property
+    def about(self) -> str:
+        """What the programme is and how large."""
+        return f"nuclear norm of a Hankel matrix, {self.problem.shape} entries"

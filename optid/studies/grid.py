@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.backends import find
+from optid.backends.choice import find
 from optid.data.record import Data
 from optid.errors import SolverMissing, StudyError
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study

@@ -5,7 +5,7 @@ import inspect
 from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 
-from optid.backends import AUTO, back_ends
+from optid.backends.choice import AUTO, back_ends
 from optid.registry import FORMULATIONS, registered
 
 ALWAYS = ("optid", "numpy", "scipy", "cvxpy")

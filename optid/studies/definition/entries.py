@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
-from optid.backends import back_ends
+from optid.backends.choice import back_ends
 from optid.bases import parse
 from optid.data.record import Data
 from optid.errors import OptidError, nearest

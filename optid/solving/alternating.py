@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import cvxpy as cp
 import numpy as np
 
-from optid.backends import Answer, Settings
+from optid.backends.back_end import Answer, Settings
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
+from optid.structures.least_squares import rank_one_of
 
 GAUGE = "gauge"  # name of the structural constraint that fixes the scale between mu and b
 STEPS = 1000
@@ -28,7 +29,7 @@ def run(program: Program, settings: Settings) -> Answer:
     pairs of half-steps, default 1000).
 
     Args:
-        program: a programme that carries a `RankOneForm`; its constraints must be convex in each half.
+        program: a programme that carries a `RankOneStructure`; its constraints must be convex in each half.
         settings: what is asked.
 
     Returns:
@@ -37,7 +38,7 @@ def run(program: Program, settings: Settings) -> Answer:
     Raises:
         StructureError: a constraint that is not convex even with one factor held.
     """
-    form = program.rank_one
+    form = rank_one_of(program)
     if form is None:
         return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
     options = dict(settings.options)

@@ -1,0 +1,114 @@
+"""What a back end is: one function ``run(program, settings) -> Answer`` with its capabilities as data.
+
+What it answers is a claim: `optid.solving` measures the point and decides the status.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.program.solution import Status
+from optid.program.structure import Structure
+
+if TYPE_CHECKING:  # programmes import CVXPY, which the list of solvers does not need
+    from optid.program.program import Program
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked of a solver, in words that do not depend on the solver.
+
+    Attributes:
+        accuracy: requested relative accuracy; every back end translates it into its own tolerances.
+        time_limit: seconds, or None.
+        warm: start from the programme's ``start`` (or the previous solution) where the solver can.
+        verbose: let the solver print.
+        options: native options, passed through.
+    """
+
+    accuracy: float = 1e-8
+    time_limit: float | None = None
+    warm: bool = True
+    verbose: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A solver's claim.
+
+    Attributes:
+        status: its own status in our words; a claim of success is ``Status.LOCAL`` or ``Status.OPTIMAL``.
+        word: its own word.
+        values: {variable: array}, empty without a point.
+        duals: {constraint: flat multipliers}; may be incomplete.
+        iterations: -1 where unknown.
+        compile: seconds of the call that translated the programme for the solver; nan where they are not told apart.
+    """
+
+    status: Status
+    word: str
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+    duals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    iterations: int = -1
+    compile: float = float("nan")
+
+
+@dataclass(frozen=True)
+class BackEnd:
+    """One solver under one word.
+
+    Attributes:
+        name: the word, in lower case.
+        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP".
+        run: (program, settings) -> Answer.
+        installed: whether it can run here.
+        pip: what to install where it cannot.
+        structures: types of structure it accepts, whatever the class of the programme.
+        duals: whether it returns multipliers.
+        warm: whether it can start from a given point.
+        thorough: options with which it searches further for a better local optimum, for where the proof fails.
+        about: one line for the table of solvers.
+        broken: why its entry point cannot be loaded, "" where it can.
+    """
+
+    name: str
+    classes: frozenset[str]
+    run: Callable[["Program", Settings], Answer] = field(repr=False)
+    installed: bool = True
+    pip: str = ""
+    structures: tuple[type[Structure], ...] = ()
+    duals: bool = True
+    warm: bool = False
+    thorough: Mapping[str, Any] = field(default_factory=dict)
+    about: str = ""
+    broken: str = ""
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        """Classes and structures it accepts, as words."""
+        return (*sorted(self.classes), *(structure.word for structure in self.structures))
+
+    def exploits(self, program: "Program") -> bool:
+        """Whether it accepts the structure of the programme, with the user's constraints."""
+        structure = program.structure
+        return isinstance(structure, self.structures) and (structure.constrained or not program.user_constraints)
+
+    def refuses(self, program: "Program") -> str:
+        """Return why this back end cannot take the programme, or an empty string."""
+        if self.exploits(program):
+            return ""
+        if isinstance(program.structure, self.structures):
+            names = ", ".join(map(repr, program.user_constraints))
+            return (f"{self.name} takes no further constraints ({names}); use a back end of class {program.kind} "
+                    "(clarabel, scs)")
+        kind = program.kind
+        if kind in self.classes:
+            return ""
+        if kind == "NLP":
+            parts = ", ".join(program.nonconvex_parts())
+            return (f"{self.name} solves {', '.join(self.accepted)}; {program.name!r} is not convex in {parts}. "
+                    "Use an NLP back end (gauss_newton, ipopt, uno) or a relaxed formulation")
+        return f"{self.name} solves {', '.join(self.accepted)}; {program.name!r} is of class {kind}"

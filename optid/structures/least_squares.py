@@ -1,0 +1,96 @@
+"""Least squares behind a programme, with and without products of its variables."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.program.structure import Structure, relative_gradient, variable_size
+from optid.structures.rank_one import RankOne
+
+
+class SumOfSquares(Protocol):
+    """The numbers of ``‖root z - target‖² + remainder``."""
+
+    @property
+    def root(self) -> Array:
+        """(k, n)."""
+        ...
+
+    @property
+    def target(self) -> Array:
+        """(k,)."""
+        ...
+
+    @property
+    def remainder(self) -> float:
+        """What no variable changes."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquaresStructure(Structure):
+    """``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
+
+    The structural constraints of its programme only fix directions that do not change F.
+
+    Attributes:
+        problem: the numbers.
+        linear: names of the linear variables in the order of z (each flattened column by column).
+        blocks: (mu name, b name) of every rank-one block; none without products.
+    """
+
+    word: ClassVar[str] = "least-squares"
+    constrained: ClassVar[bool] = True
+    problem: SumOfSquares
+    linear: tuple[str, ...]
+    blocks: tuple[tuple[str, str], ...] = ()
+
+    def measure(self, program: Any) -> tuple[float, float]:
+        """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
+        problem = self.problem
+        flat = {name: np.ravel(v.value, order="F") for name, v in program.variables.items()}
+        pairs = [(flat[mu], flat[b]) for mu, b in self.blocks]
+        z = np.concatenate([*(flat[name] for name in self.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
+        r = problem.root @ z - problem.target
+        value = float(r @ r) + problem.remainder
+        pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
+        parts, position = [], 0
+        for name in self.linear:
+            span = slice(position, position + flat[name].size)
+            parts.append((name, pull[span], effort[span]))
+            position = span.stop
+        for (mu_name, b_name), (mu, b) in zip(self.blocks, pairs):
+            span = slice(position, position + mu.size * b.size)
+            block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
+            parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
+            position = span.stop
+        yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
+        for name, gradient, terms in parts:
+            size = variable_size(flat[name], usual.get(program.variables[name].id))
+            worst = max(worst, relative_gradient(np.abs(gradient), terms, yardstick, size))
+        return value, worst
+
+
+@dataclass(frozen=True, eq=False)
+class RankOneStructure(LeastSquaresStructure):
+    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate.
+
+    Attributes:
+        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
+    """
+
+    word: ClassVar[str] = "rank-one"
+    problem: RankOne
+    gauge: str = "norm"
+
+    @property
+    def about(self) -> str:
+        """What the programme is and how large."""
+        return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
+
+
+def rank_one_of(program: Any) -> RankOneStructure | None:
+    """Return the rank-one structure of a programme, None where it has another or none."""
+    return program.structure if isinstance(program.structure, RankOneStructure) else None
