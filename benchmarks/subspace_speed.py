@@ -27,7 +27,7 @@ import numpy as np
 from scipy.signal import dlsim
 
 from optid import Data, Polynomial, Triangular, fit
-from optid.identify.subspace.projection import positions, project, realise
+from optid.identify.subspace.projection import project, realise
 from optid.statistics.expansion import expand
 from optid.statistics.hankel import hankel_statistics, windows_of
 from optid.statistics.rq import rq
@@ -67,7 +67,7 @@ def formed(record: np.ndarray, expansion, rows: int, scale: np.ndarray) -> np.nd
     hankel = windows_of(expansion(record), 2 * rows).reshape(len(record) - 2 * rows + 1, -1)
     hankel = np.concatenate([np.ones((len(hankel), 1)), hankel], axis=1)
     statistics = hankel_statistics([record[: 4 * rows]], 2 * rows, expansion, method="gram")  # for positions alone
-    z, phi, y = positions(statistics, expansion, "inputs+past", True, rows)
+    z, phi, y = expansion.positions(statistics.at, "inputs+past", rows)
     order = np.concatenate([phi, z[~np.isin(z, phi)], y])
     triangle = np.linalg.qr(hankel[:, order], mode="r")
     r22 = triangle[phi.size : z.size, -y.size :].T

@@ -13,7 +13,7 @@ from formulations.output_error import OutputError
 from formulations.prediction_error import Descent, descend
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
-from optid.identify.subspace.projection import default_block_rows, project, realise
+from optid.identify.subspace.projection import project, realise
 from optid.models.roots import contained, roots_of
 from optid.statistics.expansion import expand
 from optid.statistics.sensitivities import PlantPoint, Unknowns, instruments
@@ -64,7 +64,7 @@ def subspace(data: Data, unknowns: Unknowns) -> Array | None:
         expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # as in `equation_error`
-            found = project(records, expansion, default_block_rows(records, expansion, layout.na), instruments="past")
+            found = project(records, expansion, expansion.block_rows(records, layout.na), instruments="past")
         poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
     except (OptidError, np.linalg.LinAlgError):
         return None

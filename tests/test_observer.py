@@ -8,7 +8,6 @@ from optid.errors import RankError
 from optid.identify.innovations import innovation_form
 from optid.identify.subspace.instruments import simulate_clipped
 from optid.identify.subspace.observer import ObserverForm, observer_gain, observer_problem
-from optid.identify.subspace.projection import default_block_rows
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])
@@ -228,6 +227,6 @@ def test_gain_of_an_innovation_form():
 def test_block_rows_fit_the_record():
     rng = np.random.default_rng(8)
     long, short = records_of(rng, [5000]), records_of(rng, [120])
-    assert default_block_rows(long, expansion_of(long), None) == 10
-    assert default_block_rows(long, expansion_of(long), 8) == 16
-    assert default_block_rows(short, expansion_of(short), 2) < 6
+    assert expansion_of(long).block_rows(long, None) == 10
+    assert expansion_of(long).block_rows(long, 8) == 16
+    assert expansion_of(short).block_rows(short, 2) < 6

@@ -118,6 +118,14 @@ class HankelStatistics:
         """Mean of every signal over the windows and block rows, (d,)."""
         return self.centre + self.gram[0, 1:].reshape(self.rows, self.d).mean(axis=0) / self.windows
 
+    def sizes(self, signals: Sequence[int] | range, centred: bool = True) -> Array:
+        """Standard deviation of some signals over windows and block rows; root mean square where not centred."""
+        at = self.at(signals).reshape(self.rows, -1)
+        energy = np.diag(self.gram)[at].mean(axis=0) / self.windows
+        if centred:
+            energy -= self.gram[0, at].mean(axis=0) ** 2 / self.windows**2
+        return np.sqrt(np.maximum(energy, 1e-300))
+
     def check(self, per_row: float = 1.0) -> None:
         """Refuse fewer windows than `per_row` times the rows of the Hankel matrix.
 

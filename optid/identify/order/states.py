@@ -85,13 +85,8 @@ def _errors(
     """Covariances (alpha l, alpha l) of the errors in the future of `judged` of states and predictors of `fitted`."""
     from scipy.linalg import cholesky, solve_triangular
 
-    at = fitted.at
-    signals = [*expansion.eta, *expansion.zeta]
-    past = np.concatenate([at([*signals, *expansion.y], [i]) for i in range(alpha)])
-    drive = np.concatenate(
-        [[0], at(expansion.eta, range(alpha, 2 * alpha)), at(expansion.zeta, range(alpha, 2 * alpha - 1))]
-    )
-    future = at(expansion.y, range(alpha, 2 * alpha))
+    past = fitted.at([*expansion.eta, *expansion.zeta, *expansion.y], range(alpha))
+    _, drive, future = expansion.positions(fitted.at, "inputs", alpha)
     order = np.concatenate([drive, past, future])
     gram = fitted.gram[np.ix_(order, order)] / fitted.windows
     gram[np.diag_indices_from(gram)] *= 1 + ROUNDING

@@ -1,10 +1,9 @@
 """One study of the order of a record: states, lags, and a recommendation with its reasons."""
 
-import textwrap
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +16,10 @@ from optid.identify.order.lags import LagScan, scan_lags
 from optid.identify.order.ranks import RankTest
 from optid.identify.order.signals import block_rows_for, order_test, with_simulated_outputs
 from optid.identify.order.states import StateCriteria, state_criteria
+from optid.registry import render
 from optid.statistics.channels import check_channels
 from optid.statistics.expansion import expand
 from optid.statistics.hankel import hankel_statistics
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-LINES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,43 +51,11 @@ class OrderStudy:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Return tables, recommendation and reasons, at most 80 columns wide."""
-        ranks, states = self.ranks, self.states
-        lines = [f"Order of {self.data}" if self.data else "Order"]
-        lines.append(f"  {ranks.windows} windows, {self.block_rows} block rows, level {ranks.level:.2g}")
-        heads = f"{'s(n)':>11}{'s/s next':>10}{'tail':>11}{'threshold':>11}{'p':>9}{'BIC':>11}{'hold-out %':>12}"
-        lines.append(f"  {'n':>3}{heads}")
-        roots = np.sqrt(ranks.statistics), np.sqrt(ranks.thresholds)
-        bic = states.bic - states.bic.min()
-        for n in range(min(max(LINES, self.nx + 3), ranks.singular_values.size)):
-            single = f"{ranks.singular_values[n - 1]:11.4g}" if n else f"{'':11}"
-            ratio = f"{ranks.ratios[n - 1]:10.3g}" if 0 < n <= ranks.ratios.size else f"{'':10}"
-            cost = f"{bic[n]:11.1f}" if n < bic.size else f"{'':11}"
-            fit = f"{states.fit[n]:12.2f}" if n < bic.size and np.isfinite(states.fit[n]) else f"{'':12}"
-            mark = " <" if n == self.nx else ""
-            tail = f"{roots[0][n]:11.4g}{roots[1][n]:11.4g}{ranks.p_values[n]:9.2g}"
-            lines.append(f"  {n:>3}{single}{ratio}{tail}{cost}{fit}{mark}"[:80])
-        if self.lags is not None:
-            lines.append(f"  {'lags by':<10}{'':<34}{'BIC':>12}{'hold-out %':>12}")
-            for name in ("aicc", "bic", "fit"):
-                if name != "fit" or any(np.isfinite(c.fit) for c in self.lags.candidates):
-                    one = self.lags.best(name)
-                    fit = f"{one.fit:12.2f}" if np.isfinite(one.fit) else ""
-                    word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
-                    lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
-        said = f"nx = {self.nx}"
-        if self.na is not None and self.lags is not None:
-            said += f"; {self.lags.best('bic')}"
-        lines.append(f"Recommended: {said}")
-        for reason in (*self.reasons, *(f"note: {note}" for note in self.notes)):
-            lines += textwrap.wrap(reason, 80, initial_indent="  - ", subsequent_indent="    ")
-        return "\n".join(lines)
+        return render(self, "text")
 
-    def picture(self) -> "Figure":
-        """Draw singular values with thresholds, criteria, and the scan of lags."""
-        from optid.identify.order.picture import draw
-
-        return draw(self)
+    def picture(self) -> Any:
+        """Draw singular values with thresholds, criteria, and the scan of lags; a matplotlib figure."""
+        return render(self, "figure")
 
 
 def order(

@@ -9,6 +9,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.order.signals import order_test
 from optid.identify.subspace.imputation import count_windows, impute
 from optid.identify.subspace.instruments import simulate_clipped
 from optid.identify.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
@@ -17,12 +18,10 @@ from optid.identify.subspace.projection import (
     WEIGHTINGS,
     Projection,
     check_order,
-    default_block_rows,
     largest_gap,
     project,
     scaled_pair,
     signal_rank,
-    tested_order,
     weakest_feedback,
 )
 from optid.models.hammerstein_ss import HammersteinSS
@@ -102,7 +101,7 @@ def prepared(plan: Plan) -> tuple[Expansion, int]:
     expansion, given = plan.expansion(), plan.block_rows
     check_channels(plan.records, plan.data.inputs, plan.data.outputs)
     if given is None:
-        alpha = default_block_rows(plan.records, expansion, plan.order)
+        alpha = expansion.block_rows(plan.records, plan.order)
     elif isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 2:
         raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order.")
     else:
@@ -241,8 +240,8 @@ def _order(plan: Plan, projection: Projection, records: list[Array], expansion: 
         nx, reason = rank, f"{rank}: the singular values after it are rounding"
     elif plan.nx == "auto":
         try:
-            nx, reason = tested_order(records, expansion, projection.block_rows, instruments=projection.instruments,
-                                      offset=plan.offset)
+            nx, reason = order_test(records, expansion, projection.block_rows, instruments=projection.instruments,
+                                    offset=plan.offset).choice
         except RankError:  # singular regressors, or a record too short for the distribution
             nx = None
     if nx is None:

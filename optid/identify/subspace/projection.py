@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
@@ -18,9 +17,6 @@ WEIGHTINGS = ("moesp", "cva", "plain")
 
 KEPT = 0.5
 """Share of the windows left by missing samples below which the user is told."""
-
-PER_ROW = 2.0
-"""Windows per row of the Hankel matrix that are wanted; block rows are chosen so that a record has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,37 +99,6 @@ class Projection:
         return replace(self, range=estimate_range(self.blocks, l, weighting, self.scale))
 
 
-def positions(
-    statistics: HankelStatistics, expansion: Expansion, instruments: str, offset: bool, alpha: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
-
-    The last block row of the feedback functions never reaches the future outputs and is left out.
-
-    Args:
-        statistics: moments of windows of 2 alpha samples or more.
-        expansion: the signals.
-        instruments: "past" (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs),
-            "inputs+past", "simulated" (past and future inputs and functions of simulated outputs), "simulated+past".
-        offset: whether a constant is among instruments and regressors.
-        alpha: block rows of the past and of the future.
-    """
-    at = statistics.at
-    past, future, both = range(alpha), range(alpha, 2 * alpha), range(2 * alpha)
-    one = np.zeros(int(offset), dtype=np.intp)
-    phi = np.concatenate([one, at(expansion.eta, future), at(expansion.zeta, future[:-1])])
-    z = [one]
-    if instruments == "past":
-        z.append(at(expansion.eta, past))
-    else:
-        z.append(at(expansion.eta, both))
-    if instruments.startswith("simulated"):
-        z.append(at(expansion.zeta_simulated, both))
-    if instruments.endswith("past"):
-        z += [at(expansion.zeta, past), at(expansion.y, past)]
-    return np.concatenate(z), phi, at(expansion.y, future)
-
-
 def project(
     records: Sequence[Array],
     expansion: Expansion,
@@ -151,7 +116,7 @@ def project(
         records: raw channels [u | y] or [u | y | simulated y] per experiment.
         expansion: the signals.
         block_rows: of the future; the past has as many.
-        instruments: as in `positions`.
+        instruments: as in `Expansion.positions`.
         offset: whether the system has a constant.
         form: "projection" or "correlation".
         tolerance: of the pseudo-inverse; None asks for regular regressors.
@@ -169,39 +134,10 @@ def project(
     if statistics.windows < KEPT * statistics.candidates:
         warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "
                       f"{2 * block_rows} samples: fewer block rows keep more.", DataWarning, stacklevel=2)
-    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
+    z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
-    scale = _spread(statistics, expansion, offset)
+    scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
     return Projection(statistics, blocks, estimate_range(blocks, expansion.l, weighting, scale), instruments, scale)
-
-
-def tested_order(
-    records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool
-) -> tuple[int, str]:
-    """Return the order whose trailing singular values are noise by their own distribution, and the reason in words.
-
-    Arguments as in `project`.
-
-    Raises:
-        RankError: records shorter than three times the block rows, or regressors that the instruments do not reach.
-    """
-    from optid.identify.order import rank_test
-
-    statistics = hankel_statistics(records, 3 * block_rows, expansion, names=expansion.names,
-                                   centre="mean" if offset else None)
-    z, phi, y = positions(statistics, expansion, instruments, offset, block_rows)
-    return rank_test(statistics, z, phi, y, rows=2 * block_rows, largest=(block_rows - 1) * expansion.l).choice
-
-
-def _spread(statistics: HankelStatistics, expansion: Expansion, offset: bool) -> Array:
-    """Standard deviation of every output (root mean square without an offset); one output is left as it is."""
-    if expansion.l == 1:
-        return np.ones(1)
-    rows = [statistics.at([o]) for o in expansion.y]
-    energy = np.array([np.mean(np.diag(statistics.gram)[at]) for at in rows]) / statistics.windows
-    if offset:
-        energy -= np.array([np.mean(statistics.gram[0, at]) for at in rows]) ** 2 / statistics.windows**2
-    return np.sqrt(np.maximum(energy, 1e-300))
 
 
 def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
@@ -232,22 +168,6 @@ def largest_gap(values: Array, largest: int) -> int:
     floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
     ratios = floor[:-1] / floor[1:]
     return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
-
-
-def default_block_rows(records: Sequence[Array], expansion: Expansion, nx: int | None) -> int:
-    """Return block rows that a record can carry: 10, or twice the order, or fewer on a short record.
-
-    Args:
-        records: raw channels, one per experiment.
-        expansion: the signals.
-        nx: the order, or None where it is to be found.
-    """
-    wanted = 10 if nx is None else max(10, 2 * nx)
-    width = expansion.p + 2 * expansion.q + expansion.l
-    count = sum(len(record) for record in records)
-    affordable = int(count / (2 * (len(records) + PER_ROW * width)))  # windows = count - experiments (2 alpha - 1)
-    shortest = min(len(record) for record in records) // 2
-    return max(2 if nx is None else nx + 1, min(wanted, affordable, shortest))
 
 
 def check_order(nx: int, block_rows: int, outputs: int) -> None:
