@@ -90,7 +90,7 @@ def expanded(count: int, rows: int, rounds: int, basis: str) -> None:
         slow, values = cpu(formed, record, expansion, rows, projection.scale)
         times.append((fast, slow))
     fast, slow = np.median(np.array(times), axis=0)
-    ours = projection.range.values
+    ours = projection.values
     error = float(np.max(np.abs(ours - values[: ours.size]) / values[0]))
     poles = np.sort(np.abs(np.linalg.eigvals(realise(projection.gamma(4), 2)[0])))
     print(f"expanded inputs, {basis}, {count} samples, 2 x {expansion.input_sizes[0]} functions, 2 outputs, {rows} "

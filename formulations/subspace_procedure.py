@@ -11,8 +11,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from formulations.constraints.stability import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
@@ -104,12 +102,8 @@ def _with_noise(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[s
 
 def _model(plan: Plan, step: ObserverProblem, factors: Factors) -> HammersteinSS:
     form = step.form
-    n, l = form.n, form.l  # noqa: E741
-    b = np.column_stack([part[:n] for part in factors.bs])
-    d = np.column_stack([part[n:] if len(part) > n else np.zeros(l) for part in factors.bs])
-    e = np.column_stack([np.zeros((n, 0)), *factors.es])
-    model = state_model(form.expansion, plan.data, (form.a, b, form.c, d), factors.mus, factors.nus, e,
-                        offset=factors.offset)
+    model = state_model(form.expansion, plan.data, (form.a, factors.B, form.c, factors.D), factors.mus, factors.nus,
+                        factors.E, offset=factors.offset)
     return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
 
 

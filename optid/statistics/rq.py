@@ -38,6 +38,8 @@ class RQ:
             themselves: it grows with the record where instruments and regressors are not correlated.
         windows: number of Hankel columns.
         discarded: directions of the regressors that a tolerance left out.
+        triangle: (z, z) triangular factor of the instruments.
+        projected: (p, z) regressors on the orthonormal instruments, and (y, z) outputs.
     """
 
     r11: Array
@@ -47,7 +49,9 @@ class RQ:
     gain: Array
     condition: float
     windows: int
-    discarded: int = 0
+    discarded: int
+    triangle: Array
+    projected: tuple[Array, Array]
 
     @cached_property
     def decomposition(self) -> tuple[Array, Array, Array]:
@@ -129,7 +133,8 @@ def rq(
         gain = (r21 / values[:kept]) @ left[:, :kept].T
         discarded = phi.size - kept
         r11 = left[:, :kept] @ r11
-    return RQ(r11 * size[:, None], r21, r22, residual.T, gain / size, condition, statistics.windows, discarded)
+    return RQ(r11 * size[:, None], r21, r22, residual.T, gain / size, condition, statistics.windows, discarded,
+              triangle[: z.size, : z.size], (l21, l31))
 
 
 def _regular(l21: Array, l31: Array) -> tuple[Array, Array, Array]:

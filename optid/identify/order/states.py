@@ -9,6 +9,7 @@ errors of a window is the likelihood. Source: Larimore 1990; small-sample correc
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +46,20 @@ class StateCriteria:
         return found
 
 
+def criteria(likelihood: Any, parameters: Any, samples: int, outputs: int) -> tuple[Any, Any, Any]:
+    """Return AIC, AIC with the small-sample correction, and BIC.
+
+    Args:
+        likelihood: minus twice the logarithm of the likelihood, up to a constant.
+        parameters: their number.
+        samples: number of samples of every output.
+        outputs: number of outputs.
+    """
+    aic = likelihood + 2 * parameters
+    spare = np.maximum(samples * outputs - parameters - 1, 1)
+    return aic, aic + 2 * parameters * (parameters + 1) / spare, likelihood + np.log(samples) * parameters
+
+
 def state_criteria(
     statistics: HankelStatistics,
     expansion: Expansion,
@@ -68,15 +83,13 @@ def state_criteria(
     n = np.arange(largest + 1, dtype=float)
     k = n * (2 * l + expansion.p + expansion.q) + l * (expansion.p + 1)
     likelihood = j / alpha * np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
-    aic = likelihood + 2 * k
-    spare = np.maximum(j * l - k - 1, 1)
     fit = np.full(n.size, np.nan)
     if train is not None and test is not None:
         y = test.at(expansion.y, range(alpha, 2 * alpha))
         spread = np.diag(test.gram)[y] / test.windows - (test.gram[0, y] / test.windows) ** 2
         errors = np.array([np.diag(covariance) for covariance in _errors(train, test, expansion, alpha, largest)])
         fit = 100 * np.mean(1 - np.sqrt(np.maximum(errors, 0) / np.maximum(spread, 1e-300)), axis=1)
-    return StateCriteria(aic, aic + 2 * k * (k + 1) / spare, likelihood + np.log(j) * k, fit, j)
+    return StateCriteria(*criteria(likelihood, k, j, l), fit, j)
 
 
 def _errors(

@@ -21,7 +21,6 @@ from optid.identify.subspace.projection import (
     largest_gap,
     project,
     scaled_pair,
-    signal_rank,
     weakest_feedback,
 )
 from optid.models.hammerstein_ss import HammersteinSS
@@ -139,7 +138,7 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
     if plan.weighting == BEST:
         projection, figures["weighting"] = _best_weighting(plan, records, expansion, projection, nx)
     height = 1.0 if plan.weighting == "cva" else plan.units.y_scale[0]  # unit of the singular values
-    figures |= {"singular values": height * projection.range.values, "condition of R11": projection.blocks.condition}
+    figures |= {"singular values": height * projection.values, "condition of R11": projection.blocks.condition}
     if expansion.simulated:
         share, output = weakest_feedback(projection, expansion)
         figures["share of the feedback that the simulated one explains"] = share
@@ -224,7 +223,7 @@ def _best_weighting(plan: Plan, records: list[Array], expansion: Expansion, proj
     """
     tried = []
     for word in WEIGHTINGS:
-        weighted = projection.weighted(word, expansion.l)
+        weighted = replace(projection, weighting=word)
         found = Observability(plan, records, expansion, weighted.gamma(nx), weighted.scale)
         error = found.step(found.contracted(), instruments=False).problem.remainder
         tried.append((spectral_radius(found.pair()[0]) >= 1, error, word, weighted))
@@ -234,8 +233,8 @@ def _best_weighting(plan: Plan, records: list[Array], expansion: Expansion, proj
 
 def _order(plan: Plan, projection: Projection, records: list[Array], expansion: Expansion) -> tuple[int, str]:
     """Return the order, and where it was to be found the reason in words."""
-    nx, values, reason = plan.order, projection.range.values, ""
-    rank = signal_rank(projection)
+    nx, values, reason = plan.order, projection.values, ""
+    rank = projection.rank
     if plan.nx == "auto" and rank <= min(projection.block_rows - 1, values.size - 1):  # a record without noise
         nx, reason = rank, f"{rank}: the singular values after it are rounding"
     elif plan.nx == "auto":

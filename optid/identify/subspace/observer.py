@@ -11,7 +11,7 @@ of samples has its own initial state; those of all but the first run of an exper
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,18 @@ class ObserverForm:
         x = self.expansion
         return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
 
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """Where the unknowns z stand in [x0 of all experiments | d | D row by row | B and E column by column]."""
+        n, l, p = self.n, self.l, self.expansion.p  # noqa: E741
+        found, start = [np.arange(self.linear)], 0
+        for functions, entries in self.blocks:
+            position = start + np.arange(functions)[:, None]
+            inner = self.linear + l * p + position * n + np.arange(n)
+            found.append(np.hstack([inner, self.linear + np.arange(entries - n) * p + position]).ravel(order="F"))
+            start += functions
+        return np.concatenate(found)
+
     def names(self) -> list[str]:
         """Name the unknowns in words for messages."""
         named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
@@ -117,20 +129,13 @@ class ObserverProblem:
         form: the layout.
         problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
         rows: equations used.
-        candidates: equations there would be, were no sample missing.
         instrumented: whether the normal equations are those of instruments.
     """
 
     form: ObserverForm
     problem: RankOne
     rows: int
-    candidates: int
     instrumented: bool = False
-
-    @property
-    def condition(self) -> float:
-        """Estimate of the condition number of the scaled regressors."""
-        return conditioning(np.asarray(self.problem.root, dtype=float))
 
     def least_squares(self) -> Array:
         """Return the unrestricted minimiser z.
@@ -158,20 +163,14 @@ class ObserverProblem:
 
     def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
-        form = self.form
-        x, n, l = form.expansion, form.n, form.l  # noqa: E741
-        bu, du, ez = np.zeros((n, x.p)), np.zeros((l, x.p)), np.zeros((n, x.q))
-        starts = np.cumsum([0, *(p for p, _ in form.blocks)])
-        for i, (p, b) in enumerate(form.blocks):
-            theta = z[form.block(i)].reshape(b, p)
-            if i < x.m:
-                bu[:, starts[i] : starts[i] + p] = theta[:n]
-                if b > n:
-                    du[:, starts[i] : starts[i] + p] = theta[n:]
-            else:
-                ez[:, starts[i] - x.p : starts[i] - x.p + p] = theta
-        x0 = z[: form.experiments * n].reshape(form.experiments, n)
-        return bu, du, ez, z[form.experiments * n : form.linear] if form.offset else np.zeros(l), x0
+        form, x = self.form, self.form.expansion
+        direct, inner = form.linear, form.linear + form.l * x.p
+        found = np.zeros(inner + form.n * (x.p + x.q))
+        found[form.columns] = z
+        effects, states = found[inner:].reshape(-1, form.n).T, form.experiments * form.n
+        offset = found[states:direct] if form.offset else np.zeros(form.l)
+        return (effects[:, : x.p], found[direct:inner].reshape(form.l, x.p), effects[:, x.p :], offset,
+                found[:states].reshape(form.experiments, form.n))
 
 
 def observer_problem(
@@ -195,11 +194,10 @@ def observer_problem(
     regressors = _Regressors(form, instruments, chunk)
     extra = regressors.extra
     total = form.experiments * form.n + regressors.common + extra  # [x0 | eta, d | zeta simulated | zeta] and y
-    root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, 0.0
+    root, rows, energy = np.zeros((total + 1, total + 1)), 0, 0.0
     own = slice(form.experiments * form.n, total + 1)
     for e, record in enumerate(records):
         y = record[:, regressors.y] if targets is None else targets[e]
-        candidates += y.size
         for i, (start, stop) in enumerate(runs_of(~np.isnan(record[:, regressors.needed]).any(axis=1))):
             part, used, squares = regressors.compress(record[start:stop], y[start:stop])
             rows += used
@@ -217,11 +215,11 @@ def observer_problem(
     if extra:  # the equations seen through the instruments: what lies outside them is dropped
         seen = total - regressors.feeds
         root = root[:seen, np.r_[: seen - regressors.feeds, seen : total + 1]]
-    triangle = np.triu(np.linalg.qr(root[:, [*regressors.columns(form.experiments * form.n), -1]], mode="r"))
+    triangle = np.triu(np.linalg.qr(root[:, [*form.columns, -1]], mode="r"))
     size = form.size
     remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
     problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear, energy)
-    return ObserverProblem(form, problem, rows, candidates, bool(extra))
+    return ObserverProblem(form, problem, rows, bool(extra))
 
 
 class _Regressors:
@@ -298,19 +296,6 @@ class _Regressors:
             rows[:, direct:inner] -= np.einsum("kji,io->koj", out[:, 1 : 1 + p], form.gain).reshape(count, -1)
             rows[:, -1] -= np.einsum("kji,ij->k", out[:, past + 1 :], form.gain)
         return rows
-
-    def columns(self, states: int) -> NDArray[np.intp]:
-        """Return where the unknowns z stand in the rows [x0 | d | D | B | E], x0 of all experiments."""
-        form = self.form
-        n, l, p = form.n, form.l, form.expansion.p  # noqa: E741
-        direct = states + l * form.offset
-        found, start = [np.arange(form.linear)], 0
-        for functions, entries in form.blocks:
-            position = start + np.arange(functions)[:, None]
-            inner = direct + l * p + position * n + np.arange(n)
-            found.append(np.hstack([inner, direct + np.arange(entries - n) * p + position]).ravel(order="F"))
-            start += functions
-        return np.concatenate(found)
 
 
 def observer_gain(a: Array, c: Array, noise: float = 1.0) -> Array:

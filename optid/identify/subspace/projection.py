@@ -2,7 +2,8 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,83 +21,59 @@ KEPT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Range:
-    """The weighted singular value decomposition behind an estimate of Gamma.
-
-    Attributes:
-        vectors: (rows l, rows l) left singular vectors of W r22.
-        values: singular values, largest first.
-        unweighted: W^-1, (rows l, rows l).
-        l: number of outputs.
-    """
-
-    vectors: Array
-    values: Array
-    unweighted: Array
-    l: int  # noqa: E741 - the field's letter
-
-    @property
-    def rows(self) -> int:
-        """Number of block rows."""
-        return len(self.vectors) // self.l
-
-    def gamma(self, n: int) -> Array:
-        """Return Gamma (rows l, n) in balanced coordinates: columns scaled by the roots of the singular values."""
-        return self.unweighted @ (self.vectors[:, :n] * np.sqrt(self.values[:n]))
-
-
-def estimate_range(blocks: RQ, l: int, weighting: str = "moesp", scale: Array | None = None) -> Range:  # noqa: E741
-    """Decompose the projected outputs.
-
-    Args:
-        blocks: the RQ decomposition.
-        l: number of outputs.
-        weighting: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of the future
-            outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990) or
-            "plain" (outputs in their units: at an order too low the larger ones come first).
-        scale: (l,) size of every output, by which its rows are divided: outputs in small units are not lost.
-    """
-    sizes = np.tile(np.ones(l) if scale is None or weighting == "plain" else scale, len(blocks.r22) // l)
-    r22, unweighted = blocks.r22 / sizes[:, None], np.diag(sizes)
-    if weighting == "cva":
-        whole = np.concatenate([r22, blocks.residual / sizes[:, None]], axis=1)
-        left, values, _ = np.linalg.svd(whole, full_matrices=False)
-        values = np.maximum(values, 1e-8 * values[0])  # directions without noise weigh much, not infinitely much
-        r22, unweighted = (left / values) @ left.T @ r22, unweighted @ (left * values) @ left.T
-    vectors, values, _ = np.linalg.svd(r22)
-    return Range(vectors, values, unweighted, l)
-
-
-@dataclass(frozen=True, eq=False)
 class Projection:
     """What the projection step leaves.
 
     Attributes:
         statistics: moments of the windows of 2 block_rows samples.
         blocks: the RQ decomposition.
-        range: its weighted singular value decomposition.
         instruments: word of the instruments.
-        scale: (l,) standard deviations of the outputs, by which the rows of r22 were divided.
+        scale: (l,) standard deviations of the outputs; one output is left as it is.
+        weighting: of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not
+            lost), "cva" (the inverse root of the covariance of the future outputs with the regressors removed, so that
+            singular values are canonical correlations: Larimore 1990) or "plain" (outputs in their units: at an order
+            too low the larger ones come first).
     """
 
     statistics: HankelStatistics
     blocks: RQ
-    range: Range
     instruments: str
     scale: Array
+    weighting: str = WEIGHTINGS[0]
 
     @property
     def block_rows(self) -> int:
         """Number of block rows of the future."""
         return self.statistics.rows // 2
 
+    @cached_property
+    def decomposition(self) -> tuple[Array, Array]:
+        """Left singular vectors of the weighted outputs, the weights undone, and the singular values, largest first."""
+        sizes = np.tile(self.scale, self.block_rows) if self.weighting != "plain" else np.ones(len(self.blocks.r22))
+        r22, unweighted = self.blocks.r22 / sizes[:, None], np.diag(sizes)
+        if self.weighting == "cva":
+            whole = np.concatenate([r22, self.blocks.residual / sizes[:, None]], axis=1)
+            left, values, _ = np.linalg.svd(whole, full_matrices=False)
+            values = np.maximum(values, 1e-8 * values[0])  # directions without noise weigh much, not infinitely much
+            r22, unweighted = (left / values) @ left.T @ r22, unweighted @ (left * values) @ left.T
+        vectors, values, _ = np.linalg.svd(r22)
+        return unweighted @ vectors, values
+
+    @property
+    def values(self) -> Array:
+        """Singular values, largest first."""
+        return self.decomposition[1]
+
+    @property
+    def rank(self) -> int:
+        """Number of singular values that are more than rounding, noise included."""
+        floor = 10 * len(self.statistics.gram) * np.finfo(float).eps * self.values[0]
+        return int(np.sum(self.values > floor))
+
     def gamma(self, n: int) -> Array:
         """Return Gamma (block_rows l, n) in balanced coordinates in which the states have about unit size."""
-        return self.range.gamma(n) / self.statistics.windows**0.25
-
-    def weighted(self, weighting: str, l: int) -> "Projection":  # noqa: E741
-        """Return the same decomposition in another weighting, as in `estimate_range`, of l outputs."""
-        return replace(self, range=estimate_range(self.blocks, l, weighting, self.scale))
+        vectors, values = self.decomposition
+        return vectors[:, :n] * np.sqrt(values[:n]) / self.statistics.windows**0.25
 
 
 def project(
@@ -120,7 +97,7 @@ def project(
         offset: whether the system has a constant.
         form: "projection" or "correlation".
         tolerance: of the pseudo-inverse; None asks for regular regressors.
-        weighting: as in `estimate_range`.
+        weighting: of the projected outputs.
 
     Raises:
         StructureError: unknown words.
@@ -137,7 +114,7 @@ def project(
     z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
-    return Projection(statistics, blocks, estimate_range(blocks, expansion.l, weighting, scale), instruments, scale)
+    return Projection(statistics, blocks, instruments, scale, weighting)
 
 
 def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
@@ -182,12 +159,6 @@ def check_order(nx: int, block_rows: int, outputs: int) -> None:
     if nx > (block_rows - 1) * outputs:
         raise StructureError(f"order {nx} with {block_rows} block rows and {outputs} outputs: at most "
                              f"{(block_rows - 1) * outputs}.")
-
-
-def signal_rank(projection: Projection) -> int:
-    """Return how many singular values are more than rounding, noise included."""
-    values = projection.range.values
-    return int(np.sum(values > 10 * len(projection.statistics.gram) * np.finfo(float).eps * values[0]))
 
 
 def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:

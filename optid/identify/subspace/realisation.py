@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,24 +16,23 @@ from optid.structures.whitening import leading_pair
 Values = Mapping[str, Array]
 
 
-@dataclass(frozen=True, eq=False)
-class Factors:
+class Factors(NamedTuple):
     """What the step answers.
 
     Attributes:
+        B: (n, m).
+        D: (l, m).
+        E: (n, s), one column per feedback family.
         mus: coefficients of the nonlinearity of every input.
-        bs: (n + l,) or (n,) entries [B_i; D_i] of every input.
         nus: coefficients of every feedback family in its orthonormal coordinates.
-        es: (n,) of every feedback family.
-        x0: (experiments, n).
         offset: (l,).
     """
 
+    B: Array
+    D: Array
+    E: Array
     mus: list[Array]
-    bs: list[Array]
     nus: list[Array]
-    es: list[Array]
-    x0: Array
     offset: Array
 
 
@@ -101,11 +101,12 @@ class Realisation:
                 else:
                     mu, b = (np.ones(1), theta[0]) if shape[0] == 1 else (theta[:, 0], np.ones(1))
             pairs.append(_oriented(mu, b, linear=i < x.m and isinstance(x.inputs[i], Linear)))
+        n, l, m = form.n, form.l, x.m  # noqa: E741
         mus, bs = [mu for mu, _ in pairs], [b for _, b in pairs]
-        return Factors(
-            mus[: x.m], bs[: x.m], mus[x.m :], bs[x.m :],
-            np.reshape(values["x0"], (form.n, form.experiments), order="F").T,
-            np.asarray(values["offset"]) if form.offset else np.zeros(form.l))
+        direct = [b[n:] if len(b) > n else np.zeros(l) for b in bs[:m]]
+        return Factors(np.column_stack([b[:n] for b in bs[:m]]), np.column_stack(direct),
+                       np.column_stack([np.zeros((n, 0)), *bs[m:]]), mus[:m], mus[m:],
+                       np.asarray(values["offset"]) if form.offset else np.zeros(l))
 
 
 def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
