@@ -202,13 +202,8 @@ class Expansion:
         return replace(self, feedback=(), simulated=False)
 
 
-def expand(
-    records: Sequence[Array],
-    inputs: Sequence[Basis],
-    feedback: Sequence[Basis | None],
-    input_names: Sequence[str],
-    output_names: Sequence[str],
-) -> Expansion:
+def expand(records: Sequence[Array], inputs: Sequence[Basis], feedback: Sequence[Basis | None],
+           input_names: Sequence[str], output_names: Sequence[str]) -> Expansion:
     """Fit the feedback functions to a record and return its expansion.
 
     Args:

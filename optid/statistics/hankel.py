@@ -143,16 +143,9 @@ class HankelStatistics:
             )
 
 
-def hankel_statistics(
-    records: Sequence[Array],
-    rows: int,
-    expand: Expand | None = None,
-    *,
-    names: Sequence[str] | None = None,
-    centre: Array | Literal["mean"] | None = None,
-    method: Literal["auto", "gram", "qr"] = "auto",
-    chunk: int = CHUNK,
-) -> HankelStatistics:
+def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None = None, *,
+                      names: Sequence[str] | None = None, centre: Array | Literal["mean"] | None = None,
+                      method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK) -> HankelStatistics:
     """Take the statistics of all windows of some records.
 
     Args:
@@ -196,7 +189,7 @@ def hankel_statistics(
         raise StructureError(f"{len(names)} names for {sums.d} signals.")
     if isinstance(centre, str):
         spread = [sums.evaluated(run[:: 1 + len(run) // chunk]) for run in runs]  # a centre has to be near, no more
-        sums.centre = sum(part.sum(axis=0) for part in spread) / sum(map(len, spread))
+        sums.centre = np.concatenate(spread).mean(axis=0)
     elif centre is not None:
         sums.centre = np.asarray(centre, dtype=float)
     if method != "qr":

@@ -69,9 +69,8 @@ class LagScan:
         return min(self.candidates, key=lambda c: getattr(c, criterion))
 
 
-def scan_lags(
-    data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, nk: int = 8, test: Data | None = None
-) -> LagScan:
+def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, nk: int = 8, test: Data | None = None
+             ) -> LagScan:
     """Compare all structures up to the given lags; the inputs share nb and nk first and are then refined one by one.
 
     Args:
@@ -155,7 +154,8 @@ class _Scan:
             spread = np.diag(gram)[columns.size :] / rows - mean**2
             errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / rows
             fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
-        return Lags(na, nb, nk, *map(float, criteria(likelihood, k, self.rows, self.l)), fit)
+        aic, aicc, bic = criteria(likelihood, k, self.rows, self.l)
+        return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
 
 
 def _contraction(statistics: Statistics) -> Array:

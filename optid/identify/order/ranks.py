@@ -112,17 +112,9 @@ class RankTest:
         return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
 
 
-def rank_test(
-    statistics: HankelStatistics,
-    instruments: Positions,
-    regressors: Positions,
-    outputs: Positions,
-    *,
-    rows: int,
-    level: float | None = None,
-    largest: int | None = None,
-    scale: Array | None = None,
-) -> RankTest:
+def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: Positions, outputs: Positions, *,
+              rows: int, level: float | None = None, largest: int | None = None, scale: Array | None = None
+             ) -> RankTest:
     """Test the ranks of R22.
 
     Args:
@@ -185,14 +177,8 @@ def rank_test(
     return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
 
 
-def _projections(
-    statistics: HankelStatistics,
-    z: NDArray[np.intp],
-    phi: NDArray[np.intp],
-    y: NDArray[np.intp],
-    width: int,
-    sizes: Array,
-) -> tuple[Array, Array, Array, float]:
+def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp],
+                 width: int, sizes: Array) -> tuple[Array, Array, Array, float]:
     """R22, the windows' weights (width, .) that give e_t and orthonormal z_t, and the floor, per window."""
     from scipy.linalg import solve_triangular
 

@@ -41,16 +41,8 @@ def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | 
     return alpha
 
 
-def order_test(
-    records: Sequence[Array],
-    expansion: Expansion,
-    alpha: int,
-    *,
-    instruments: str = "simulated",
-    offset: bool = True,
-    level: float | None = None,
-    statistics: HankelStatistics | None = None,
-) -> RankTest:
+def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, instruments: str = "simulated",
+               offset: bool = True, level: float | None = None, statistics: HankelStatistics | None = None) -> RankTest:
     """Test the ranks of the projected outputs; several outputs count relative to their sizes.
 
     Args:
@@ -74,9 +66,7 @@ def order_test(
     return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
 
 
-def with_simulated_outputs(
-    records: Sequence[Array], expansion: Expansion, alpha: int
-) -> tuple[list[Array], Expansion]:
+def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha: int) -> tuple[list[Array], Expansion]:
     """Append outputs simulated from the inputs alone: least squares on the functions of the last 2 alpha samples.
 
     They are free of noise, so that functions of them are valid instruments for functions of measured outputs. The

@@ -60,14 +60,8 @@ def criteria(likelihood: Any, parameters: Any, samples: int, outputs: int) -> tu
     return aic, aic + 2 * parameters * (parameters + 1) / spare, likelihood + np.log(samples) * parameters
 
 
-def state_criteria(
-    statistics: HankelStatistics,
-    expansion: Expansion,
-    alpha: int,
-    largest: int,
-    train: HankelStatistics | None = None,
-    test: HankelStatistics | None = None,
-) -> StateCriteria:
+def state_criteria(statistics: HankelStatistics, expansion: Expansion, alpha: int, largest: int,
+                   train: HankelStatistics | None = None, test: HankelStatistics | None = None) -> StateCriteria:
     """Compare the orders 0 ... largest.
 
     Args:
@@ -92,9 +86,8 @@ def state_criteria(
     return StateCriteria(*criteria(likelihood, k, j, l), fit, j)
 
 
-def _errors(
-    fitted: HankelStatistics, judged: HankelStatistics, expansion: Expansion, alpha: int, largest: int
-) -> list[Array]:
+def _errors(fitted: HankelStatistics, judged: HankelStatistics, expansion: Expansion, alpha: int, largest: int
+           ) -> list[Array]:
     """Covariances (alpha l, alpha l) of the errors in the future of `judged` of states and predictors of `fitted`."""
     from scipy.linalg import cholesky, solve_triangular
 

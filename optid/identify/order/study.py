@@ -58,19 +58,9 @@ class OrderStudy:
         return render(self, "figure")
 
 
-def order(
-    data: Data,
-    *,
-    basis: "Basis | str | Sequence[Basis | str] | None" = None,
-    feedback_basis: Any = None,
-    block_rows: int | None = None,
-    nx: int | None = None,
-    na: int = 8,
-    nb: int = 6,
-    nk: int = 8,
-    holdout: float = 0.3,
-    level: float | None = None,
-) -> OrderStudy:
+def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = None, feedback_basis: Any = None,
+          block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6, nk: int = 8,
+          holdout: float = 0.3, level: float | None = None) -> OrderStudy:
     """Find the order of a record without a model of its noise.
 
     The number of states comes from the singular values of the future outputs on past inputs: the smallest order whose
@@ -115,11 +105,10 @@ def order(
     ranks = order_test(extended, shown, alpha, level=level, statistics=statistics)
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
-    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=_centre(
-        statistics.centre, expansion)) if part is not None else None for part in (train, test)]
-    moments = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names,
-                                centre=_centre(statistics.centre, expansion))
-    states = state_criteria(moments, expansion, alpha, max(largest, 1), *parts)
+    centre = statistics.centre[: expansion.p + expansion.q + expansion.l]
+    moments = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=centre)
+               for part in (data, train, test) if part is not None]
+    states = state_criteria(moments[0], expansion, alpha, max(largest, 1), *moments[1:])
     lags = _lags(data, train, test, bases, na, nb, nk, notes)
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
@@ -136,10 +125,6 @@ def _records(data: Data) -> list[Array]:
     return [np.hstack([e.u, e.y]) for e in data.experiments]
 
 
-def _centre(centre: Array, expansion: Any) -> Array:
-    return centre[: expansion.p + expansion.q + expansion.l]
-
-
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
     if not holdout:
         return None, None
@@ -153,10 +138,8 @@ def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Da
     return train, test
 
 
-def _lags(
-    data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
-    notes: list[str],
-) -> LagScan | None:
+def _lags(data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
+          notes: list[str]) -> LagScan | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)

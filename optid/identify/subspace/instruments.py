@@ -24,9 +24,8 @@ def clipping_range(outputs: Sequence[Array]) -> tuple[Array, Array]:
     return low - BEYOND * (high - low), high + BEYOND * (high - low)
 
 
-def simulate_clipped(
-    records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array, ez: Array, d: Array
-) -> list[Array]:
+def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
+                     ez: Array, d: Array) -> list[Array]:
     """Simulate the outputs from the inputs alone, as instruments: noise free, clipped to the range of the record.
 
     The functions of a missing input count as zero.

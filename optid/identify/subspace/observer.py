@@ -173,10 +173,8 @@ class ObserverProblem:
                 found[:states].reshape(form.experiments, form.n))
 
 
-def observer_problem(
-    records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
-    targets: Sequence[Array] | None = None
-) -> ObserverProblem:
+def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
+                     targets: Sequence[Array] | None = None) -> ObserverProblem:
     """Compress the step.
 
     Args:

@@ -59,8 +59,8 @@ class Plan:
         for name, known in WORDS.items():
             if (value := getattr(self, name)) not in known:
                 raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
-        integer = isinstance(self.nx, int | np.integer) and self.nx is not True
-        if self.nx not in ("auto", "gap") and not (integer and self.nx >= 1):
+        nx: Any = self.nx
+        if nx not in ("auto", "gap") and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
             raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
         if not self.units.y_scale:
             object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))

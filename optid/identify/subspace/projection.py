@@ -76,17 +76,8 @@ class Projection:
         return vectors[:, :n] * np.sqrt(values[:n]) / self.statistics.windows**0.25
 
 
-def project(
-    records: Sequence[Array],
-    expansion: Expansion,
-    block_rows: int,
-    *,
-    instruments: str,
-    offset: bool = True,
-    form: str = "projection",
-    tolerance: float | None = None,
-    weighting: str = "moesp",
-) -> Projection:
+def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool = True,
+            form: str = "projection", tolerance: float | None = None, weighting: str = "moesp") -> Projection:
     """Take the statistics and decompose.
 
     Args:

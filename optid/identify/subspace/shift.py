@@ -249,7 +249,7 @@ def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:
     return _disobeyed_by(np.linalg.eigvals(a), rules)
 
 
-def _disobeyed_by(values: Array, rules: Sequence[Any]) -> list[str]:
+def _disobeyed_by(values: Any, rules: Sequence[Any]) -> list[str]:
     checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
     return [sentence for check in checks if (sentence := check(SimpleNamespace(poles=values)))]
 
