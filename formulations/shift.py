@@ -18,14 +18,14 @@ from cvxpy.constraints.psd import PSD
 
 from formulations.constraints.rule import Rule
 from optid.identify.subspace import shift
-from optid.identify.subspace.shift import DEFINITE, Programmes, Shifting, ShiftStep
+from optid.identify.subspace.shift import DEFINITE, Shifting, ShiftStep
 from optid.program.program import Program, Values
 from optid.program.view import View
 
 
 def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = ()) -> Shifting:
     """Solve ``min ‖up A - down‖`` under rules, as `optid.identify.subspace.shift.constrained_shift`."""
-    return shift.constrained_shift(up, down, rules, Programmes(joint, refined, centred))
+    return shift.constrained_shift(up, down, rules, (joint, refined, centred))
 
 
 def joint(step: ShiftStep, rules: Sequence[Rule]) -> Program:

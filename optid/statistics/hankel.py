@@ -113,11 +113,6 @@ class HankelStatistics:
         """Estimate of the condition number of the windows with their rows scaled to norm one; inf when singular."""
         return conditioning(self.root)
 
-    @cached_property
-    def means(self) -> Array:
-        """Mean of every signal over the windows and block rows, (d,)."""
-        return self.centre + self.gram[0, 1:].reshape(self.rows, self.d).mean(axis=0) / self.windows
-
     def sizes(self, signals: Sequence[int] | range, centred: bool = True) -> Array:
         """Standard deviation of some signals over windows and block rows; root mean square where not centred."""
         at = self.at(signals).reshape(self.rows, -1)

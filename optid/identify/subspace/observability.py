@@ -124,19 +124,21 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
         DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
     """
     expansion, alpha = prepared(plan)
-    records, imputed = plan.records, {}
+    windows, imputed = _Windows(plan, plan.records, expansion, alpha, plan.instruments), {}
     if _lacks_windows(plan, expansion, alpha):
-        imputation = impute(plan.data, lambda filled: _estimated(plan, expansion, alpha, filled, preliminary))
-        records, imputed = imputation.records, {"missing outputs": str(imputation)}
+        imputation = impute(plan.data, lambda filled: _estimated(replace(windows, records=filled), preliminary))
+        windows, imputed = replace(windows, records=imputation.records), {"missing outputs": str(imputation)}
         warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {imputation}. The "
                       "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
-    records, expansion, instruments = _instrumented(plan, records, expansion, alpha)
-    projection = _projected(plan, records, expansion, alpha, instruments)
-    nx, reason = _order(plan, projection, records, expansion)
-    figures: dict[str, Any] = {"order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-                               "windows": projection.statistics.windows, **imputed, "instruments": instruments}
+    windows = windows.instrumented()
+    projection, expansion = windows.projected(), windows.expansion
+    nx, reason = windows.order(projection)
+    figures: dict[str, Any] = {
+        "order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
+        "windows": projection.statistics.windows, **imputed, "instruments": windows.instruments}
     if plan.weighting == BEST:
-        projection, figures["weighting"] = _best_weighting(plan, records, expansion, projection, nx)
+        projection = windows.best_weighting(projection, nx)
+        figures["weighting"] = f"{projection.weighting}: the smallest error on the record"
     height = 1.0 if plan.weighting == "cva" else plan.units.y_scale[0]  # unit of the singular values
     figures |= {"singular values": height * projection.values, "condition of R11": projection.blocks.condition}
     if expansion.simulated:
@@ -148,7 +150,7 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
                           "iterations or a stronger input.", DataWarning, stacklevel=2)
     if projection.blocks.discarded:
         figures["regressor directions left out"] = projection.blocks.discarded
-    return Observability(plan, records, expansion, projection.gamma(nx), projection.scale, figures)
+    return replace(windows.observability(projection, nx), figures=figures)
 
 
 def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
@@ -163,91 +165,99 @@ def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
     return complete < INTACT * candidates and complete < SCARCE * 2 * alpha * (expansion.p + expansion.q + expansion.l)
 
 
-def _estimated(plan: Plan, expansion: Expansion, alpha: int, records: list[Array], preliminary: Preliminary
-               ) -> HammersteinSS:
+def _estimated(windows: "_Windows", preliminary: Preliminary) -> HammersteinSS:
     """Return the preliminary model of records whose missing outputs are estimated."""
+    plan = windows.plan
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
-        if expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last one is consistent
+        if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
             plan = replace(plan, instruments=f"{plan.instruments}+past")
-        records, expansion, instruments = _instrumented(plan, records, expansion, alpha)
-        return preliminary(_ordered(plan, records, expansion, alpha, instruments))
+        return preliminary(replace(windows, plan=plan, instruments=plan.instruments).instrumented().ordered())
 
 
-def _instrumented(plan: Plan, raw: list[Array], expansion: Expansion, alpha: int
-                  ) -> tuple[list[Array], Expansion, str]:
-    """Return the records, with simulated outputs where these are instruments, their signals, and the instruments.
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """Signals in windows of 2 alpha samples, and the instruments for them."""
 
-    Any preliminary model will do for the simulation, which depends on the inputs alone. The first one has past outputs
-    as instruments; where the regressors are singular then, it has no feedback.
-    """
-    if not plan.instruments.startswith("simulated"):
-        return raw, expansion, plan.instruments
-    if not expansion.q:
-        return raw, expansion, plan.instruments.replace("simulated", "inputs")
-    signals, records, kind = expansion, raw, "inputs+past"
-    for i in range(plan.iterations):
-        try:
-            found = _ordered(plan, records, signals, alpha, kind)
-        except RankError:
-            if i:
-                raise
-            signals = expansion.without_feedback()
-            found = _ordered(plan, records, signals, alpha, "inputs")
-        a = found.contracted()
-        step = found.step(a)
-        bu, du, ez, d, _ = step.matrices(step.least_squares())
-        outputs = simulate_clipped(raw, signals, a, step.form.c, bu, du, ez, d)
-        records = [np.hstack([record, y]) for record, y in zip(raw, outputs)]
-        signals, kind = expansion.with_simulated(), plan.instruments
-    return records, signals, plan.instruments
+    plan: Plan
+    records: list[Array]
+    expansion: Expansion
+    alpha: int
+    instruments: str
 
+    def projected(self) -> Projection:
+        plan = self.plan
+        return project(self.records, self.expansion, self.alpha, instruments=self.instruments, offset=plan.offset,
+                       form=plan.form, tolerance=plan.tolerance,
+                       weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
 
-def _ordered(plan: Plan, records: list[Array], expansion: Expansion, alpha: int, instruments: str) -> Observability:
-    projection = _projected(plan, records, expansion, alpha, instruments)
-    nx, _ = _order(plan, projection, records, expansion)
-    return Observability(plan, records, expansion, projection.gamma(nx), projection.scale)
+    def ordered(self) -> Observability:
+        """Return the observability matrix in the weighting that was asked for."""
+        projection = self.projected()
+        return self.observability(projection, self.order(projection)[0])
 
+    def observability(self, projection: Projection, nx: int) -> Observability:
+        return Observability(self.plan, self.records, self.expansion, projection.gamma(nx), projection.scale)
 
-def _projected(plan: Plan, records: list[Array], expansion: Expansion, alpha: int, instruments: str) -> Projection:
-    return project(records, expansion, alpha, instruments=instruments, offset=plan.offset, form=plan.form,
-                   tolerance=plan.tolerance, weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
+    def instrumented(self) -> "_Windows":
+        """Return the same with simulated outputs where these are instruments.
 
+        Any preliminary model will do for the simulation, which depends on the inputs alone. The first one has past
+        outputs as instruments; where the regressors are singular then, it has no feedback.
+        """
+        plan, raw = self.plan, self.records
+        if not plan.instruments.startswith("simulated"):
+            return self
+        if not self.expansion.q:
+            return replace(self, instruments=plan.instruments.replace("simulated", "inputs"))
+        windows = replace(self, instruments="inputs+past")
+        for i in range(plan.iterations):
+            try:
+                found = windows.ordered()
+            except RankError:
+                if i:
+                    raise
+                found = replace(self, expansion=self.expansion.without_feedback(), instruments="inputs").ordered()
+            a = found.contracted()
+            step = found.step(a)
+            bu, du, ez, d, _ = step.matrices(step.least_squares())
+            outputs = simulate_clipped(raw, found.expansion, a, step.form.c, bu, du, ez, d)
+            windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
+                              expansion=self.expansion.with_simulated(), instruments=plan.instruments)
+        return windows
 
-def _best_weighting(plan: Plan, records: list[Array], expansion: Expansion, projection: Projection, nx: int
-                    ) -> tuple[Projection, str]:
-    """Return the projection in the weighting whose (A, C) leaves the smallest error on the record, and its word.
+    def best_weighting(self, projection: Projection, nx: int) -> Projection:
+        """Return the projection in the weighting whose (A, C) leaves the smallest error on the record.
 
-    None is best on all records: the canonical weighting has the smaller variance where the order suffices, the others
-    keep the outputs with most energy where it does not. A stable estimate comes before one that had to be moved.
-    """
-    tried = []
-    for word in WEIGHTINGS:
-        weighted = replace(projection, weighting=word)
-        found = Observability(plan, records, expansion, weighted.gamma(nx), weighted.scale)
-        error = found.step(found.contracted(), instruments=False).problem.remainder
-        tried.append((spectral_radius(found.pair()[0]) >= 1, error, word, weighted))
-    _, _, word, best = min(tried, key=lambda one: one[:2])
-    return best, f"{word}: the smallest error on the record"
+        None is best on all records: the canonical weighting has the smaller variance where the order suffices, the
+        others keep the outputs with most energy where it does not. A stable estimate comes before one that had to be
+        moved.
+        """
+        tried = []
+        for word in WEIGHTINGS:
+            weighted = replace(projection, weighting=word)
+            found = self.observability(weighted, nx)
+            error = found.step(found.contracted(), instruments=False).problem.remainder
+            tried.append((spectral_radius(found.pair()[0]) >= 1, error, weighted))
+        return min(tried, key=lambda one: one[:2])[2]
 
-
-def _order(plan: Plan, projection: Projection, records: list[Array], expansion: Expansion) -> tuple[int, str]:
-    """Return the order, and where it was to be found the reason in words."""
-    nx, values, reason = plan.order, projection.values, ""
-    rank = projection.rank
-    if plan.nx == "auto" and rank <= min(projection.block_rows - 1, values.size - 1):  # a record without noise
-        nx, reason = rank, f"{rank}: the singular values after it are rounding"
-    elif plan.nx == "auto":
-        try:
-            nx, reason = order_test(records, expansion, projection.block_rows, instruments=projection.instruments,
-                                    offset=plan.offset).choice
-        except RankError:  # singular regressors, or a record too short for the distribution
-            nx = None
-    if nx is None:
-        nx = largest_gap(values, min(projection.block_rows - 1, values.size // 2))
-        following = values[nx] if nx < values.size else 0.0
-        reason = f"{nx}: the largest gap of the singular values, {values[nx - 1]:.3g} before {following:.3g}"
-    if nx > rank:
-        raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more block "
-                        "rows or a richer input.")
-    return nx, reason
+    def order(self, projection: Projection) -> tuple[int, str]:
+        """Return the order, and where it was to be found the reason in words."""
+        nx, values, reason = self.plan.order, projection.values, ""
+        rank = projection.rank
+        if self.plan.nx == "auto" and rank <= min(self.alpha - 1, values.size - 1):  # a record without noise
+            nx, reason = rank, f"{rank}: the singular values after it are rounding"
+        elif self.plan.nx == "auto":
+            try:
+                nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.instruments,
+                                        offset=self.plan.offset).choice
+            except RankError:  # singular regressors, or a record too short for the distribution
+                nx = None
+        if nx is None:
+            nx = largest_gap(values, min(self.alpha - 1, values.size // 2))
+            following = values[nx] if nx < values.size else 0.0
+            reason = f"{nx}: the largest gap of the singular values, {values[nx - 1]:.3g} before {following:.3g}"
+        if nx > rank:
+            raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more "
+                            "block rows or a richer input.")
+        return nx, reason

@@ -13,7 +13,7 @@ poles that obey stay as they are and the others are constrained a few at a time.
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -104,19 +104,9 @@ class ShiftStep:
         return self.basis @ a @ self.change
 
 
-class Programmes(NamedTuple):
-    """The programmes of the step.
-
-    Attributes:
-        joint: (step, rules) -> in P and Q = A P, the residual weighted by P.
-        refined: (step, P, A, rules) -> in A alone, from a start, its residual unweighted.
-        centred: (step, A, rules) -> in P, its largest margin.
-    """
-
-    joint: Callable[..., Program]
-    refined: Callable[..., Program]
-    centred: Callable[..., Program]
-
+Programmes = tuple[Callable[..., Program], Callable[..., Program], Callable[..., Program]]
+"""The programmes of the step: (step, rules) -> joint, in P and Q = A P, its residual weighted by P; (step, P, A, rules)
+-> refined, in A alone from a start, its residual unweighted; (step, A, rules) -> centred, the largest margin of P."""
 
 Shifting = Generator[Program, Solution, Shift]
 
@@ -150,8 +140,8 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
         return Shift(free, bound, bound, free, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
     if len(free) > LARGEST and verified and (blocks := _pole_blocks(free, rules)) is not None:
         return (yield from _deflated(up, down, free, blocks, rules, programmes))
-    step = ShiftStep.of(up, down, free)
-    solution = yield programmes.joint(step, rules)
+    step, (joint, refined, centred) = ShiftStep.of(up, down, free), programmes
+    solution = yield joint(step, rules)
     if not solution.has_point or not _definite(solution.values["P"]):
         status = solution.status  # a singular P is no point
         status = Status.FAILED if status in (Status.OPTIMAL, Status.LOCAL) else status
@@ -159,7 +149,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     p, a = solution.values["P"], step.recover(solution.values)
     best, status, reason = float(np.linalg.norm(up @ a - down)), solution.status, solution.reason
     for last in [False] * (ROUNDS - 1) + [True]:
-        solution = yield programmes.refined(step, p, a, rules)
+        solution = yield refined(step, p, a, rules)
         if not solution.has_point:
             break
         trial = step.recover(solution.values)
@@ -169,7 +159,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
             status, reason = solution.status, solution.reason
         if last or fall <= ENOUGH * (best - bound) or best - bound <= TINY * step.size:
             break
-        solution = yield programmes.centred(step, a, rules)
+        solution = yield centred(step, a, rules)
         if not solution.has_point or not _definite(solution.values["P"]):
             break
         p = solution.values["P"]
