@@ -59,5 +59,5 @@ def _arx(problem: EquationError, constraints: Sequence[Any]) -> Program:
 
     return residual_programme(
         problem, "arx", {**linear, **numerators}, problem.residual(linear, list(numerators.values())), start={},
-        recover=recover, view=problem.view({**linear, **numerators}, "linear"),
+        recover=recover, view=problem.view({**linear, **numerators}),
         structure=LeastSquaresStructure(problem.problem, (*linear, *keys), ())).subject_to(*constraints)

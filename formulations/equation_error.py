@@ -97,10 +97,10 @@ class EquationError:
         parts = [flat(linear[name]) for name in ("a", "offset") if name in linear] + [flat(t) for t in thetas]
         return self.problem.root @ cp.hstack(parts) - self.problem.target
 
-    def view(self, expressions: Mapping[str, cp.Expression], kind: str, gauge: str = "") -> View:
+    def view(self, expressions: Mapping[str, cp.Expression], gauge: str = "") -> View:
         """Return what constraints may speak about."""
         full = solve_triangular(self.problem.root, self.problem.target)
-        return View(expressions, kind=kind, channels=self.channels, bases=dict(zip(self.channels, self.bases)),
+        return View(expressions, channels=self.channels, bases=dict(zip(self.channels, self.bases)),
                     gauge=gauge, reference=self.linear_part(full[: self.problem.linear]), units=self.units)
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:

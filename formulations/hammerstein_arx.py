@@ -100,7 +100,7 @@ def _exact(problem: EquationError, constraints: Sequence[Any], gauge: str) -> Pr
     program = residual_programme(
         problem, "hammerstein_arx.exact", variables, problem.residual(linear, thetas),
         constraints={"gauge": tuple(gauges)}, start=start, recover=lambda values: None,
-        view=problem.view(expressions, "exact", gauge),
+        view=problem.view(expressions, gauge),
         structure=RankOneStructure(problem.problem, tuple(linear), tuple(blocks), gauge),
         certify=certify_rank_one)
     program = program.subject_to(*constraints)
@@ -237,7 +237,7 @@ def _matrix_programme(name: str, problem: EquationError, constraints: Sequence[A
     program = residual_programme(
         problem, name, {**linear, **thetas}, problem.residual(linear, list(thetas.values())), penalty=penalty,
         start={}, recover=partial(_split_model, problem, reduce(problem.problem), keys, gauge, svd),
-        view=problem.view({**linear, **thetas}, "relaxed"),
+        view=problem.view({**linear, **thetas}),
         parameters={"weight": tau} if nuclear else {},
         structure=None if nuclear else LeastSquaresStructure(problem.problem, (*linear, *keys), ()),
         certify=partial(certify_nuclear, problem.problem, np.array(heights) / problem.unit) if nuclear else None)

@@ -192,7 +192,7 @@ class Posing:
         units = self.criterion.units
         if unknowns.memory:
             expressions["x0"] = variables["x0"] + self._before(expressions)
-        view = View(expressions, kind="tangent", channels=unknowns.layout.inputs,
+        view = View(expressions, iterate=True, channels=unknowns.layout.inputs,
                     bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))),
                     gauge=self.criterion.gauge, reference=values, units=units)
         start = {**(self.usual or values), "residual": at.whole[1]}

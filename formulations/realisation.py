@@ -88,6 +88,6 @@ def _view(realisation: Realisation, units: Transform, variables: dict[str, Any],
         expressions["Ez"] = cp.hstack(inner[x.m :])
     if all(isinstance(basis, Linear) for basis in x.inputs):
         expressions["B"], expressions["D"] = expressions["Bu"], expressions["Du"]
-    return View(expressions, kind="realisation", channels=x.input_names, outputs=x.output_names,
+    return View(expressions, channels=x.input_names, outputs=x.output_names,
                 bases=dict(zip(x.input_names, outer_bases(x.inputs, units))),
                 gauge="norm" if realisation.factored else "", reference={"A": form.a, "C": form.c}, units=units)

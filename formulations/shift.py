@@ -49,7 +49,7 @@ def refined(step: ShiftStep, p: np.ndarray, a: np.ndarray, rules: Sequence[Rule]
 def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Program:
     """Return the programme for the P that leaves a given A the largest margin in the matrix inequalities."""
     p, margin = cp.Variable(a.shape, symmetric=True, name="P"), cp.Variable(name="margin")
-    view = View({"P": p, "Q": step.inner(a) @ p}, kind="shift", reference={"A": step.free})
+    view = View({"P": p, "Q": step.inner(a) @ p}, reference={"A": step.free})
     structural = _normalised(p)
     bare = Program("centre", cp.Minimize(-margin), structural, {"P": p, "margin": margin}, {}, dict, view,
                    structural=frozenset(structural)).subject_to(*rules)
@@ -68,7 +68,7 @@ def _least_norm(name: str, step: ShiftStep, fit: Any, variables: dict[str, Any],
     residual, height = cp.Variable(fit.size, name="residual"), cp.Variable(name="height")
     error = cp.vec(fit, order="F")
     constraints = {"residual": (residual == error,), "norm": (cp.SOC(height, residual),), **constraints}
-    view = View({"P": pair[0], "Q": pair[1]}, kind="shift", reference={"A": step.free})
+    view = View({"P": pair[0], "Q": pair[1]}, reference={"A": step.free})
     return Program(name, cp.Minimize(height), constraints, {**variables, "residual": residual, "height": height},
                    start, step.recover, view, structural=frozenset(constraints), derived={"residual": error},
                    scale=step.size).subject_to(*rules)

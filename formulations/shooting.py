@@ -130,7 +130,7 @@ class _Shooting:
         start = self._start()
         reference = {name: start[name] for name in ("a", "offset") if name in start}
         units = self.criterion.units
-        view = View(expressions, kind="exact", channels=layout.inputs,
+        view = View(expressions, channels=layout.inputs,
                     bases=dict(zip(layout.inputs, outer_bases(layout.bases, units))), gauge=gauge, reference=reference,
                     units=units)
         objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))

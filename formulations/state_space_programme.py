@@ -88,7 +88,7 @@ class Posing:
             objective = objective + cp.sum_squares(cp.multiply(weights, stacked - x))
         names, bases = unknowns.expansion.input_names, unknowns.expansion.inputs
         bases = bases if self.units is None else outer_bases(bases, self.units)
-        view = View({**variables, **self._theta(variables, values), **self._static(variables, values)}, kind="tangent",
+        view = View({**variables, **self._theta(variables, values), **self._static(variables, values)}, iterate=True,
                     channels=names, outputs=unknowns.expansion.output_names,
                     bases=dict(zip(names, bases)), gauge="norm", reference=values, units=self.units)
         program = Program(name=self.name, objective=cp.Minimize(objective), constraints={"residual": (r == residual,)},

@@ -78,7 +78,7 @@ def test_an_unbounded_programme_says_so():
     def falling(data):
         x = cp.Variable(1, name="x")
         return Program("falling", cp.Minimize(cp.sum(x)), {"cap": (x <= 1,)}, {"x": x}, {}, dict,
-                       View({"x": x}, kind="linear"))
+                       View({"x": x}))
 
     with pytest.raises(UnboundedError, match="'falling' has no minimum"):
         optid.fit(record(), falling)

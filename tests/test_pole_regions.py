@@ -18,7 +18,7 @@ def admits(rule, matrix):
     """Whether some P > 0 satisfies the rule for a given A: the margin it leaves when tr P = n."""
     n = len(matrix)
     p, slack = cp.Variable((n, n), symmetric=True), cp.Variable()
-    members = rule.build(View({"P": p, "Q": matrix @ p}, kind="shift"))
+    members = rule.build(View({"P": p, "Q": matrix @ p}))
     eased = [c.args[0] - slack * np.eye(c.args[0].shape[0]) >> 0 for c in members]
     problem = cp.Problem(cp.Maximize(slack), [p >> 1e-3 * np.eye(n), cp.trace(p) == n, slack <= 1, *eased])
     with warnings.catch_warnings():
@@ -98,8 +98,8 @@ def test_every_region_has_a_word_and_is_about_poles(word, name):
     (lambda: strip(0.9, 0.1), "low < high"),
     (lambda: sector(2.0), r"\(0, pi/2\]"),
     (lambda: pole_regions.damped(1.0), r"\(0, 1\)"),
-    (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(2)}, kind="linear")), "only 'stable' is available"),
-    (lambda: stable(real=0.3).build(View({"P": cp.Variable((2, 2))}, kind="shift")), "not for a matrix A"),
+    (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(2)})), "only 'stable' is available"),
+    (lambda: stable(real=0.3).build(View({"P": cp.Variable((2, 2)), "Q": cp.Variable((2, 2))})), "not for a matrix A"),
 ])
 def test_bad_arguments(call, words):
     with pytest.raises(StructureError, match=words):

@@ -175,11 +175,11 @@ def test_point_outside_the_bounds_of_a_variable_can_be_assigned_and_judged():
 
 def test_view_of_several_inputs_asks_for_the_channel():
     x = cp.Variable(2)
-    view = View({"mu[valve]": x}, kind="exact", channels=("valve", "pump"))
+    view = View({"mu[valve]": x}, channels=("valve", "pump"))
     assert view.key("mu", "valve") == "mu[valve]"
     with pytest.raises(StructureError, match="valve, pump"):
         view.key("mu")
-    assert View({"mu": x}, kind="exact", channels=("valve",)).key("mu") == "mu"
+    assert View({"mu": x}, channels=("valve",)).key("mu") == "mu"
 
 
 def test_infeasible_status_of_a_frozen_programme():

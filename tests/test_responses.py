@@ -29,7 +29,7 @@ def system(seed=0, direct=True, functions=None):
     thetas = {f"Theta[{name}]": cp.Variable((bases[name].size, width), name=f"Theta[{name}]") for name in INPUTS}
     targets = {key: rng.normal(size=v.shape) for key, v in thetas.items()}
     offset = cp.Variable(2, name="offset")
-    view = View({**thetas, "offset": offset}, kind="realisation", channels=INPUTS, outputs=OUTPUTS, bases=bases,
+    view = View({**thetas, "offset": offset}, channels=INPUTS, outputs=OUTPUTS, bases=bases,
                 reference={"A": a, "C": c})
     cost = sum(cp.sum_squares(v - targets[key]) for key, v in thetas.items()) + cp.sum_squares(offset - 1)
     program = Program("realisation", cp.Minimize(cost), {}, {**thetas, "offset": offset}, {}, dict, view)
@@ -139,7 +139,7 @@ def test_contradictions_are_infeasible():
 
 def test_a_pole_at_one_has_no_static_gain():
     program, a, c, bases, _ = system(0)
-    view = View({name: program.view[name] for name in program.view}, kind="realisation", channels=INPUTS,
+    view = View({name: program.view[name] for name in program.view}, channels=INPUTS,
                 outputs=OUTPUTS, bases=bases, reference={"A": np.eye(N), "C": c})
     with pytest.raises(StructureError, match="pole at 1"):
         shape.gain(1.0, channel="u1", output="y1")(view)
@@ -154,7 +154,7 @@ def test_a_pole_at_one_has_no_static_gain():
     (lambda view: responses.positive_real(-1.0), "not negative"),
     (lambda view: responses.step_response("up"), "'positive' or 'negative'"),
     (lambda view: responses.impulse_response(horizon=0), "at least one sample"),
-    (lambda view: responses.no_effect("u")(View({}, kind="linear", channels=("u",))), "no such step"),
+    (lambda view: responses.no_effect("u")(View({}, channels=("u",))), "no such step"),
 ])
 def test_bad_arguments(build, words):
     with pytest.raises(StructureError, match=words):

@@ -17,7 +17,7 @@ def _program():
     x = cp.Variable(2, name="x")
     objective = cp.Minimize(cp.sum_squares(x - np.array([1.0, 2.0])))
     return Program("small", objective, {"sum": (cp.sum(x) == 2.0,)}, {"x": x}, {"x": np.ones(2)}, dict,
-                   View({"x": x}, kind="exact"), frozenset({"sum"}))
+                   View({"x": x}), frozenset({"sum"}))
 
 
 def _claiming(status, values):

@@ -18,10 +18,10 @@ from optid.program.limits import Limit
 from optid.program.view import View
 
 
-def build(rule, na, reference=None, kind="linear"):
+def build(rule, na, reference=None, iterate=False):
     """The constraint on a, with its variable."""
     a = cp.Variable(na, name="a")
-    view = View({"a": a}, kind=kind, channels=("u",), reference={} if reference is None else {"a": reference})
+    view = View({"a": a}, iterate=iterate, channels=("u",), reference={} if reference is None else {"a": reference})
     members = rule.build(view)
     return a, [member.member if isinstance(member, Limit) else member
                for member in (members if isinstance(members, list) else [members])]
@@ -83,7 +83,7 @@ def test_a_stable_iterate_lies_in_its_own_region_and_all_of_the_region_is_stable
     for _ in range(8):
         radius = float(rng.choice([1.0, 0.9]))
         iterate = np.real(np.poly(radius * near_the_circle(rng, na, distance)))[1:]
-        a, members = build(stable(radius), na, iterate, kind="tangent")
+        a, members = build(stable(radius), na, iterate, iterate=True)
         assert holds(a, members, iterate)
         for _ in range(25):  # as far as the region reaches in a random direction
             way, low, high = rng.normal(size=na), 0.0, 10.0
@@ -97,7 +97,7 @@ def test_a_stable_iterate_lies_in_its_own_region_and_all_of_the_region_is_stable
 
 def test_a_tangent_step_from_an_unstable_iterate_is_led_back():
     iterate = np.real(np.poly([1.05, 0.9 + 0.3j, 0.9 - 0.3j]))[1:]
-    a, members = build(stable(1.0), 3, iterate, kind="tangent")
+    a, members = build(stable(1.0), 3, iterate, iterate=True)
     cp.Problem(cp.Minimize(cp.sum_squares(a - iterate)), members).solve(solver=cp.CLARABEL)
     assert largest(a.value) < 1
 

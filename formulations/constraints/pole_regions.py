@@ -99,10 +99,10 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     Raises:
         StructureError: the formulation has no such step.
     """
-    if view.kind != "shift":
+    if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available")
-    return [side.inequality(view["P"], view["Q"]) for side in sides]
+    return [side.inequality(*view.poles) for side in sides]
 
 
 def disc(centre: float, radius: float) -> Rule:

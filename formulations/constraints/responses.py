@@ -11,7 +11,6 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.constraints.rule import Rule
-from formulations.constraints.static_curve import output_index, through_matrices
 from optid.errors import StructureError
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -77,7 +76,7 @@ def no_effect(channel: str, output: str | None = None) -> Rule:
 
     def build(view: View) -> Any:
         _needs_realisation(view, "no_effect")
-        theta = view[view.key("Theta", _known(view, channel))]
+        theta = view[view.key("Theta", view.channel(channel))]
         if output is None:
             return Limit(theta == 0, band=np.eye(theta.size), span=np.eye(theta.size))
         rows = markov_rows(view, channel, output, len(view.reference["A"]) + 1)
@@ -126,10 +125,10 @@ def positive_real(margin: float = 0.0) -> Rule:
 def markov_rows(view: View, channel: str | None, output: str | None, count: int) -> np.ndarray:
     """Return (count, n + l or n) weights whose products with Theta are D, C B, C A B, ... of one output."""
     a, c = view.reference["A"], view.reference["C"]
-    row = c[output_index(view, output)]
-    found = [through_matrices(view, channel, np.zeros(len(a)), output)]
+    row = c[view.output(output)]
+    found = [view.weights(channel, np.zeros(len(a)), output)]
     for _ in range(count - 1):
-        found.append(through_matrices(view, channel, row, output, direct=0.0))
+        found.append(view.weights(channel, row, output, direct=0.0))
         row = row @ a
     return np.array(found)
 
@@ -144,7 +143,7 @@ def _response(word: str, sign: str, horizon: float, channel: str | None, output:
 
     def build(view: View) -> Any:
         _needs_realisation(view, word)
-        one = _known(view, channel)
+        one = view.channel(channel)
         weights = markov_rows(view, one, output, int(horizon) + 1)
         weights = np.cumsum(weights, axis=0) if summed else weights
         sizes = np.linalg.norm(weights, axis=1)
@@ -155,16 +154,7 @@ def _response(word: str, sign: str, horizon: float, channel: str | None, output:
     return Rule(f"{word}:{sign}" + (f"[{','.join(label)}]" if label else ""), build)
 
 
-def _known(view: View, channel: str | None) -> str:
-    if channel is None and len(view.channels) == 1:
-        return view.channels[0]
-    if channel not in view.channels:
-        wrong = "needs channel=" if channel is None else f"names no input {channel!r}"
-        raise StructureError(f"this constraint {wrong}; the inputs are {', '.join(view.channels)}")
-    return channel
-
-
 def _needs_realisation(view: View, word: str) -> None:
-    if view.kind != "realisation":
+    if not view.holds_matrices:
         raise StructureError(f"constraint {word!r} acts where B and D of a state-space model are chosen; "
                              "this formulation has no such step")

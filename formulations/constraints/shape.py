@@ -23,7 +23,6 @@ import numpy as np
 
 from formulations.constraints.rule import Rule
 from formulations.constraints.stability import stable
-from formulations.constraints.static_curve import basis_of, denominator, offset_of, settles, static_theta
 from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.program.limits import Limit
@@ -32,8 +31,8 @@ from optid.program.view import View
 __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "gain", "monotone", "odd", "saturation",
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
-FACTORED = ("exact", "tangent", "realisation")  # kinds whose variables are mu and b
 RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
+SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -140,11 +139,10 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
         raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
 
     def build(view: View) -> Any:
-        basis, theta = basis_of(view, channel), static_theta(view, channel, output)
-        curve = basis.values(us) @ theta + offset_of(view, output)
-        size = denominator(view)
+        basis, theta, size = view.basis(channel), view.static(channel, output), view.static_scale
+        curve = basis.values(us) @ theta + view.static_offset(output)
         points = Limit(curve == cp.multiply(ys, size), size, None, step=_range_of(basis, theta, size), words=RANGE)
-        return [points, *settles(view)]
+        return [points, *_settles(view)]
 
     return Rule(_label("through", channel, output), build)
 
@@ -191,7 +189,7 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
         raise StructureError("coefficients needs low= and/or high=")
 
     def build(view: View) -> Any:
-        if view.kind in FACTORED and view.gauge == "norm" and name not in ("a", "offset"):
+        if view.gauge == "norm" and name not in ("a", "offset"):
             raise StructureError(f"bounds on {name!r} depend on the gauge, and 'norm' only fixes a length; choose "
                                  "gauge='b0' or gauge='gain', or bound the static gain or slope instead")
         variable = view[name] if index is None else cp.hstack([view[name][int(index)]])
@@ -215,18 +213,17 @@ def fixed(name: str, value: Any) -> Rule:
 
     def build(view: View) -> Any:
         word, _, channel = name.partition("[")
-        if word in ("mu", "b") and view.kind != "linear":
-            direction = np.ravel(known, order="F") / np.linalg.norm(known)
-            rest = np.eye(direction.size) - np.outer(direction, direction)
-            rest = _independent(rest)
-            if view.kind in FACTORED:
-                _check_shape(name, known, view[name].shape)
-                target = view[name] if view[name].ndim == 1 else cp.vec(view[name], order="F")
-                return rest @ target == 0
-            theta = view["Theta[" + channel if channel else "Theta"]
-            return rest @ (theta if word == "mu" else theta.T) == 0
-        _check_shape(name, known, view[name].shape)
-        return view[name] == known
+        product = "Theta[" + channel if channel else "Theta"
+        scaled = product in view or name.replace("b", "mu", 1) in view  # f and b are known up to a factor then
+        if word not in ("mu", "b") or not scaled:
+            _check_shape(name, known, view[name].shape)
+            return view[name] == known
+        direction = np.ravel(known, order="F") / np.linalg.norm(known)
+        rest = _independent(np.eye(direction.size) - np.outer(direction, direction))
+        if name in view:
+            _check_shape(name, known, view[name].shape)
+            return rest @ (view[name] if view[name].ndim == 1 else cp.vec(view[name], order="F")) == 0
+        return rest @ (view[product] if word == "mu" else view[product].T) == 0
 
     return Rule(f"fixed:{name}", build)
 
@@ -269,15 +266,10 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
     """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
 
     def build(view: View, one: str) -> Any:
-        basis = basis_of(view, one)
+        basis = view.basis(one)
         matrix = rows(basis)
-        if view.kind in FACTORED and view.key("mu", one) in view:
-            coefficients = [view[view.key("mu", one)]]
-        else:
-            outputs = view.outputs if view.kind == "realisation" else (None,)
-            coefficients = [static_theta(view, one, output) for output in outputs or (None,)]
-        return [Limit(matrix @ each >= 0, bound=one, step=_range_of(basis, each) if heights else None,
-                      words=RANGE if heights else "") for each in coefficients]
+        return [Limit(matrix @ curve >= 0, bound=one, step=_range_of(basis, curve) if heights else None,
+                      words=RANGE if heights else "") for curve in view.curves(one)]
 
     return Rule(_label(f"{word}:{direction}" if direction else word, channel),
                 lambda view: _every(view, channel, lambda one: build(view, one)))
@@ -285,11 +277,9 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
     def build(view: View, one: str) -> Any:
-        basis = basis_of(view, one)
+        basis, coefficients = view.basis(one), view.function(one)
         whole = rows(basis)
         matrix = _independent(whole)
-        factored = view.kind in FACTORED and view.key("mu", one) in view
-        coefficients = view[view.key("mu" if factored else "Theta", one)]
         return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(basis, coefficients),
                      words=RANGE)
 
@@ -304,18 +294,23 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
         raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
 
     def build(view: View) -> Any:
-        basis, theta, size = basis_of(view, channel), static_theta(view, channel, output), denominator(view)
+        basis, theta, size = view.basis(channel), view.static(channel, output), view.static_scale
         curve = rows(basis) @ theta
         if offset:
-            curve = curve + offset_of(view, output)
+            curve = curve + view.static_offset(output)
         meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
                                    "words": RANGE if offset else f"{RANGE} over the width of its interval"}
         if low == high:
-            return [Limit(curve - low * size == 0, size, "value", **meaning), *settles(view)]
+            return [Limit(curve - low * size == 0, size, "value", **meaning), *_settles(view)]
         return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
-            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + settles(view)
+            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + _settles(view)
 
     return Rule(_label(word, channel), build)
+
+
+def _settles(view: View) -> list[Any]:
+    """Return the constraint ``1 + sum(a) > 0``, without which there is no static characteristic."""
+    return [Limit(view.static_scale >= SETTLES, bound="settles")] if "a" in view else []
 
 
 def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) -> Callable[[], float]:

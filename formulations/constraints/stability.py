@@ -5,9 +5,9 @@ Exact for na <= 2 (the stability triangle); above that a stated convex inner reg
 Sebek and Kucera 2003 use the same central polynomial in LMI form). It is imposed on a grid of frequencies that is
 dense where a root of C is near the circle, as linear inequalities; the roots are verified after the fit.
 
-In the steps of an output-error fit (kind "tangent") C is the current iterate, pulled inwards only as far as the
+In the steps of an output-error fit C is the current iterate, pulled inwards only as far as the
 iterate stays inside the region: no step is therefore cut off, and every iterate is stable by construction. For the
-matrix A of a state-space model (kind "shift") the disc is an exact linear matrix inequality.
+matrix A of a state-space model the disc is an exact linear matrix inequality.
 """
 
 from collections.abc import Sequence
@@ -49,13 +49,13 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
     name, radius = f"stable:{radius:g}", radius * (1 - MARGIN)
 
     def build(view: View) -> Any:
-        if view.kind == "shift":
+        a = view.poles
+        if isinstance(a, tuple):
             if points is not None:
                 raise StructureError("real= is defined for the coefficients of a polynomial, not for a matrix A")
             return lmi(view, [disc_side(radius)], name)
-        if "a" not in view:
+        if a is None:
             raise StructureError("there is nothing to stabilise: na is 0")
-        a = view["a"]
         if a.ndim != 1:
             raise StructureError("stable is defined for one output; constrain the entries of a instead")
         na = a.shape[0]
@@ -69,7 +69,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
             return [Limit(1 + first + second >= 0, -along - across), Limit(1 - first + second >= 0, along - across),
                     Limit(second <= 1, across)]
         reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
-        rows, levels, centre = inner_region(reference, radius, keep=view.kind == "tangent")
+        rows, levels, centre = inner_region(reference, radius, keep=view.iterate)
         grid = frequencies(roots_of(scaled(centre, radius)))
         wider, narrower = ((1 + sign * NEARBY) * radius for sign in (1, -1))
         (above, high), (below, low) = (_positive_real(centre * (near / radius) ** np.arange(1, na + 1), near, grid)

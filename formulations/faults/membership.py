@@ -193,7 +193,7 @@ def membership_programme(window: BoundedWindow, signature: Signature | None = No
         constraints["no noise"] = (noise(exact, np.ones(exact.size)) == 0,)
     return Program(
         "fault.membership", cp.Minimize(t), constraints, variables,
-        {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions, kind="membership"),
+        {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions),
         structural=frozenset(constraints), scale=1.0, compressed=window,
         certify=partial(_certified, window, signature, bounded, exact, bounds))
 

@@ -68,7 +68,7 @@ def places_programme(problem: CovarianceProblem) -> Program:
     sizes = np.linalg.norm(problem.signatures, axis=0)
     scaled, residual = cp.Variable(sizes.size, name="scaled"), cp.Variable(problem.target.size, name="residual")
     misfit = problem.target - (problem.signatures / sizes) @ scaled
-    view = View({"rho": cp.multiply(1 / sizes, scaled)}, kind="covariance")
+    view = View({"rho": cp.multiply(1 / sizes, scaled)})
     return Program(
         "fault.noise_covariance", cp.Minimize(0.5 * cp.sum_squares(residual)),
         {"residual": (residual == misfit,), "variances": (scaled >= 0,)}, {"scaled": scaled, "residual": residual},
@@ -91,7 +91,7 @@ def full_programme(problem: CovarianceProblem) -> Program:
         "fault.noise_covariance full", cp.Minimize(0.5 * cp.sum_squares(residual)),
         {"residual": (residual == misfit,), "process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)},
         {"Q": Q, "R": R, "residual": residual}, {"Q": np.eye(n), "R": np.eye(l)}, dict,
-        View({"Q": process, "R": sensor}, kind="covariance"),
+        View({"Q": process, "R": sensor}),
         structural=frozenset({"residual", "process covariance", "sensor covariance"}), derived={"residual": misfit},
         scale=0.5 * float(problem.target @ problem.target))
 

@@ -142,7 +142,7 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
     misfit = problem.r - columns @ changes[:, 0]
     form = GroupSparseStructure(GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count)),
                                 {"changes": (count, 1)})
-    view = View({"f": shapes @ changes[:, 0], "changes": changes[:, 0]}, kind="profile")
+    view = View({"f": shapes @ changes[:, 0], "changes": changes[:, 0]})
     return Program(
         f"fault.profile {prior}", cp.Minimize(0.5 * cp.sum_squares(residual) + level * cp.norm1(changes)),
         {"residual": (residual == misfit,)}, {"changes": changes, "residual": residual},
@@ -165,7 +165,7 @@ def _refit(problem: CourseProblem, shapes: np.ndarray, prior: str, rules: Sequen
     program = Program(
         f"fault.profile {prior} refit", cp.Minimize(0.5 * cp.sum_squares(residual)),
         {"residual": (residual == misfit,)}, variables, start, dict,
-        View({"f": course, "changes": changes}, kind="profile"), structural=frozenset({"residual"}),
+        View({"f": course, "changes": changes}), structural=frozenset({"residual"}),
         derived={"residual": misfit}, scale=0.5 * float(problem.r @ problem.r))
     return program.subject_to(*rules) if shapes.shape[1] else program
 
@@ -231,7 +231,7 @@ def smooth_programme(problem: CourseProblem) -> Program:
         "fault.profile smooth", cp.Minimize(0.5 * cp.sum_squares(residual) + 0.5 * cp.sum_squares(rough)),
         {"residual": (residual == misfit,), "roughness": (rough == steps,)},
         {"f": f, "residual": residual, "rough": rough}, {"f": problem.shapes("tv") @ _one(steps_seen, problem.r)}, dict,
-        View({"f": f, "changes": f - cp.hstack([np.zeros(1), f[:-1]])}, kind="profile"),
+        View({"f": f, "changes": f - cp.hstack([np.zeros(1), f[:-1]])}),
         structural=frozenset({"residual", "roughness"}), parameters={"root of rho": root},
         derived={"residual": misfit, "rough": steps}, scale=0.5 * float(problem.r @ problem.r))
 

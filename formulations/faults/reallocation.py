@@ -130,7 +130,7 @@ def _posed(name: str, problem: AllocationProblem, variables: dict[str, cp.Variab
         return np.asarray(values["v"])
 
     names = tuple(problem.names)
-    view = View(dict(variables), kind="linear", channels=names, outputs=tuple(problem.outputs))
+    view = View(dict(variables), channels=names, outputs=tuple(problem.outputs))
     return Program(name, cp.Minimize(objective), structural, variables, {}, recover, view, frozenset(structural),
                    scale=scale or 1.0).subject_to(*constraints)
 

@@ -143,7 +143,7 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
         rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
     elif constraints != "default":
         raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
-    view = View(expressions, kind="exact", channels=tuple(curve.name for curve in problem.curves), gauge="none",
+    view = View(expressions, channels=tuple(curve.name for curve in problem.curves), gauge="none",
                 bases={curve.name: curve.basis for curve in problem.curves}, outputs=problem.model.outputs)
 
     def recover(values: Values) -> Refitted:

@@ -86,7 +86,7 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
         "fault.signature", cp.Minimize(0.5 * cp.sum_squares(residual) + level * norms),
         {"residual": (residual == misfit,)}, {**variables, "residual": residual},
         {name: _alone(atom, r) for name, atom in zip(variables, atoms)}, dict,
-        View({**variables, **sizes}, kind="signature"),
+        View({**variables, **sizes}),
         structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, structure=form,
         certify=partial(certify), scale=0.5 * float(r @ r))
 

@@ -70,7 +70,7 @@ def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: l
     """
     groups = {key: tuple(group) if isinstance(group, list | tuple) else (group,) for key, group in constraints.items()}
     named = {variable.name(): variable for variable in variables}
-    view = View({**named, **(expressions or {})}, kind="exact")
+    view = View({**named, **(expressions or {})})
     return Program(name, cp.Minimize(objective), groups, named, dict(start or {}), dict, view, **parts)
 
 

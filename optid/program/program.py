@@ -202,7 +202,7 @@ class Program:
             if name in self.structural and not any(c.variables() for c in kept):
                 continue
             constraints[name] = kept
-        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, kind=self.view.kind,
+        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, iterate=self.view.iterate,
                     channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
                     reference=self.view.reference, outputs=self.view.outputs, units=self.view.units)
         limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}

@@ -88,14 +88,14 @@ def energy_unit(units: Transform) -> float:
     return units.y_scale[0] ** 2
 
 
-def outward(expressions: Mapping[str, Any], kind: str, units: Transform, inputs: Sequence[str]) -> dict[str, Any]:
+def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> dict[str, Any]:
     """Return the named expressions of a programme in the units of the record.
 
     Args:
         expressions: by name, in the units of the programme.
-        kind: that of the view.
         units: from those of the programme to those of the record.
         inputs: names of the inputs.
+        states: whether the constant is that of the output equation of a state-space model.
     """
     r, found = units.y_scale[0], {}
     for name, expression in expressions.items():
@@ -109,7 +109,7 @@ def outward(expressions: Mapping[str, Any], kind: str, units: Transform, inputs:
             level = np.array(units.y_offset)
             found[name] = found[name] + (level[0] if expression.ndim == 1 else np.tile(level, (expression.shape[0], 1)))
     if "offset" in found:
-        found["offset"] = found["offset"] + _level(found, kind, units, inputs)
+        found["offset"] = found["offset"] + _level(found, units, inputs, states)
     return found
 
 
@@ -117,10 +117,10 @@ def _position(channel: str, inputs: Sequence[str]) -> int:
     return list(inputs).index(channel) if channel in inputs else 0
 
 
-def _level(found: Mapping[str, Any], kind: str, units: Transform, inputs: Sequence[str]) -> Any:
+def _level(found: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> Any:
     """What the levels of outputs and linear inputs add to the constants of the equations."""
     level: Any = np.array(units.y_offset)
-    if kind == "realisation" or "C" in found:  # the constant of the output equation
+    if states:
         return level
     a = found.get("a")
     if a is not None and np.any(level):

@@ -17,35 +17,38 @@ Values = Mapping[str, np.ndarray]
 class View(Mapping[str, cp.Expression]):
     """The named expressions that a constraint may speak about, and the structure it may need.
 
+    A factored model has ``mu`` and ``b`` of an input, a relaxed one the product ``Theta``, a linear one ``b`` alone;
+    the step that chooses the poles of a state-space model has ``P`` and ``Q`` = A P, the step that chooses B and D
+    ``Theta`` = functions x [B; D] with A and C held.
+
     Attributes:
-        kind: "exact" (variables a, b, mu, offset), "relaxed" (a, Theta, offset), "linear" (a, b, offset), "tangent"
-            (a step of an output-error fit), "shift" (P and Q = A P) or "realisation" (Theta_c = functions x [B; D] of
-            input c, and offset, with A and C held).
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
         bases: the fitted basis of every channel.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
-        reference: values of the unconstrained least-squares estimate, for constraints that need a centre; in a
-            "realisation" step the matrices ``A`` and ``C`` that are held.
+        reference: values of the unconstrained least-squares estimate, for constraints that need a centre; matrices
+            ``A`` and ``C`` of a state-space model, held where they are no variables.
+        iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
         inner: the expressions in the units of the programme.
     """
 
-    def __init__(self, expressions: Mapping[str, cp.Expression], *, kind: str, channels: tuple[str, ...] = (),
+    def __init__(self, expressions: Mapping[str, cp.Expression], *, channels: tuple[str, ...] = (),
                  bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None,
-                 outputs: tuple[str, ...] = (), units: Transform | None = None) -> None:
+                 outputs: tuple[str, ...] = (), units: Transform | None = None, iterate: bool = False) -> None:
         self.inner = dict(expressions)
         self.units = units
-        self._expressions = self.inner if units is None else outward(self.inner, kind, units, channels)
+        self.reference = dict(reference or {})
+        self._expressions = self.inner if units is None else outward(
+            self.inner, units, channels, states="C" in self.reference)
         self._auxiliaries: dict[int, cp.Variable] = {}
         self.outputs = tuple(outputs)
-        self.kind = kind
+        self.iterate = iterate
         self.channels = channels
         self.bases = dict(bases or {})
         self.gauge = gauge
-        self.reference = dict(reference or {})
 
     def __getitem__(self, name: str) -> cp.Expression:
         try:
@@ -89,3 +92,121 @@ class View(Mapping[str, cp.Expression]):
         if channel is None:
             raise StructureError(f"{name!r} needs a channel: there are several inputs ({', '.join(self.channels)})")
         return f"{name}[{channel}]"
+
+    # -- what constraints are stated in -----------------------------------------------------------------------------
+
+    @property
+    def poles(self) -> tuple[cp.Expression, cp.Expression] | cp.Expression | None:
+        """What determines the poles: (P, Q = A P), or the coefficients a of a polynomial; None without poles."""
+        if "P" in self and "Q" in self:
+            return self["P"], self["Q"]
+        return self["a"] if "a" in self else None
+
+    @property
+    def holds_matrices(self) -> bool:
+        """Whether A and C are held, so that the responses of the model are linear in ``Theta``."""
+        return "C" in self.reference and "C" not in self
+
+    def basis(self, channel: str | None) -> Any:
+        """Return the basis of an input, of the only one where none is named.
+
+        Raises:
+            StructureError: several inputs and none named, or no such input.
+        """
+        return self.bases[self.channel(channel)]
+
+    def channel(self, channel: str | None) -> str:
+        """Return the name of an input, of the only one where none is named.
+
+        Raises:
+            StructureError: several inputs and none named, or no such input.
+        """
+        if channel is None:
+            if len(self.channels) != 1:
+                raise StructureError(f"this constraint needs channel=, one of {', '.join(self.channels)}")
+            return self.channels[0]
+        if channel not in self.bases:
+            raise StructureError(f"there is no input {channel!r}; the inputs are {', '.join(self.channels)}")
+        return channel
+
+    def output(self, output: str | None) -> int:
+        """Return the position of an output of a state-space model; of the only one where none is named.
+
+        Raises:
+            StructureError: several outputs and none named, or no such output.
+        """
+        if output is None and len(self.reference["C"]) == 1:
+            return 0
+        if output not in self.outputs:
+            wrong = "needs output=" if output is None else f"names no output {output!r}"
+            raise StructureError(f"this constraint {wrong}; the outputs are {', '.join(self.outputs)}")
+        return self.outputs.index(output)
+
+    def function(self, channel: str) -> cp.Expression:
+        """Return the coefficients of f of an input up to factors: ``mu``, or the columns of ``Theta``."""
+        mu = self.key("mu", channel)
+        return self[mu] if mu in self else self[self.key("Theta", channel)]
+
+    def curves(self, channel: str) -> list[cp.Expression]:
+        """Return what the shape of f is stated in: ``mu``, or the static curve of every output."""
+        mu = self.key("mu", channel)
+        if mu in self:
+            return [self[mu]]
+        return [self.static(channel, output) for output in (self.outputs if self.holds_matrices else ()) or (None,)]
+
+    def static(self, channel: str | None, output: str | None = None) -> Any:
+        """Return the coefficients of the static curve of an input, times `static_scale`.
+
+        ``Theta`` summed over the lags; of a state-space model through A, B, C and D.
+
+        Raises:
+            StructureError: there is no static curve, or it is not linear in the variables.
+        """
+        channel = self.channel(channel)
+        if self.holds_matrices:
+            a, c = self.reference["A"], self.reference["C"]
+            try:
+                row = np.linalg.solve((np.eye(len(a)) - a).T, c[self.output(output)])
+            except np.linalg.LinAlgError:
+                raise StructureError(
+                    "the model has a pole at 1, hence no static characteristic; add 'stable'") from None
+            return self[self.key("Theta", channel)] @ self.weights(channel, row, output)
+        if "C" in self.reference:  # to first order in A, B, C and D
+            if self.key("static", channel) not in self:
+                raise StructureError(
+                    "nonlinear feedback: the static characteristic does not follow from the inputs alone")
+            return self[self.key("static", channel)][:, self.output(output)]
+        if self["offset"].size > 1:
+            raise StructureError("constraints on the static characteristic are defined for one output")
+        if self.key("Theta", channel) not in self:  # a linear model has b alone
+            return cp.hstack([cp.sum(self[self.key("b", channel)])])
+        return cp.sum(self[self.key("Theta", channel)], axis=1)
+
+    def static_offset(self, output: str | None = None) -> Any:
+        """Return the constant of the static curve of an output, times `static_scale`."""
+        if "C" not in self.reference:
+            return self["offset"][0]
+        level = self["offset"][self.output(output)] if "offset" in self else 0.0
+        for channel, origin in zip(self.channels, self.units.u_offset if self.units else ()):
+            if origin:  # the programme counts a linear input from its level
+                level = level - origin * self.static(channel, output)[0]
+        return level
+
+    @property
+    def static_scale(self) -> Any:
+        """``1 + sum(a)``, one where there is no a."""
+        return 1 + cp.sum(self["a"]) if "a" in self else 1.0
+
+    def weights(self, channel: str | None, row: np.ndarray, output: str | None, direct: float = 1.0) -> np.ndarray:
+        """Return w of one output with ``Theta w = (row B + direct D_output) of every function``, with A and C held.
+
+        Args:
+            channel: name of the input; its Theta is (functions, n) where it has no direct feedthrough.
+            row: (n,) weights of the states.
+            output: name of the output.
+            direct: weight of its feedthrough.
+        """
+        a, c = self.reference["A"], self.reference["C"]
+        found = np.concatenate([row, np.zeros(len(c))])
+        found[len(a) + self.output(output)] = direct
+        return found[: self[self.key("Theta", channel)].shape[1]]

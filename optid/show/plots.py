@@ -201,7 +201,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     heights = fit.program.view.units
     if fit.model.kind != "HammersteinARX" or compressed is None or not fit.solution.has_point:
         return found
-    if fit.program.view.kind == "exact":
+    if rank_one_of(fit.program) is not None:
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
         thetas = []
         for rows, columns in compressed.problem.blocks:

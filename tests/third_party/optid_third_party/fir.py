@@ -57,7 +57,7 @@ def triangle(data: Data, length: int) -> tuple[np.ndarray, float]:
 
 def view_of(data: Data, b: cp.Variable, offset: cp.Variable) -> View:
     """Return what constraints may speak about."""
-    return View({"b": b, "offset": offset}, kind="linear", channels=data.inputs, bases={data.inputs[0]: line(data)},
+    return View({"b": b, "offset": offset}, channels=data.inputs, bases={data.inputs[0]: line(data)},
                 outputs=data.outputs)
 
 
