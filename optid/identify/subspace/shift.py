@@ -174,7 +174,7 @@ def _pole_blocks(free: Array, rules: Sequence[Any]) -> tuple[Array, Array, list[
     from scipy.linalg import schur
 
     def obeys(re: float, im: float) -> bool:
-        return not _disobeyed_by(np.array([complex(re, im), complex(re, -im)]), rules)
+        return not _disobeyed(np.array([[re, im], [-im, re]]), rules)
 
     try:
         found: Any = schur(free, output="real", sort=obeys)
@@ -236,12 +236,9 @@ def _judged(best: tuple[float, Array, Array | None], bound: float, free: Array, 
 
 
 def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:
-    return _disobeyed_by(np.linalg.eigvals(a), rules)
-
-
-def _disobeyed_by(values: Any, rules: Sequence[Any]) -> list[str]:
+    model = SimpleNamespace(poles=np.linalg.eigvals(a))
     checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
-    return [sentence for check in checks if (sentence := check(SimpleNamespace(poles=values)))]
+    return [sentence for check in checks if (sentence := check(model))]
 
 
 def _definite(p: Array) -> bool:
