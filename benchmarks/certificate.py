@@ -16,11 +16,11 @@ from functools import partial
 from time import perf_counter
 
 import numpy as np
+from rank_one_fits import minimise_in_cones, solve_certified
 from scipy.signal import lfilter
 from scipy.special import ndtr
 
-from optid.certificate import certify, solve_certified
-from optid.certificate.cones import minimise_in_cones
+from optid.certificate import certify
 from optid.structures.bilinear import best_of
 from optid.structures.rank_one import RankOne, reduce
 

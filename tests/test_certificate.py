@@ -5,14 +5,17 @@ import pytest
 from exact_search import hammerstein, monotone, regress, search_circle
 from hypothesis import given
 from hypothesis import strategies as st
+from scripts import benchmark
 
-from optid.certificate import certify, solve_certified
-from optid.certificate.cones import minimise_in_cones
+from optid.certificate import certify
 from optid.certificate.minors import basis_from, cholesky, free_mask, project_minors, tangent_minors
 from optid.certificate.shape_duals import sign_free_cut
 from optid.errors import StructureError
 from optid.structures.bilinear import best_of, minimise
 from optid.structures.rank_one import Point, RankOne, reduce
+
+fits = benchmark("rank_one_fits")
+minimise_in_cones, solve_certified = fits.minimise_in_cones, fits.solve_certified
 
 SHAPES = st.tuples(st.integers(2, 4), st.integers(2, 5))
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optid.backends.group_descent import minimise
+from optid.backends.block_descent import minimise
 from optid.errors import StructureError
 from optid.structures.group_sparse import GroupProblem
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optid.backends.nuclear_admm import minimise
+from optid.backends.admm import minimise
 from optid.structures.nuclear_norm import NuclearProblem, Predictor, nuclear_norm, window_starts
 
 FORMS = ("plain", "predictor", "projection", "weighted")

@@ -6,12 +6,14 @@ from exact_search import direction_value, hammerstein, monotone, regress, search
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
+from scripts import benchmark
 
-from optid.certificate.cones import minimise_in_cones
 from optid.errors import RankError, StructureError
 from optid.structures.bilinear import alternate, best_of, descend, minimise, starts
 from optid.structures.rank_one import Point, RankOne, reduce
 from optid.structures.whitening import kronecker_factors
+
+minimise_in_cones = benchmark("rank_one_fits").minimise_in_cones
 
 
 def plain_split(problem: RankOne) -> Point:

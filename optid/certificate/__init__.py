@@ -1,5 +1,5 @@
 """Proofs of global optimality for least squares in rank-one blocks, under constraints too."""
 
-from optid.certificate.ladder import certify, solve_certified
+from optid.certificate.ladder import certify
 
-__all__ = ["certify", "solve_certified"]
+__all__ = ["certify"]

@@ -27,7 +27,6 @@ from optid.certificate.shape_duals import (
 )
 from optid.errors import StructureError
 from optid.program.solution import Bound
-from optid.structures.bilinear import LocalSolution, best_of, descend, starts
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
 
 TOLERANCE = 1e-8
@@ -193,64 +192,6 @@ def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = 
         reason = f"{found.bound.reason}; the relaxation with {size} multipliers exceeds the limit {max_size}"
         return replace(found, bound=replace(found.bound, reason=reason))
     return relaxed(case, found, steps)
-
-
-@dataclass(frozen=True, eq=False)
-class Certified:
-    """A fit and what is known about it.
-
-    Attributes:
-        solution: the best local solution found.
-        certification: bound, gap and proof.
-        starts: number of local descents.
-    """
-
-    solution: LocalSolution
-    certification: Certification
-    starts: int
-
-
-def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, count: int = 8, seed: int = 0,
-                    max_size: int = 700) -> Certified:
-    """Minimise without constraints and prove it: stop at the first proof, search on while there is none.
-
-    The order of work: whitened SVD start and instant proof; all starts, instant proof, ascent, SDP; restarts from its
-    moment matrix; four times as many random starts; the honest gap.
-
-    Args:
-        problem: the least-squares problem.
-        effort: last rung of the ladder of :func:`certify`.
-        steps: of the ascent.
-        count: number of starts.
-        seed: of the random ones.
-        max_size: largest SDP, in multipliers.
-    """
-    core = reduce(problem)
-    if not core.shapes:
-        best = descend(core, [], [])
-        return Certified(best, certify(problem, best.point, core=core), 1)
-    best = descend(core, *starts(core, 1, seed)[0])
-    proof = certify(problem, best.point, effort="instant", core=core)
-    if proof.bound.proved:
-        return Certified(best, proof, 1)
-    best = min(best, best_of(core, count, seed, first=1), key=lambda solution: solution.value)
-    proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
-    tried = count
-    for round_ in range(2):
-        if proof.bound.proved or effort == "instant":
-            break
-        if proof.better:
-            again = [descend(core, *core.factors(point)[1:], alternations=1) for point in proof.better]
-        else:
-            again = [best_of(core, 4 * count, seed + 1 + round_, first=4)]
-        tried += len(proof.better) or 4 * (count - 1)
-        challenger = min(again, key=lambda solution: solution.value)
-        if challenger.value < best.value * (1 - 1e-10):
-            best = challenger
-            proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
-        elif proof.better:
-            proof = replace(proof, better=())
-    return Certified(best, proof, tried)
 
 
 def prepare(problem: RankOne, point: Point, cones: dict[int, Array], linear: Linear | None,

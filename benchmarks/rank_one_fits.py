@@ -1,17 +1,21 @@
-"""Local solution of rank-one least squares with ``C_i mu_i >= 0``, C_i square and invertible, and b_i of free sign.
+"""Fits in rank-one blocks without a programme: certified without constraints, and local with ``C_i mu_i >= 0``.
 
-Written in delta_i = C_i mu_i (the increments, for a monotone function) the constraint is a sign. Alternating
-nonnegative least squares finds which delta vanish; on that face the problem is unconstrained again, and Newton's method
-finishes with a gradient at roundoff. A face is left when a multiplier on it is negative.
+The matrices C_i are square and invertible, b_i is of free sign. Written in delta_i = C_i mu_i (the increments, for a
+monotone function) the constraint is a sign. Alternating nonnegative least squares finds which delta vanish; on that
+face the problem is unconstrained again, and Newton's method finishes with a gradient at roundoff. A face is left when a
+multiplier on it is negative.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
 
+from optid.certificate import certify
+from optid.certificate.ladder import Certification
 from optid.errors import StructureError
-from optid.structures.bilinear import LocalSolution, descend, starts
+from optid.structures.bilinear import LocalSolution, best_of, descend, starts
 from optid.structures.rank_one import Array, Point, RankOne, block_slices, matrices, reduce
 
 
@@ -166,3 +170,61 @@ def _multipliers_hold(problem: RankOne, point: Point, signed: tuple[int, ...]) -
     reference = float(np.linalg.norm(problem.g))
     gradients = matrices(slope, problem.blocks)
     return all((gradients[i] @ point.bs[i])[point.mus[i] == 0].min(initial=0.0) >= -1e-9 * reference for i in signed)
+
+
+@dataclass(frozen=True, eq=False)
+class Certified:
+    """A fit and what is known about it.
+
+    Attributes:
+        solution: the best local solution found.
+        certification: bound, gap and proof.
+        starts: number of local descents.
+    """
+
+    solution: LocalSolution
+    certification: Certification
+    starts: int
+
+
+def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, count: int = 8, seed: int = 0,
+                    max_size: int = 700) -> Certified:
+    """Minimise without constraints and prove it: stop at the first proof, search on while there is none.
+
+    The order of work: whitened SVD start and instant proof; all starts, instant proof, ascent, SDP; restarts from its
+    moment matrix; four times as many random starts; the honest gap.
+
+    Args:
+        problem: the least-squares problem.
+        effort: last rung of the ladder of `certify`.
+        steps: of the ascent.
+        count: number of starts.
+        seed: of the random ones.
+        max_size: largest SDP, in multipliers.
+    """
+    core = reduce(problem)
+    if not core.shapes:
+        best = descend(core, [], [])
+        return Certified(best, certify(problem, best.point, core=core), 1)
+    best = descend(core, *starts(core, 1, seed)[0])
+    proof = certify(problem, best.point, effort="instant", core=core)
+    if proof.bound.proved:
+        return Certified(best, proof, 1)
+    best = min(best, best_of(core, count, seed, first=1), key=lambda solution: solution.value)
+    proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+    tried = count
+    for round_ in range(2):
+        if proof.bound.proved or effort == "instant":
+            break
+        if proof.better:
+            again = [descend(core, *core.factors(point)[1:], alternations=1) for point in proof.better]
+        else:
+            again = [best_of(core, 4 * count, seed + 1 + round_, first=4)]
+        tried += len(proof.better) or 4 * (count - 1)
+        challenger = min(again, key=lambda solution: solution.value)
+        if challenger.value < best.value * (1 - 1e-10):
+            best = challenger
+            proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+        elif proof.better:
+            proof = replace(proof, better=())
+    return Certified(best, proof, tried)
