@@ -22,6 +22,7 @@ import numpy as np
 
 import formulations.shift
 import optid
+import optid.identify.subspace.shift
 from formulations.constraints.stability import stable
 from optid.errors import DataWarning
 from optid.solving.solve import run
@@ -58,7 +59,7 @@ def step(n: int, outputs: int, whole: bool) -> str:
     """Solve one step; return its excess over the least-squares residual in words."""
     gamma = observability(n, outputs)
     if whole:
-        formulations.shift.LARGEST = n
+        optid.identify.subspace.shift.LARGEST = n
     shift = run(formulations.shift.constrained_shift(gamma[:-outputs], gamma[outputs:], [stable(0.999)])).model
     return f"excess {shift.suboptimality / shift.bound:.3e}"
 

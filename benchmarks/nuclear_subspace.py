@@ -27,9 +27,12 @@ from pathlib import Path
 import numpy as np
 
 import optid
-from formulations.nuclear_subspace import held_out_fit, nuclear_programme, order_scores, structure
-from formulations.subspace_procedure import Plan, prepared
+from formulations.nuclear_subspace import nuclear_programme
+from formulations.subspace_procedure import preliminary
 from optid.backends import Settings, find
+from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
+from optid.identify.subspace.observability import prepared
+from optid.identify.subspace.plan import Plan
 from optid.solving.solve import solve
 
 
@@ -71,7 +74,7 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
         clock = time.process_time()
         solution = solve(program, "admm", accuracy=1e-7)
         seconds += time.process_time() - clock
-        for n, score in order_scores(plan, expansion, structured, solution.values, test).items():
+        for n, score in order_scores(plan, expansion, structured, solution.values, test, preliminary).items():
             found[float(weight), n] = score
     return found, seconds
 

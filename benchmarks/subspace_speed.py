@@ -27,8 +27,7 @@ import numpy as np
 from scipy.signal import dlsim
 
 from optid import Data, Polynomial, Triangular, fit
-from optid.identify.subspace.methods import positions, project
-from optid.identify.subspace.realisation import realise
+from optid.identify.subspace.projection import project, realise
 from optid.statistics.expansion import expand
 from optid.statistics.hankel import hankel_statistics, windows_of
 from optid.statistics.rq import rq
@@ -68,7 +67,7 @@ def formed(record: np.ndarray, expansion, rows: int, scale: np.ndarray) -> np.nd
     hankel = windows_of(expansion(record), 2 * rows).reshape(len(record) - 2 * rows + 1, -1)
     hankel = np.concatenate([np.ones((len(hankel), 1)), hankel], axis=1)
     statistics = hankel_statistics([record[: 4 * rows]], 2 * rows, expansion, method="gram")  # for positions alone
-    z, phi, y = positions(statistics, expansion, "inputs+past", True, rows)
+    z, phi, y = expansion.positions(statistics.at, "inputs+past", rows)
     order = np.concatenate([phi, z[~np.isin(z, phi)], y])
     triangle = np.linalg.qr(hankel[:, order], mode="r")
     r22 = triangle[phi.size : z.size, -y.size :].T
@@ -91,7 +90,7 @@ def expanded(count: int, rows: int, rounds: int, basis: str) -> None:
         slow, values = cpu(formed, record, expansion, rows, projection.scale)
         times.append((fast, slow))
     fast, slow = np.median(np.array(times), axis=0)
-    ours = projection.range.values
+    ours = projection.values
     error = float(np.max(np.abs(ours - values[: ours.size]) / values[0]))
     poles = np.sort(np.abs(np.linalg.eigvals(realise(projection.gamma(4), 2)[0])))
     print(f"expanded inputs, {basis}, {count} samples, 2 x {expansion.input_sizes[0]} functions, 2 outputs, {rows} "

@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from formulations.subspace_plan import in_record_units, planned
-from formulations.subspace_procedure import NOISES, identified
+from formulations.subspace_procedure import identified
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
 from optid.identify.design.expansion import Bases, FeedbackBases
+from optid.identify.subspace.plan import in_record_units, planned
 from optid.solving.solve import Procedure
+
+NOISES = ("white", "coloured")
 
 
 def sid(
@@ -46,7 +48,7 @@ def sid(
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
             alone (consistent under coloured measurement noise).
-        weighting: of the singular values, "moesp", "cva" or "plain" (`optid.identify.subspace.realisation`),
+        weighting: of the singular values, "moesp", "cva" or "plain" (`optid.identify.subspace.projection`),
             or "best" for the one whose (A, C) leaves the smallest error on the record.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
@@ -62,9 +64,9 @@ def sid(
         DataError: a channel that is constant.
     """
     one_of("noise", noise, NOISES)
-    instruments = "inputs+past" if noise == "white" else "inputs"
-    plan = planned("hammerstein_ss.sid", data, nx, block_rows, basis, None, instruments, weighting=weighting,
-                   offset=offset, feedthrough=feedthrough, observer=observer, split=split, stability=stability,
+    plan = planned("hammerstein_ss.sid", data, nx=nx, block_rows=block_rows, basis=basis,
+                   instruments="inputs+past" if noise == "white" else "inputs", weighting=weighting, offset=offset,
+                   feedthrough=feedthrough, observer=observer, split=split, stability=stability,
                    constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)
 
@@ -108,10 +110,11 @@ def sivid(
     """
     one_of("instruments", instruments, ("past", "inputs", "inputs+past"))
     if not 0 <= tolerance < 1:
-        raise StructureError(f"tolerance={tolerance!r}: a number in [0, 1) is needed.")
-    plan = planned("hammerstein_ss.sivid", data, nx, block_rows, basis, feedback_basis, instruments, form=form,
-                   tolerance=max(tolerance, 1e-10), weighting=weighting, offset=offset, feedthrough=feedthrough,
-                   observer=observer, split=split, stability=stability, constraints=tuple(constraints))
+        raise StructureError(f"tolerance={tolerance!r}: it must be a number in [0, 1).")
+    plan = planned("hammerstein_ss.sivid", data, nx=nx, block_rows=block_rows, basis=basis,
+                   feedback_basis=feedback_basis, instruments=instruments, form=form, tolerance=max(tolerance, 1e-10),
+                   weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
+                   stability=stability, constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)
 
 
@@ -152,10 +155,10 @@ def asivid(
     """
     one_of("noise", noise, NOISES)
     if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 0:
-        raise StructureError(f"iterations={iterations!r}: a whole number from 0 is needed.")
+        raise StructureError(f"iterations={iterations!r}: it must be an integer >= 0.")
     kind = "simulated" if iterations else "inputs"
-    plan = planned("hammerstein_ss.asivid", data, nx, block_rows, basis, feedback_basis,
-                   kind + ("+past" if noise == "white" else ""), form=form, iterations=int(iterations),
-                   weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
-                   stability=stability, constraints=tuple(constraints))
+    plan = planned("hammerstein_ss.asivid", data, nx=nx, block_rows=block_rows, basis=basis,
+                   feedback_basis=feedback_basis, instruments=kind + ("+past" if noise == "white" else ""), form=form,
+                   iterations=int(iterations), weighting=weighting, offset=offset, feedthrough=feedthrough,
+                   observer=observer, split=split, stability=stability, constraints=tuple(constraints))
     return in_record_units(identified(plan), plan)

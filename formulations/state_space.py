@@ -27,7 +27,6 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.subspace_plan import Plan, in_record_units, planned
 from formulations.subspace_procedure import identified
 from optid.data.channels import Transform
 from optid.data.record import Data
@@ -39,6 +38,7 @@ from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
 from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
@@ -121,8 +121,9 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
     if feedback_basis is not None and words["criterion"] == "prediction":
         instruments = "simulated+past"
     # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
-    plan = planned(name, data, nx, None, basis, feedback_basis, instruments, offset=bool(offset),
-                   feedthrough=feedthrough, stability="free", iterations=2 * (feedback_basis is not None))
+    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
+                   instruments=instruments, feedthrough=feedthrough, stability="free",
+                   iterations=2 * (feedback_basis is not None))
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
     found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
     poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
@@ -159,7 +160,8 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
             continue
         if evidence.model is not None:
             nx = nx or int(evidence.figures["order"])
-            found[f"{evidence.figures['block rows']} block rows"] = evidence.model
+            model = evidence.extended()[0] if words["criterion"] == "prediction" else evidence.model  # K counts there
+            found[f"{evidence.figures['block rows']} block rows"] = model
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
     expansion, data = plan.expansion(), with_whole_inputs(plan.data, 2 * nx + 1)

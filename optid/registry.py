@@ -11,7 +11,9 @@ from optid.errors import LookupFailed, StructureError, nearest
 FORMULATIONS = "optid.formulations"
 CONSTRAINTS = "optid.constraints"
 FAULTS = "optid.fault_formulations"
-_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults"}
+RENDERERS = "optid.renderers"
+_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults",
+          RENDERERS: "renderer"}
 
 
 @cache
@@ -102,6 +104,19 @@ def defaults(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the arguments of a formulation that may be left out, with their values then."""
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is not p.empty}
+
+
+def render(result: Any, form: str) -> Any:
+    """Return a result in a form for people, such as "text" or "figure".
+
+    Args:
+        result: of any class that has a renderer.
+        form: the entry point "<class name>.<form>" of the group "optid.renderers" is called with the result.
+
+    Raises:
+        LookupFailed: no such renderer.
+    """
+    return entry_point(RENDERERS, f"{type(result).__name__}.{form}").load()(result)
 
 
 def _number(text: str) -> Any:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import optid
-from formulations.nuclear_subspace import certify, held_out_fit, nuclear_programme, order_of, structure
-from formulations.subspace_plan import Plan
-from formulations.subspace_procedure import prepared
+from formulations.nuclear_subspace import certify, nuclear_programme
 from optid.backends import Answer, Settings, find
 from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
+from optid.identify.subspace.low_rank import held_out_fit, order_of, structure
+from optid.identify.subspace.observability import prepared
+from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
 from optid.solving.solve import solve
 from optid.structures.nuclear_norm import NuclearNormStructure

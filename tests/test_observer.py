@@ -5,8 +5,8 @@ import pytest
 
 from optid.bases import Linear, Polynomial, Triangular
 from optid.errors import RankError
-from optid.identify.subspace.innovations import innovation_form, prediction_errors
-from optid.identify.subspace.methods import default_block_rows, simulate_clipped
+from optid.identify.innovations import innovation_form
+from optid.identify.subspace.instruments import simulate_clipped
 from optid.identify.subspace.observer import ObserverForm, observer_gain, observer_problem
 from optid.statistics.expansion import expand
 
@@ -119,7 +119,7 @@ def test_missing_outputs_without_feedback_leave_the_state_alone():
     phi, y = columns(form, records[0], 0)
     present = ~np.isnan(y)
     np.testing.assert_allclose(step.problem.H, phi[present].T @ phi[present], atol=1e-9)
-    assert step.rows == 115 and step.candidates == 120
+    assert step.rows == 115
 
 
 def test_gaps_restart_the_state_and_eliminate_it():
@@ -210,18 +210,16 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
 
 
-def test_prediction_errors_and_gain_of_an_innovation_form():
+def test_gain_of_an_innovation_form():
     rng = np.random.default_rng(7)
     k, e = np.array([[0.5, 0.1], [-0.2, -0.4]]), rng.standard_normal((20000, 2)) * [1.0, 0.3]
-    drive, x = rng.standard_normal((20000, 2)), np.array([3.0, -2.0])
-    y = np.empty((20000, 2))
+    gain, x, predicted = observer_gain(A, C), np.zeros(2), np.zeros(2)
+    errors = np.empty((20000, 2))
     for t in range(20000):
-        y[t] = C @ x + e[t]
-        x = A @ x + drive[t] + k @ e[t]
-    exact = prediction_errors(A, C, k, drive, np.zeros((20000, 2)), y)
-    np.testing.assert_allclose(exact[50:], e[50:], atol=1e-6)
-    gain = observer_gain(A, C)
-    found, noise = innovation_form(A, C, gain, [prediction_errors(A, C, gain, drive, np.zeros((20000, 2)), y)])
+        y = C @ x + e[t]
+        errors[t] = y - C @ predicted
+        x, predicted = A @ x + k @ e[t], A @ predicted + gain @ errors[t]
+    found, noise = innovation_form(A, C, gain, [errors[:15000], errors[15000:]])
     np.testing.assert_allclose(found, k, atol=0.05)
     np.testing.assert_allclose(noise.innovation, np.diag([1.0, 0.09]), atol=0.02)
 
@@ -229,6 +227,6 @@ def test_prediction_errors_and_gain_of_an_innovation_form():
 def test_block_rows_fit_the_record():
     rng = np.random.default_rng(8)
     long, short = records_of(rng, [5000]), records_of(rng, [120])
-    assert default_block_rows(long, expansion_of(long), None) == 10
-    assert default_block_rows(long, expansion_of(long), 8) == 16
-    assert default_block_rows(short, expansion_of(short), 2) < 6
+    assert expansion_of(long).block_rows(long, None) == 10
+    assert expansion_of(long).block_rows(long, 8) == 16
+    assert expansion_of(short).block_rows(short, 2) < 6

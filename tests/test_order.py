@@ -16,7 +16,7 @@ from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order import order_test, rank_test, scan_lags
-from optid.identify.order.several_outputs import weighted_problem
+from optid.identify.order.lags import weighted_problem
 from optid.identify.order.signals import block_rows_for, with_simulated_outputs
 from optid.identify.order.states import state_criteria
 from optid.plants import EXAMPLE1, TWO_MODES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-import formulations.shift
 import optid
+import optid.identify.subspace.shift
 from formulations.constraints.pole_regions import damped, disc, sector, strip
 from formulations.constraints.stability import stable
 from formulations.shift import constrained_shift
@@ -175,8 +175,8 @@ def test_a_deflated_step_is_nearly_as_good_as_the_whole(rule, monkeypatch):
         up, down = observability(unstable(6, rng), 2, 10, rng, 0.02)
         whole, _ = solved(up, down, [rule])
         with monkeypatch.context() as patch:
-            patch.setattr(formulations.shift, "LARGEST", 3)
-            patch.setattr(formulations.shift, "AT_ONCE", 3)
+            patch.setattr(optid.identify.subspace.shift, "LARGEST", 3)
+            patch.setattr(optid.identify.subspace.shift, "AT_ONCE", 3)
             deflated, _ = solved(up, down, [rule])
         assert rule.verify(type("Model", (), {"poles": np.linalg.eigvals(deflated.a)})) == ""
         assert deflated.bound == pytest.approx(whole.bound, rel=1e-12)
@@ -189,7 +189,7 @@ def test_a_rule_about_all_poles_together_is_not_deflated(monkeypatch):
     up, down = observability(unstable(4, rng), 2, 10, rng, 0.02)
     together = replace(stable(0.9), verify=lambda model: "too large" if len(model.poles) == 4 and np.max(
         np.abs(model.poles)) > 0.9 else "")
-    monkeypatch.setattr(formulations.shift, "LARGEST", 2)
+    monkeypatch.setattr(optid.identify.subspace.shift, "LARGEST", 2)
     _, outcome = solved(up, down, [together])
     assert posed_orders(outcome) == {4}
 

@@ -82,7 +82,13 @@ def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
         return lmi(view, sides, name)
 
     def verify(model: Any) -> str:
-        return outside(name, np.atleast_1d(model.poles), sides, text)
+        poles = np.atleast_1d(model.poles)
+        slack = [min(side.slack(z) for side in sides) for z in poles]
+        if not slack or min(slack) >= -10 * MARGIN:
+            return ""
+        worst = poles[int(np.argmin(slack))]  # the one furthest outside
+        shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
+        return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
     return Rule(name, build, verify, frozenset({"poles"}))
 
@@ -97,16 +103,6 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available")
     return [side.inequality(*view.poles) for side in sides]
-
-
-def outside(name: str, poles: np.ndarray, sides: Sequence[Side], text: str) -> str:
-    """Return a sentence naming the pole furthest outside the sides, "" where there is none."""
-    slack = [min(side.slack(z) for side in sides) for z in poles]
-    if not slack or min(slack) >= -10 * MARGIN:
-        return ""
-    worst = poles[int(np.argmin(slack))]
-    shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
-    return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
 
 def disc(centre: float, radius: float) -> Rule:

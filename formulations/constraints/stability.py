@@ -99,7 +99,7 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius
     for limit in LIMITS if keep and inside else LIMITS[:1]:
-        centre = central(whole, radius, limit)
+        centre = pulled(whole, limit * radius)
         rows, levels = _positive_real(centre, radius)
         if not (keep and inside) or np.all(rows @ whole >= levels):
             return rows, levels, centre
@@ -134,11 +134,6 @@ def frequencies(roots: np.ndarray) -> np.ndarray:
         parts.append(np.angle(root) + 2 * np.arctan(near * np.tan((even[1:] - np.pi / 2) * 0.999)))
     found = np.concatenate(parts)
     return np.unique(found[(found >= 0) & (found <= np.pi)])
-
-
-def central(a: np.ndarray, radius: float, share: float = LIMITS[0]) -> np.ndarray:
-    """Return the coefficients of ``A`` with every pole outside ``share * radius`` pulled back onto that circle."""
-    return pulled(a, share * radius)
 
 
 def _real(a: Any, na: int, radius: float, points: np.ndarray) -> list[Any]:

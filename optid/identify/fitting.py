@@ -17,7 +17,7 @@ from optid.identify.record_checks import examine, examine_instruments, examine_r
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
-from optid.program.solution import Solution, Status
+from optid.program.solution import Bound, Solution, Status
 from optid.registry import check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 
@@ -27,33 +27,60 @@ class Fit:
     """A fitted model with the evidence for it.
 
     Attributes:
-        model: the identified model, in raw units; None only with ``raises=False``.
-        solution: status, proof, residuals and times.
+        identified: the identified model as far as it is needed at once, in raw units; None only with
+            ``raises=False``. See `model`.
+        solved: status, proof, residuals and times, as far as they were needed at once. See `solution`.
         formulation: its name.
         arguments: what it was called with.
         program: the last programme solved.
         data: the record.
         prices: activity and price of every user constraint.
         findings: what the examination of the record found, one sentence each.
-        figures: rows used, rows there are, condition number, method of the statistics; for a procedure what it measured
-            on its way (singular values, number of starts, ...).
+        measured: rows used, rows there are, condition number, method of the statistics; for a procedure what it
+            measured on its way (singular values, number of starts, ...). See `figures`.
         steps: (name, solution) of every programme on the way.
         procedure: whether a procedure of several steps judged the whole: its bound may be that of a step.
         seconds: wall time of the whole call.
+        bound: returns a bound that was not needed at once, or None.
+        extend: as in `optid.solving.solve.Evidence`.
     """
 
-    model: Any
-    solution: Solution
+    identified: Any
+    solved: Solution
     formulation: str
     arguments: Mapping[str, Any] = field(repr=False)
     program: Program = field(repr=False)
     data: Data | Stream = field(repr=False)
     prices: tuple[Price, ...] = ()
     findings: tuple[str, ...] = ()
-    figures: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    measured: Mapping[str, Any] = field(default_factory=dict, repr=False)
     steps: tuple[tuple[str, Solution], ...] = field(default=(), repr=False)
     procedure: bool = False
     seconds: float = 0.0
+    bound: Callable[[], Bound] | None = field(default=None, repr=False)
+    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = field(default=None, repr=False)
+
+    @cached_property
+    def solution(self) -> Solution:
+        """Status, proof, residuals and times."""
+        return self.solved if self.bound is None else replace(self.solved, bound=self.bound())
+
+    @cached_property
+    def _extended(self) -> tuple[Any, dict[str, Any]]:
+        if self.extend is None:
+            return self.identified, {}
+        model, figures = self.extend()
+        return _in_raw_units(model, self.data), figures
+
+    @property
+    def model(self) -> Any:
+        """The identified model, in raw units; parts such as its noise model are estimated at the first call."""
+        return self._extended[0]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What was measured on the way, the estimation of the parts of the model included."""
+        return {**self.measured, **self._extended[1]}
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
@@ -210,9 +237,6 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
         _raise_failure(outcome)
     model = outcome.model
     findings = findings + _disobeyed(model, arguments.get("constraints", ()))
-    transform = getattr(data, "transform", None)
-    if model is not None and transform is not None and not transform.is_identity:
-        model = model.with_transform(transform)
     statistics = getattr(outcome.program.compressed, "statistics", None)
     figures = dict(outcome.figures)
     if statistics is not None:
@@ -222,12 +246,17 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     if "condition of R11" in figures:
         findings = findings + examine_instruments(figures["condition of R11"])
     findings = findings + examine_residuals(figures)
-    return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
+    return Fit(identified=_in_raw_units(model, data), solved=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),
                        *price_earlier_steps(outcome.constrained, outcome.program)),
-               findings=tuple(findings), figures=figures, steps=outcome.steps, procedure=outcome.procedure,
-               seconds=time.perf_counter() - started)
+               findings=tuple(findings), measured=figures, steps=outcome.steps, procedure=outcome.procedure,
+               seconds=time.perf_counter() - started, bound=outcome.bound, extend=outcome.extend)
+
+
+def _in_raw_units(model: Any, data: Data | Stream) -> Any:
+    transform = getattr(data, "transform", None)
+    return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
 
 
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import between_gaps, runs_of
-from optid.errors import StructureError
-from optid.identify.subspace.innovations import innovation_form
+from optid.errors import DataError, StructureError
+from optid.identify.innovations import innovation_form, regression_lags
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.models.innovation_gain import (
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-10
 """Residuals below this share of the outputs are rounding: there is no noise to describe."""
+
+EXACT = 1e-8
+"""Prediction errors relative to the outputs below which a record shows no noise model."""
 
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
@@ -60,12 +63,7 @@ which two gains are not the same optimum of it."""
 
 
 class Noise(NamedTuple):
-    """The noise model of a state-space model.
-
-    Attributes:
-        K: (n, l) gain of the innovations; A - K C is stable.
-        covariances: Q, R, S and the covariance of the innovations.
-    """
+    """The gain K (n, l) of the innovations, with A - K C stable, and the covariances of the noises."""
 
     K: Array
     covariances: NoiseCovariances
@@ -75,6 +73,27 @@ def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
     """Return the model with the gain and the noise covariances that a record shows, see `estimate_noise`."""
     found = estimate_noise(model, data)
     return replace(model, K=found.K, noise=found.covariances)
+
+
+def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
+    """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
+
+    Args:
+        model: a model in the units of the data.
+        data: the record it was identified on.
+    """
+    outputs = [e.y for e in data.experiments]
+    try:
+        regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
+        found = with_noise(model, data)
+    except (StructureError, DataError) as reason:
+        return model, f"none: {reason}"
+    except np.linalg.LinAlgError:
+        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
+    spread = np.nanstd(np.concatenate(outputs), axis=0)
+    if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
+        return model, "none: the prediction errors vanish, there is no noise to model"
+    return found, ""
 
 
 def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
@@ -118,12 +137,10 @@ def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
     Raises:
         StructureError: the model has no noise covariances.
     """
-    if model.noise is None:
-        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
     z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * model.dt)
     states = np.linalg.solve(z[:, None, None] * np.eye(model.nx) - model.A, model.K.astype(complex))
     shaped = np.eye(model.l) + model.C @ states
-    return np.asarray(shaped @ model.noise.innovation @ np.conj(np.swapaxes(shaped, 1, 2)))
+    return np.asarray(shaped @ _innovations(model) @ np.conj(np.swapaxes(shaped, 1, 2)))
 
 
 def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Correlation]:
@@ -153,14 +170,19 @@ def output_noise(model: "HammersteinSS") -> Array:
     """
     from scipy.linalg import solve_discrete_lyapunov
 
-    if model.noise is None:
-        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
+    covariance = _innovations(model)
     if not model.K.any():
-        return np.array(model.noise.innovation)
+        return covariance
     if not model.is_stable:
         return np.full((model.l, model.l), np.inf)
-    states = solve_discrete_lyapunov(model.A, model.K @ model.noise.innovation @ model.K.T)
-    return np.asarray(model.C @ states @ model.C.T + model.noise.innovation)
+    states = solve_discrete_lyapunov(model.A, model.K @ covariance @ model.K.T)
+    return np.asarray(model.C @ states @ model.C.T + covariance)
+
+
+def _innovations(model: "HammersteinSS") -> Array:
+    if model.noise is None:
+        raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
+    return np.array(model.noise.innovation)
 
 
 def _largest(signals: Sequence[Array]) -> float:
@@ -204,12 +226,10 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     def measured(gain: Array) -> tuple[float, Array]:
         return log_determinant(innovations_covariance(A, C, gain, rest)), gain
 
-    size = np.linalg.norm(C, axis=1)
-    unit = np.diag(np.where(size > 0, size, 1.0) ** 2)
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         try:
-            observers.append(np.array(kalman_gain(A, C, ratio * np.eye(len(A)), unit).K))
+            observers.append(_observer_gain(A, C, ratio))
         except StructureError:
             continue
     found = sorted(map(measured, observers), key=itemgetter(0))
@@ -227,6 +247,10 @@ def _observer(model: "HammersteinSS") -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
         return np.zeros((model.nx, model.l))
-    size = np.linalg.norm(model.C, axis=1)
-    unit = np.diag(np.where(size > 0, size, 1.0) ** 2)
-    return np.array(kalman_gain(model.A, model.C, 0.1 * np.eye(model.nx), unit).K)
+    return _observer_gain(model.A, model.C, 0.1)
+
+
+def _observer_gain(A: Array, C: Array, ratio: float) -> Array:
+    """Return the gain for equal noise in all states, so many times that at the outputs in units of C."""
+    size = np.linalg.norm(C, axis=1)
+    return np.array(kalman_gain(A, C, ratio * np.eye(len(A)), np.diag(np.where(size > 0, size, 1.0) ** 2)).K)

@@ -286,20 +286,28 @@ class Evidence:
     Attributes:
         model: the model.
         objective: value of the procedure's own objective.
-        bound: bound on that objective, with the reason where there can be none.
+        bound: bound on that objective, with the reason where there can be none; or a function that returns it, called
+            when the solution of the fit is first asked for.
         status: status of the procedure as a whole.
         reason: one sentence for people.
         figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
             "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
             which the report draws. The fit prints them in this order.
+        extend: returns the model completed by what only some uses need, such as a noise model, and further figures; it
+            is called when the model of the fit is first asked for.
     """
 
     model: Any
     objective: float
-    bound: Bound
+    bound: Bound | Callable[[], Bound]
     status: Status
     reason: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)
+    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
+
+    def extended(self) -> tuple[Any, dict[str, Any]]:
+        """Return the completed model and what there is to say of it."""
+        return self.extend() if self.extend else (self.model, {})
 
     @classmethod
     def pointless(cls, status: Status, reason: str) -> "Evidence":
@@ -320,6 +328,8 @@ class Outcome:
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
         procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
+        bound: that of the procedure's `Evidence` where it is a function; the solution has no bound then.
+        extend: that of the procedure's `Evidence`.
     """
 
     model: Any
@@ -329,6 +339,8 @@ class Outcome:
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
     procedure: bool = False
+    bound: Callable[[], Bound] | None = None
+    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -365,7 +377,9 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-            solution = replace(solution, objective=found.objective, bound=found.bound, status=found.status,
-                               reason=found.reason)
+            later = found.bound if callable(found.bound) else None
+            solution = replace(solution, objective=found.objective, bound=None if later else found.bound,
+                               status=found.status, reason=found.reason)
             figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True)
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, later,
+                           found.extend)

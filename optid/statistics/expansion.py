@@ -5,11 +5,12 @@ from an output injection (A - LC, B - LD), and a function nearly linear in y wou
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
@@ -142,6 +143,46 @@ class Expansion:
             parts += [family.values(raw[:, m + l :]) for family in self.feedback]
         return np.concatenate(parts, axis=1)
 
+    def positions(self, at: Callable[..., NDArray[np.intp]], instruments: str, alpha: int, offset: bool = True
+                  ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
+
+        The last block row of the feedback functions never reaches the future outputs and is left out.
+
+        Args:
+            at: `optid.statistics.hankel.HankelStatistics.at` of windows of 2 alpha samples or more.
+            instruments: "past" (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs),
+                "inputs+past", "simulated" (past and future inputs and functions of simulated outputs),
+                "simulated+past".
+            alpha: block rows of the past and of the future.
+            offset: whether a constant is among instruments and regressors.
+        """
+        past, future, both = range(alpha), range(alpha, 2 * alpha), range(2 * alpha)
+        one = np.zeros(int(offset), dtype=np.intp)
+        z = [one, at(self.eta, past if instruments == "past" else both)]
+        if instruments.startswith("simulated"):
+            z.append(at(self.zeta_simulated, both))
+        if instruments.endswith("past"):
+            z += [at(self.zeta, past), at(self.y, past)]
+        phi = [one, at(self.eta, future), at(self.zeta, future[:-1])]
+        return np.concatenate(z), np.concatenate(phi), at(self.y, future)
+
+    def block_rows(self, records: Sequence[Array], nx: int | None, *, spans: int = 2, per_row: float = 2.0,
+                   least: int | None = None) -> int:
+        """Return block rows that a record can carry: 10, or twice the order, or fewer on a short record.
+
+        Args:
+            records: raw channels, one per experiment.
+            nx: the order, or None where it is to be found.
+            spans: block rows of a window, in multiples of those of the future.
+            per_row: windows that are wanted per row of the Hankel matrix.
+            least: block rows at least; None for one more than the order.
+        """
+        width, count = self.p + 2 * self.q + self.l, sum(len(record) for record in records)
+        affordable = int(count / (spans * (len(records) + per_row * width)))  # windows = count - experiments (rows - 1)
+        shortest = min(len(record) for record in records) // spans
+        return max(1 + (nx or 1) if least is None else least, min(max(10, 2 * (nx or 0)), affordable, shortest))
+
     def injection(self, e: Array) -> tuple[Array, Array]:
         """Return L (n, l) and the constant (n,) that ``E zeta_r`` adds to the state equation beside ``E V^T zeta(y)``.
 
@@ -161,13 +202,8 @@ class Expansion:
         return replace(self, feedback=(), simulated=False)
 
 
-def expand(
-    records: Sequence[Array],
-    inputs: Sequence[Basis],
-    feedback: Sequence[Basis | None],
-    input_names: Sequence[str],
-    output_names: Sequence[str],
-) -> Expansion:
+def expand(records: Sequence[Array], inputs: Sequence[Basis], feedback: Sequence[Basis | None],
+           input_names: Sequence[str], output_names: Sequence[str]) -> Expansion:
     """Fit the feedback functions to a record and return its expansion.
 
     Args:

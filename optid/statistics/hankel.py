@@ -27,11 +27,8 @@ Expand = Callable[[Array], Array]
 CHUNK = 8192
 """Samples expanded at a time."""
 
-NARROW = 8
-"""Signals up to which a compiled loop is faster than one matrix product per lag."""
-
-SHORT = 5000
-"""Samples up to which it would not make up for its import."""
+WIDE = 128
+"""Signals times samples of the blocks whose products are taken at once."""
 
 FORMED = 2048
 """Windows formed at once where that is the cheapest way."""
@@ -116,10 +113,13 @@ class HankelStatistics:
         """Estimate of the condition number of the windows with their rows scaled to norm one; inf when singular."""
         return conditioning(self.root)
 
-    @cached_property
-    def means(self) -> Array:
-        """Mean of every signal over the windows and block rows, (d,)."""
-        return self.centre + self.gram[0, 1:].reshape(self.rows, self.d).mean(axis=0) / self.windows
+    def sizes(self, signals: Sequence[int] | range, centred: bool = True) -> Array:
+        """Standard deviation of some signals over windows and block rows; root mean square where not centred."""
+        at = self.at(signals).reshape(self.rows, -1)
+        energy = np.diag(self.gram)[at].mean(axis=0) / self.windows
+        if centred:
+            energy -= self.gram[0, at].mean(axis=0) ** 2 / self.windows**2
+        return np.sqrt(np.maximum(energy, 1e-300))
 
     def check(self, per_row: float = 1.0) -> None:
         """Refuse fewer windows than `per_row` times the rows of the Hankel matrix.
@@ -138,16 +138,9 @@ class HankelStatistics:
             )
 
 
-def hankel_statistics(
-    records: Sequence[Array],
-    rows: int,
-    expand: Expand | None = None,
-    *,
-    names: Sequence[str] | None = None,
-    centre: Array | Literal["mean"] | None = None,
-    method: Literal["auto", "gram", "qr"] = "auto",
-    chunk: int = CHUNK,
-) -> HankelStatistics:
+def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None = None, *,
+                      names: Sequence[str] | None = None, centre: Array | Literal["mean"] | None = None,
+                      method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK) -> HankelStatistics:
     """Take the statistics of all windows of some records.
 
     Args:
@@ -190,7 +183,8 @@ def hankel_statistics(
     if len(names) != sums.d:
         raise StructureError(f"{len(names)} names for {sums.d} signals.")
     if isinstance(centre, str):
-        sums.centre = _means(runs, expand or (lambda raw: raw), chunk)
+        spread = [sums.evaluated(run[:: 1 + len(run) // chunk]) for run in runs]  # a centre has to be near, no more
+        sums.centre = np.concatenate(spread).mean(axis=0)
     elif centre is not None:
         sums.centre = np.asarray(centre, dtype=float)
     if method != "qr":
@@ -227,45 +221,31 @@ def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArra
     return statistics.name(int(order[column]))
 
 
-def _means(runs: Sequence[Array], expand: Expand, chunk: int) -> Array:
-    """Means over samples spread over the runs: a centre has to be near the signals, no more."""
-    total, count = 0.0, 0
-    for run in runs:
-        signals = expand(run[:: 1 + len(run) // chunk])
-        total, count = total + signals.sum(axis=0), count + len(signals)
-    return np.asarray(total / count)
-
-
 class _Sums:
-    """Running sums over runs: per lag in the middle, per sample and lag at the ends."""
+    """Running sums over runs: per lag in the middle of a run, of windows that are formed at its ends."""
 
     def __init__(self, rows: int, expand: Expand | None, d: int, chunk: int) -> None:
         self.rows, self.d = rows, d
         self.centre: Array = np.zeros(d)
         self._expand, self._chunk = expand, max(chunk, 4 * rows)
         self._middle = np.zeros((rows, d, d))  # sum of s(k) s(k + lag)^T
-        self._heads = np.zeros((rows, d, rows, d))  # the same for single samples before the middle, by sample and lag
-        self._tails = np.zeros((rows, d, rows, d))
-        self._totals = np.zeros((2, rows, d))
         self._total = np.zeros(d)
-        self._direct = np.zeros((1 + rows * d, 1 + rows * d))
-        self._short: list[Array] = []
+        self._ends = np.zeros((rows * d, 1 + rows * d))  # those of block rows not above the diagonal do not count
         self._windows = 0
 
-    def _signals(self, raw: Array) -> Array:
+    def evaluated(self, raw: Array) -> Array:
+        """Return the signals of some samples, less the centre."""
         signals = raw if self._expand is None else self._expand(raw)
         return signals - self.centre if np.any(self.centre) else np.ascontiguousarray(signals)
 
     def add(self, run: Array) -> None:
         """Add the windows of a run of complete samples."""
         rows, count = self.rows, len(run) - self.rows + 1
-        if count < rows:
-            self._short.append(windows_of(self._signals(run), rows).reshape(count, -1))
-            if sum(map(len, self._short)) >= FORMED:
-                self._flush()
-            return
         self._windows += count
-        signals = self._signals(run[rows - 1 : rows - 1 + self._chunk])
+        if count < rows:
+            self._add_formed(self.evaluated(run), np.ones((count, rows)))
+            return
+        signals = self.evaluated(run[rows - 1 : rows - 1 + self._chunk])
         start = rows - 1  # of the signals at hand; the middle is rows - 1 <= k < count
         while start < count:
             stop = min(start + len(signals) - (rows - 1), count)
@@ -273,47 +253,45 @@ class _Sums:
             following = run[start + len(signals) : start + len(signals) + self._chunk]
             signals, start = signals[stop - start :], stop
             if len(following):
-                signals = np.concatenate([signals, self._signals(following)])
-        ends = self._signals(run[: 2 * rows - 1]), self._signals(run[count:])
-        for end, products, totals in zip(ends, (self._heads, self._tails), self._totals):
-            padded = np.concatenate([end, np.zeros((rows, self.d))])
-            for k in range(rows - 1):
-                products[k] += np.multiply.outer(padded[k], padded[k : k + rows])
-            totals[: rows - 1] += end[: rows - 1]
+                signals = np.concatenate([signals, self.evaluated(following)])
+        if rows > 1:  # windows k < rows - 1 with k + i < rows - 1, and k > count - rows with k + i >= count
+            early = np.add.outer(np.arange(rows - 1), np.arange(rows)) < rows - 1
+            self._add_formed(self.evaluated(run[: 2 * rows - 2]), early)
+            self._add_formed(self.evaluated(run[count - rows + 1 :]), ~early)
+
+    def _add_formed(self, signals: Array, counted: NDArray) -> None:
+        """Add the products of the samples that count, by window and block row, with the samples after them."""
+        windows = windows_of(signals, self.rows)
+        whole = windows.reshape(len(windows), -1)
+        part = (windows * counted[:, :, None]).reshape(whole.shape)
+        self._ends[:, 0] += part.sum(axis=0)
+        self._ends[:, 1:] += part.T @ whole
 
     def _add_lags(self, signals: Array, count: int) -> None:
         """Add the products of the first `count` samples with those up to rows - 1 samples later."""
-        part = signals[:count]
-        self._total += np.ones(count) @ part
-        if self.d <= NARROW and count > SHORT:
-            from optid.statistics.subspace_kernels import window_products
-
-            found = np.zeros((self.d, self.rows * self.d))
-            window_products(signals.reshape(-1), count, self.d, found)
-            self._middle += found.reshape(self.d, self.rows, self.d).transpose(1, 0, 2)
-            return
-        for lag in range(self.rows):
-            self._middle[lag] += part.T @ signals[lag : lag + count]
+        rows, d = self.rows, self.d
+        step = min(rows, max(1, WIDE // d))  # samples of a block: large products are fast, the diagonals are added up
+        following = -(-(rows - 1) // step)  # blocks that the largest lag reaches
+        blocks = max((count + rows - 1) // step - following, 0)
+        views = [signals[i * step : (i + blocks) * step].reshape(blocks, step * d) for i in range(following + 1)]
+        products = np.concatenate([(views[0].T @ view).reshape(step, d, step, d) for view in views], axis=2)
+        found = sum((products[i, :, i : i + rows] for i in range(step)), np.zeros((d, rows, d)))
+        if blocks * step < count:
+            rest = windows_of(signals[blocks * step : count + rows - 1], rows).reshape(-1, rows * d)
+            found += (signals[blocks * step : count].T @ rest).reshape(d, rows, d)
+        self._middle += found.transpose(1, 0, 2)
+        self._total += np.ones(count) @ signals[:count]
 
     def gram(self) -> Array:
         """Return the Gram matrix of [1; window], symmetric."""
-        self._flush()
         rows, d = self.rows, self.d
-        heads = np.cumsum(self._heads[::-1], axis=0)[::-1]  # samples i and later
-        tails = np.concatenate([np.zeros((1, d, rows, d)), np.cumsum(self._tails, axis=0)[:-1]])  # before sample i
-        inner = np.zeros((rows, d, rows, d))
+        upper = np.zeros((1 + rows * d, 1 + rows * d))
+        upper[1:] = self._ends
         for i in range(rows):
-            row = self._middle[: rows - i].transpose(1, 0, 2) + heads[i, :, : rows - i] + tails[i, :, : rows - i]
-            inner[i, :, i:] = row
-            inner[i + 1 :, :, i] = row[:, 1:].transpose(1, 2, 0)
-        gram = self._direct.copy()
-        gram[1:, 1:] += inner.reshape(rows * d, rows * d)
-        totals = np.cumsum(self._totals[0][::-1], axis=0)[::-1] + self._total
-        totals[1:] += np.cumsum(self._totals[1], axis=0)[:-1]
-        gram[0, 1:] += totals.ravel()
-        gram[1:, 0] += totals.ravel()
-        gram[0, 0] += self._windows
-        return (gram + gram.T) / 2
+            start = 1 + i * d
+            upper[start : start + d, start:] += self._middle[: rows - i].transpose(1, 0, 2).reshape(d, -1)
+        upper[0] = np.concatenate([[self._windows], upper[1:, 0] + np.tile(self._total, rows)])
+        return np.triu(upper) + np.triu(upper, 1).T
 
     def factorised(self, runs: Sequence[Array]) -> Array:
         """Return the triangular factor of [1; window] over all runs by stacked QR decompositions."""
@@ -327,13 +305,6 @@ class _Sums:
         return add_to_root(root, self._formed(waiting)) if waiting else root
 
     def _formed(self, runs: Sequence[Array]) -> Array:
-        parts = [windows_of(self._signals(run), self.rows).reshape(len(run) - self.rows + 1, -1) for run in runs]
+        parts = [windows_of(self.evaluated(run), self.rows).reshape(len(run) - self.rows + 1, -1) for run in runs]
         stacked = np.concatenate(parts)
         return np.concatenate([np.ones((len(stacked), 1)), stacked], axis=1)
-
-    def _flush(self) -> None:
-        if self._short:
-            formed = np.concatenate(self._short)
-            formed = np.concatenate([np.ones((len(formed), 1)), formed], axis=1)
-            self._direct += formed.T @ formed
-            self._short = []

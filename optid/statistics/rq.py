@@ -29,25 +29,25 @@ class RQ:
     """The blocks of the second RQ decomposition.
 
     Attributes:
-        r11: (p, p) regressors projected on the instruments; lower triangular, or diagonal with a tolerance.
-        r21: (y, p) outputs along the regressors.
         r22: (y, r) outputs projected on the instruments, with the regressors removed: Gamma times the projected states.
         residual: (y, y) triangular factor of the outputs' part outside the instruments and regressors.
-        gain: (y, p) H = r21 r11^-1 in units of the signals.
+        gain: (y, p) H = R21 R11^-1 in units of the signals.
         condition: condition number of the projected regressors, their rows scaled to the norm of the regressors
             themselves: it grows with the record where instruments and regressors are not correlated.
         windows: number of Hankel columns.
         discarded: directions of the regressors that a tolerance left out.
+        triangle: (z, z) triangular factor of the instruments.
+        projected: (p, z) regressors on the orthonormal instruments, and (y, z) outputs.
     """
 
-    r11: Array
-    r21: Array
     r22: Array
     residual: Array
     gain: Array
     condition: float
     windows: int
-    discarded: int = 0
+    discarded: int
+    triangle: Array
+    projected: tuple[Array, Array]
 
     @cached_property
     def decomposition(self) -> tuple[Array, Array, Array]:
@@ -61,15 +61,9 @@ class RQ:
         return self.decomposition[1]
 
 
-def rq(
-    statistics: HankelStatistics,
-    instruments: Sequence[int] | NDArray[np.intp],
-    regressors: Sequence[int] | NDArray[np.intp],
-    outputs: Sequence[int] | NDArray[np.intp],
-    *,
-    form: str = "projection",
-    tolerance: float | None = None,
-) -> RQ:
+def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.intp],
+       regressors: Sequence[int] | NDArray[np.intp], outputs: Sequence[int] | NDArray[np.intp], *,
+       form: str = "projection", tolerance: float | None = None) -> RQ:
     """Triangularise twice.
 
     Args:
@@ -110,32 +104,23 @@ def rq(
         l21, l31 = l21 @ weight, l31 @ weight
     residual = triangle[order.size - y.size :, of_y]
     scaled = l21 / size[:, None]
+    discarded, condition = 0, _condition(scaled)
     if tolerance is None:
-        found = _regular(scaled, l31)
-        condition = _condition(found[0])
         if not condition < 1 / TINY:
             lost = dependent_signal(statistics, phi)
             reason = f"{lost} depends on the regressors before it" if lost else "the instruments do not reach them all"
             raise RankError(f"The regressors are singular on the instruments: {reason}. Use an input with more levels "
                             "and frequencies, fewer block rows or basis functions, or augmented instruments.")
-        r11, r21, r22 = found
+        factor = np.asarray(np.linalg.qr(np.concatenate([scaled, l31]).T, mode="r")).T
+        r11, r21, r22 = factor[: phi.size, : phi.size], factor[phi.size :, : phi.size], factor[phi.size :, phi.size :]
         gain = np.linalg.solve(r11.T, r21.T).T
-        discarded = 0
     else:
         left, values, right = np.linalg.svd(scaled, full_matrices=True)
         kept = int(np.sum(values > tolerance * values[0]))
-        condition = _condition(scaled)
-        r11, r21, r22 = np.diag(values[:kept]), l31 @ right[:kept].T, l31 @ right[kept:].T
-        gain = (r21 / values[:kept]) @ left[:, :kept].T
-        discarded = phi.size - kept
-        r11 = left[:, :kept] @ r11
-    return RQ(r11 * size[:, None], r21, r22, residual.T, gain / size, condition, statistics.windows, discarded)
-
-
-def _regular(l21: Array, l31: Array) -> tuple[Array, Array, Array]:
-    p = len(l21)
-    triangle = np.asarray(np.linalg.qr(np.concatenate([l21, l31]).T, mode="r")).T
-    return triangle[:p, :p], triangle[p:, :p], triangle[p:, p:]
+        r22, discarded = l31 @ right[kept:].T, phi.size - kept
+        gain = (l31 @ right[:kept].T / values[:kept]) @ left[:, :kept].T
+    return RQ(r22, residual.T, gain / size, condition, statistics.windows, discarded, triangle[: z.size, : z.size],
+              (l21, l31))
 
 
 def _condition(matrix: Array) -> float:

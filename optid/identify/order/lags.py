@@ -14,7 +14,9 @@ from optid.arrays import Array
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import RankError, StructureError
-from optid.statistics import Layout, Statistics, collect
+from optid.identify.order.states import criteria
+from optid.statistics import Layout, Statistics, accumulate, collect
+from optid.structures.rank_one import RankOne
 
 ROWS_PER_COLUMN = 3
 CLOSE = 0.1
@@ -67,9 +69,8 @@ class LagScan:
         return min(self.candidates, key=lambda c: getattr(c, criterion))
 
 
-def scan_lags(
-    data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, nk: int = 8, test: Data | None = None
-) -> LagScan:
+def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, nk: int = 8, test: Data | None = None
+             ) -> LagScan:
     """Compare all structures up to the given lags; the inputs share nb and nk first and are then refined one by one.
 
     Args:
@@ -114,8 +115,6 @@ def scan_lags(
 
 def collect_part(data: Data, layout: Layout) -> Statistics:
     """Take the statistics of a part that need not determine the parameters."""
-    from optid.statistics import accumulate
-
     long = [i for i, e in enumerate(data.experiments) if e.n_samples > layout.first_row]
     if not long:
         raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
@@ -145,7 +144,6 @@ class _Scan:
         covariance = (error.T @ error + np.diag(1e-16 * energy)) / self.rows
         k = self.l * columns.size + self.shape
         likelihood = self.rows * float(np.linalg.slogdet(covariance)[1])
-        spare = max(self.rows * self.l - k - 1, 1)
         fit = float("nan")
         if self.other is not None:
             gram, rows = self.other
@@ -156,14 +154,12 @@ class _Scan:
             spread = np.diag(gram)[columns.size :] / rows - mean**2
             errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / rows
             fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
-        aic = likelihood + 2 * k
-        bic = likelihood + np.log(self.rows) * k
-        return Lags(na, nb, nk, aic, aic + 2 * k * (k + 1) / spare, bic, fit)
+        aic, aicc, bic = criteria(likelihood, k, self.rows, self.l)
+        return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
 
 
 def _contraction(statistics: Statistics) -> Array:
     """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit."""
-    from optid.identify.order.several_outputs import weighted_problem
     from optid.structures.bilinear import minimise
 
     layout = statistics.layout
@@ -178,6 +174,41 @@ def _contraction(statistics: Statistics) -> Array:
         change[block, past + c * lags : past + (c + 1) * lags] = np.kron(np.eye(lags), np.reshape(mu, (-1, 1)))
     change[layout.offset :, past + layout.m * lags :] = np.eye(1 + layout.l)
     return change
+
+
+def weighted_problem(statistics: Statistics) -> RankOne:
+    """Write the regression of all outputs as one rank-one problem, each output in units of its residual.
+
+    Unknowns: the linear coefficients of each output (past outputs, constant), then Theta_c (P_c, nb_c l), outputs
+    outermost.
+    """
+    layout, root = statistics.layout, statistics.root
+    n, outputs = layout.n_columns, layout.l
+    past = np.arange(layout.na * outputs)
+    linear = past.size + 1
+    sizes = [nb * basis.size for nb, basis in zip(layout.nb, layout.bases)]
+    total = outputs * (linear + sum(sizes))
+    system = np.zeros((outputs * n, total + 1))
+    remainder = 0.0
+    for o in range(outputs):
+        rest = float(np.sum(root[n:, n + o] ** 2))
+        energy = float(np.sum(root[:, n + o] ** 2))
+        weight = 1.0 if outputs == 1 else 1 / np.sqrt(max(rest / statistics.rows, 1e-24 * energy, 1e-300))
+        where = np.empty(n, dtype=int)
+        where[past], where[layout.offset] = o * linear + past, (o + 1) * linear - 1
+        start = outputs * linear
+        for c, size in enumerate(sizes):
+            where[layout.block(c)] = start + o * size + np.arange(size)
+            start += outputs * size
+        rows = slice(o * n, (o + 1) * n)
+        system[rows, where] = weight * root[:n, :n]
+        system[rows, -1] = weight * root[:n, n + o]
+        remainder += weight**2 * rest
+    triangle: Array = np.asarray(np.linalg.qr(system, mode="r"))
+    blocks = tuple((basis.size, nb * outputs) for nb, basis in zip(layout.nb, layout.bases))
+    if len(triangle) > total:
+        remainder += float(triangle[total, total] ** 2)
+    return RankOne(triangle[:total, :total], triangle[:total, total], remainder, blocks, outputs * linear)
 
 
 def _put(values: tuple[int, ...], c: int, value: int) -> tuple[int, ...]:

@@ -112,17 +112,9 @@ class RankTest:
         return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
 
 
-def rank_test(
-    statistics: HankelStatistics,
-    instruments: Positions,
-    regressors: Positions,
-    outputs: Positions,
-    *,
-    rows: int,
-    level: float | None = None,
-    largest: int | None = None,
-    scale: Array | None = None,
-) -> RankTest:
+def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: Positions, outputs: Positions, *,
+              rows: int, level: float | None = None, largest: int | None = None, scale: Array | None = None
+             ) -> RankTest:
     """Test the ranks of R22.
 
     Args:
@@ -185,36 +177,22 @@ def rank_test(
     return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
 
 
-def _projections(
-    statistics: HankelStatistics,
-    z: NDArray[np.intp],
-    phi: NDArray[np.intp],
-    y: NDArray[np.intp],
-    width: int,
-    sizes: Array,
-) -> tuple[Array, Array, Array, float]:
+def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp],
+                 width: int, sizes: Array) -> tuple[Array, Array, Array, float]:
     """R22, the windows' weights (width, .) that give e_t and orthonormal z_t, and the floor, per window."""
     from scipy.linalg import solve_triangular
 
-    rq(statistics, z, phi, y)  # refuses what is singular by name
-    j = statistics.windows
-    own = phi[~np.isin(phi, z)]
-    order = np.concatenate([z, own, y])
-    triangle = statistics.triangle(order) / np.sqrt(j)
-    column = {int(position): c for c, position in enumerate(order)}
-    l21 = triangle[: z.size, [column[int(p)] for p in phi]].T
-    l31 = triangle[: z.size, order.size - y.size :].T
-    basis, r11 = np.linalg.qr(l21.T, mode="complete")
-    q1, q2 = basis[:, : phi.size], basis[:, phi.size :]
-    gain = solve_triangular(r11[: phi.size], (l31 @ q1).T).T
-    r22 = l31 @ q2
-    orthonormal = solve_triangular(triangle[: z.size, : z.size], np.eye(z.size))
+    blocks, j = rq(statistics, z, phi, y), statistics.windows
+    regressors, outputs = (part / np.sqrt(j) for part in blocks.projected)
+    q2 = np.linalg.qr(regressors.T, mode="complete")[0][:, phi.size :]
+    r22 = outputs @ q2
+    orthonormal = np.sqrt(j) * solve_triangular(blocks.triangle, np.eye(z.size))
     shocks, noise = np.zeros((width, q2.shape[1])), np.zeros((width, y.size))
     shocks[z] = orthonormal @ q2
     noise[y, np.arange(y.size)] = 1
-    noise[phi] -= gain.T
+    noise[phi] -= blocks.gain.T
     noise[z] -= orthonormal @ (r22 @ q2.T).T
-    size = float(np.linalg.norm(triangle[:, order.size - y.size :] / sizes))
+    size = float(np.sqrt(np.sum(np.diag(statistics.gram)[y] / sizes**2) / j))
     return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
 
 

@@ -10,9 +10,8 @@ from optid.identify.order.ranks import RankTest, rank_test
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 
-WANTED, FEWEST = 10, 2
-PER_ROW = 1.5
-"""Block rows on a long record, and at least; windows per row of the longest windows that are wanted."""
+FEWEST, PER_ROW = 2, 1.5
+"""Block rows at least; windows per row of the longest windows that are wanted."""
 
 
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
@@ -27,11 +26,7 @@ def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | 
             raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order, is needed.")
         alpha = int(given)
     else:
-        width = expansion.p + 2 * expansion.q + expansion.l
-        count = sum(len(record) for record in records)
-        affordable = int(count / (3 * (len(records) + PER_ROW * width)))
-        alpha = max(FEWEST, min(WANTED if nx is None else max(WANTED, 2 * nx), affordable,
-                                min(len(record) for record in records) // 3))
+        alpha = expansion.block_rows(records, nx, spans=3, per_row=PER_ROW, least=FEWEST)
     if nx is not None and (alpha - 1) * expansion.l < nx:
         raise StructureError(
             f"{alpha} block rows of {expansion.l} outputs show orders up to {(alpha - 1) * expansion.l}, not {nx}: use "
@@ -46,42 +41,32 @@ def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | 
     return alpha
 
 
-def order_test(
-    records: Sequence[Array],
-    expansion: Expansion,
-    alpha: int,
-    *,
-    level: float | None = None,
-    statistics: HankelStatistics | None = None,
-) -> RankTest:
-    """Test the ranks with past and future inputs as instruments, which noise of any colour leaves valid.
+def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, instruments: str = "simulated",
+               offset: bool = True, level: float | None = None, statistics: HankelStatistics | None = None) -> RankTest:
+    """Test the ranks of the projected outputs; several outputs count relative to their sizes.
 
     Args:
-        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs; their
-            feedback functions are then instruments too.
+        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs.
         expansion: the signals.
         alpha: future block rows; the past has as many, and so has the reach of the serial correlation.
+        instruments: as in `Expansion.positions`; noise of any colour leaves past and future inputs valid, and functions
+            of outputs simulated from them.
+        offset: whether a constant is among instruments and regressors.
         level: as in `rank_test`.
         statistics: of windows of 3 alpha samples, where they exist already.
+
+    Raises:
+        RankError: too short a record, or instruments that do not reach the regressors.
     """
     if statistics is None:
-        statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names, centre="mean")
-    at, both, future = statistics.at, range(2 * alpha), range(alpha, 2 * alpha)
-    z = np.concatenate([[0], at(expansion.eta, both), at(expansion.zeta_simulated, both)])
-    phi = np.concatenate([[0], at(expansion.eta, future), at(expansion.zeta, future[:-1])])
-    y = at(expansion.y, future)
-    spread = None
-    if expansion.l > 1:  # outputs in different units count alike
-        energy = np.diag(statistics.gram)[y] / statistics.windows - (statistics.gram[0, y] / statistics.windows) ** 2
-        each = np.sqrt(np.maximum(energy.reshape(alpha, expansion.l).mean(axis=0), 1e-300))
-        spread = np.tile(each, alpha)
-    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l,
-                     scale=spread)
+        statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
+                                       centre="mean" if offset else None)
+    z, phi, y = expansion.positions(statistics.at, instruments, alpha, offset)
+    scale = np.tile(statistics.sizes(expansion.y, offset), alpha) if expansion.l > 1 else None
+    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
 
 
-def with_simulated_outputs(
-    records: Sequence[Array], expansion: Expansion, alpha: int
-) -> tuple[list[Array], Expansion]:
+def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha: int) -> tuple[list[Array], Expansion]:
     """Append outputs simulated from the inputs alone: least squares on the functions of the last 2 alpha samples.
 
     They are free of noise, so that functions of them are valid instruments for functions of measured outputs. The

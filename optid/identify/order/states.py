@@ -9,6 +9,7 @@ errors of a window is the likelihood. Source: Larimore 1990; small-sample correc
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -45,14 +46,22 @@ class StateCriteria:
         return found
 
 
-def state_criteria(
-    statistics: HankelStatistics,
-    expansion: Expansion,
-    alpha: int,
-    largest: int,
-    train: HankelStatistics | None = None,
-    test: HankelStatistics | None = None,
-) -> StateCriteria:
+def criteria(likelihood: Any, parameters: Any, samples: int, outputs: int) -> tuple[Any, Any, Any]:
+    """Return AIC, AIC with the small-sample correction, and BIC.
+
+    Args:
+        likelihood: minus twice the logarithm of the likelihood, up to a constant.
+        parameters: their number.
+        samples: number of samples of every output.
+        outputs: number of outputs.
+    """
+    aic = likelihood + 2 * parameters
+    spare = np.maximum(samples * outputs - parameters - 1, 1)
+    return aic, aic + 2 * parameters * (parameters + 1) / spare, likelihood + np.log(samples) * parameters
+
+
+def state_criteria(statistics: HankelStatistics, expansion: Expansion, alpha: int, largest: int,
+                   train: HankelStatistics | None = None, test: HankelStatistics | None = None) -> StateCriteria:
     """Compare the orders 0 ... largest.
 
     Args:
@@ -68,30 +77,22 @@ def state_criteria(
     n = np.arange(largest + 1, dtype=float)
     k = n * (2 * l + expansion.p + expansion.q) + l * (expansion.p + 1)
     likelihood = j / alpha * np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
-    aic = likelihood + 2 * k
-    spare = np.maximum(j * l - k - 1, 1)
     fit = np.full(n.size, np.nan)
     if train is not None and test is not None:
         y = test.at(expansion.y, range(alpha, 2 * alpha))
         spread = np.diag(test.gram)[y] / test.windows - (test.gram[0, y] / test.windows) ** 2
         errors = np.array([np.diag(covariance) for covariance in _errors(train, test, expansion, alpha, largest)])
         fit = 100 * np.mean(1 - np.sqrt(np.maximum(errors, 0) / np.maximum(spread, 1e-300)), axis=1)
-    return StateCriteria(aic, aic + 2 * k * (k + 1) / spare, likelihood + np.log(j) * k, fit, j)
+    return StateCriteria(*criteria(likelihood, k, j, l), fit, j)
 
 
-def _errors(
-    fitted: HankelStatistics, judged: HankelStatistics, expansion: Expansion, alpha: int, largest: int
-) -> list[Array]:
+def _errors(fitted: HankelStatistics, judged: HankelStatistics, expansion: Expansion, alpha: int, largest: int
+           ) -> list[Array]:
     """Covariances (alpha l, alpha l) of the errors in the future of `judged` of states and predictors of `fitted`."""
     from scipy.linalg import cholesky, solve_triangular
 
-    at = fitted.at
-    signals = [*expansion.eta, *expansion.zeta]
-    past = np.concatenate([at([*signals, *expansion.y], [i]) for i in range(alpha)])
-    drive = np.concatenate(
-        [[0], at(expansion.eta, range(alpha, 2 * alpha)), at(expansion.zeta, range(alpha, 2 * alpha - 1))]
-    )
-    future = at(expansion.y, range(alpha, 2 * alpha))
+    past = fitted.at([*expansion.eta, *expansion.zeta, *expansion.y], range(alpha))
+    _, drive, future = expansion.positions(fitted.at, "inputs", alpha)
     order = np.concatenate([drive, past, future])
     gram = fitted.gram[np.ix_(order, order)] / fitted.windows
     gram[np.diag_indices_from(gram)] *= 1 + ROUNDING

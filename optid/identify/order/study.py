@@ -1,10 +1,9 @@
 """One study of the order of a record: states, lags, and a recommendation with its reasons."""
 
-import textwrap
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +16,10 @@ from optid.identify.order.lags import LagScan, scan_lags
 from optid.identify.order.ranks import RankTest
 from optid.identify.order.signals import block_rows_for, order_test, with_simulated_outputs
 from optid.identify.order.states import StateCriteria, state_criteria
+from optid.registry import render
 from optid.statistics.channels import check_channels
 from optid.statistics.expansion import expand
 from optid.statistics.hankel import hankel_statistics
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-LINES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,58 +51,16 @@ class OrderStudy:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Return tables, recommendation and reasons, at most 80 columns wide."""
-        ranks, states = self.ranks, self.states
-        lines = [f"Order of {self.data}" if self.data else "Order"]
-        lines.append(f"  {ranks.windows} windows, {self.block_rows} block rows, level {ranks.level:.2g}")
-        heads = f"{'s(n)':>11}{'s/s next':>10}{'tail':>11}{'threshold':>11}{'p':>9}{'BIC':>11}{'hold-out %':>12}"
-        lines.append(f"  {'n':>3}{heads}")
-        roots = np.sqrt(ranks.statistics), np.sqrt(ranks.thresholds)
-        bic = states.bic - states.bic.min()
-        for n in range(min(max(LINES, self.nx + 3), ranks.singular_values.size)):
-            single = f"{ranks.singular_values[n - 1]:11.4g}" if n else f"{'':11}"
-            ratio = f"{ranks.ratios[n - 1]:10.3g}" if 0 < n <= ranks.ratios.size else f"{'':10}"
-            cost = f"{bic[n]:11.1f}" if n < bic.size else f"{'':11}"
-            fit = f"{states.fit[n]:12.2f}" if n < bic.size and np.isfinite(states.fit[n]) else f"{'':12}"
-            mark = " <" if n == self.nx else ""
-            tail = f"{roots[0][n]:11.4g}{roots[1][n]:11.4g}{ranks.p_values[n]:9.2g}"
-            lines.append(f"  {n:>3}{single}{ratio}{tail}{cost}{fit}{mark}"[:80])
-        if self.lags is not None:
-            lines.append(f"  {'lags by':<10}{'':<34}{'BIC':>12}{'hold-out %':>12}")
-            for name in ("aicc", "bic", "fit"):
-                if name != "fit" or any(np.isfinite(c.fit) for c in self.lags.candidates):
-                    one = self.lags.best(name)
-                    fit = f"{one.fit:12.2f}" if np.isfinite(one.fit) else ""
-                    word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
-                    lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
-        said = f"nx = {self.nx}"
-        if self.na is not None and self.lags is not None:
-            said += f"; {self.lags.best('bic')}"
-        lines.append(f"Recommended: {said}")
-        for reason in (*self.reasons, *(f"note: {note}" for note in self.notes)):
-            lines += textwrap.wrap(reason, 80, initial_indent="  - ", subsequent_indent="    ")
-        return "\n".join(lines)
+        return render(self, "text")
 
-    def picture(self) -> "Figure":
-        """Draw singular values with thresholds, criteria, and the scan of lags."""
-        from optid.identify.order.picture import draw
-
-        return draw(self)
+    def picture(self) -> Any:
+        """Draw singular values with thresholds, criteria, and the scan of lags; a matplotlib figure."""
+        return render(self, "figure")
 
 
-def order(
-    data: Data,
-    *,
-    basis: "Basis | str | Sequence[Basis | str] | None" = None,
-    feedback_basis: Any = None,
-    block_rows: int | None = None,
-    nx: int | None = None,
-    na: int = 8,
-    nb: int = 6,
-    nk: int = 8,
-    holdout: float = 0.3,
-    level: float | None = None,
-) -> OrderStudy:
+def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = None, feedback_basis: Any = None,
+          block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6, nk: int = 8,
+          holdout: float = 0.3, level: float | None = None) -> OrderStudy:
     """Find the order of a record without a model of its noise.
 
     The number of states comes from the singular values of the future outputs on past inputs: the smallest order whose
@@ -152,11 +105,10 @@ def order(
     ranks = order_test(extended, shown, alpha, level=level, statistics=statistics)
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
-    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=_centre(
-        statistics.centre, expansion)) if part is not None else None for part in (train, test)]
-    moments = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names,
-                                centre=_centre(statistics.centre, expansion))
-    states = state_criteria(moments, expansion, alpha, max(largest, 1), *parts)
+    centre = statistics.centre[: expansion.p + expansion.q + expansion.l]
+    moments = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=centre)
+               for part in (data, train, test) if part is not None]
+    states = state_criteria(moments[0], expansion, alpha, max(largest, 1), *moments[1:])
     lags = _lags(data, train, test, bases, na, nb, nk, notes)
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
@@ -173,10 +125,6 @@ def _records(data: Data) -> list[Array]:
     return [np.hstack([e.u, e.y]) for e in data.experiments]
 
 
-def _centre(centre: Array, expansion: Any) -> Array:
-    return centre[: expansion.p + expansion.q + expansion.l]
-
-
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
     if not holdout:
         return None, None
@@ -190,10 +138,8 @@ def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Da
     return train, test
 
 
-def _lags(
-    data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
-    notes: list[str],
-) -> LagScan | None:
+def _lags(data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
+          notes: list[str]) -> LagScan | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)

@@ -15,8 +15,7 @@ from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
 from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.transfer_errors import TransferErrors
-from optid.identify.subspace.methods import default_block_rows, project
-from optid.identify.subspace.realisation import realise
+from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
 from optid.models.roots import contained, roots_of
 from optid.statistics.expansion import expand
@@ -154,7 +153,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
         expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # as in `arx_start`
-            found = project(records, expansion, default_block_rows(records, expansion, layout.na), instruments="past")
+            found = project(records, expansion, expansion.block_rows(records, layout.na), instruments="past")
         poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
     except (OptidError, np.linalg.LinAlgError):
         return None

@@ -16,7 +16,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import interpolated, runs_of
 from optid.errors import DataError, RankError
-from optid.identify.subspace.methods import BEYOND
+from optid.identify.subspace.instruments import clipping_range
 from optid.models.hammerstein_ss import HammersteinSS
 
 ROUNDS = 12
@@ -89,8 +89,7 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Impu
     stacked = np.vstack(outputs)
     if np.any(np.sum(~np.isnan(stacked), axis=0) < 2):
         raise RankError("an output has fewer than two samples: leave it out")
-    spread, low, high = np.nanstd(stacked, axis=0), np.nanmin(stacked, axis=0), np.nanmax(stacked, axis=0)
-    low, high = low - BEYOND * (high - low), high + BEYOND * (high - low)
+    spread, (low, high) = np.nanstd(stacked, axis=0), clipping_range([stacked])
     filled, count, change, rounds = [interpolated(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
     while rounds < ROUNDS and change > SETTLED:
         rounds += 1

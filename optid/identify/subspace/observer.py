@@ -11,7 +11,7 @@ of samples has its own initial state; those of all but the first run of an exper
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,10 @@ from optid.errors import RankError
 from optid.statistics.expansion import Expansion
 from optid.statistics.factors import add_to_root, conditioning, root_of_gram
 from optid.statistics.hankel import CONDITION_LIMIT
+from optid.statistics.responses import adjoint_responses
 from optid.structures.rank_one import RankOne
 
-CHUNK = 4096
+CHUNK = 8192
 """Samples whose regressors are formed at once."""
 
 MANY = 10
@@ -93,13 +94,29 @@ class ObserverForm:
         """Number of unknowns."""
         return self.linear + sum(p * b for p, b in self.blocks)
 
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels in words, those of the feedback last."""
+        x = self.expansion
+        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """Where the unknowns z stand in [x0 of all experiments | d | D row by row | B and E column by column]."""
+        n, l, p = self.n, self.l, self.expansion.p  # noqa: E741
+        found, start = [np.arange(self.linear)], 0
+        for functions, entries in self.blocks:
+            position = start + np.arange(functions)[:, None]
+            inner = self.linear + l * p + position * n + np.arange(n)
+            found.append(np.hstack([inner, self.linear + np.arange(entries - n) * p + position]).ravel(order="F"))
+            start += functions
+        return np.concatenate(found)
+
     def names(self) -> list[str]:
         """Name the unknowns in words for messages."""
-        x = self.expansion
-        channels = [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
         named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
         named += ["the offset"] * (self.l * self.offset)
-        for channel, (p, b) in zip(channels, self.blocks):
+        for channel, (p, b) in zip(self.channels, self.blocks):
             named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
         return named
 
@@ -112,25 +129,13 @@ class ObserverProblem:
         form: the layout.
         problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
         rows: equations used.
-        candidates: equations there would be, were no sample missing.
         instrumented: whether the normal equations are those of instruments.
     """
 
     form: ObserverForm
     problem: RankOne
     rows: int
-    candidates: int
     instrumented: bool = False
-
-    @property
-    def unit(self) -> float:
-        """One: the residuals are relative to the sizes of the outputs."""
-        return 1.0
-
-    @property
-    def condition(self) -> float:
-        """Estimate of the condition number of the scaled regressors."""
-        return conditioning(np.asarray(self.problem.root, dtype=float))
 
     def least_squares(self) -> Array:
         """Return the unrestricted minimiser z.
@@ -146,28 +151,30 @@ class ObserverProblem:
                             "order, or leave the channel out.")
         return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
 
+    def ratios(self) -> dict[str, float]:
+        """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
+        z, found = self.least_squares(), {}
+        for i, (name, shape) in enumerate(zip(self.form.channels, self.form.blocks)):
+            if min(shape) > 1:
+                values = np.linalg.svd(z[self.form.block(i)].reshape(shape, order="F"), compute_uv=False)
+                name = name if i >= self.form.expansion.m else f"channel {name}"
+                found[f"second over first singular value, {name}"] = float(values[1] / values[0])
+        return found
+
     def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
-        form = self.form
-        x, n, l = form.expansion, form.n, form.l  # noqa: E741
-        bu, du, ez = np.zeros((n, x.p)), np.zeros((l, x.p)), np.zeros((n, x.q))
-        starts = np.cumsum([0, *(p for p, _ in form.blocks)])
-        for i, (p, b) in enumerate(form.blocks):
-            theta = z[form.block(i)].reshape(b, p)
-            if i < x.m:
-                bu[:, starts[i] : starts[i] + p] = theta[:n]
-                if b > n:
-                    du[:, starts[i] : starts[i] + p] = theta[n:]
-            else:
-                ez[:, starts[i] - x.p : starts[i] - x.p + p] = theta
-        x0 = z[: form.experiments * n].reshape(form.experiments, n)
-        return bu, du, ez, z[form.experiments * n : form.linear] if form.offset else np.zeros(l), x0
+        form, x = self.form, self.form.expansion
+        direct, inner = form.linear, form.linear + form.l * x.p
+        found = np.zeros(inner + form.n * (x.p + x.q))
+        found[form.columns] = z
+        effects, states = found[inner:].reshape(-1, form.n).T, form.experiments * form.n
+        offset = found[states:direct] if form.offset else np.zeros(form.l)
+        return (effects[:, : x.p], found[direct:inner].reshape(form.l, x.p), effects[:, x.p :], offset,
+                found[:states].reshape(form.experiments, form.n))
 
 
-def observer_problem(
-    records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
-    targets: Sequence[Array] | None = None
-) -> ObserverProblem:
+def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
+                     targets: Sequence[Array] | None = None) -> ObserverProblem:
     """Compress the step.
 
     Args:
@@ -185,12 +192,11 @@ def observer_problem(
     regressors = _Regressors(form, instruments, chunk)
     extra = regressors.extra
     total = form.experiments * form.n + regressors.common + extra  # [x0 | eta, d | zeta simulated | zeta] and y
-    root, rows, candidates, energy = np.zeros((total + 1, total + 1)), 0, 0, 0.0
+    root, rows, energy = np.zeros((total + 1, total + 1)), 0, 0.0
     own = slice(form.experiments * form.n, total + 1)
     for e, record in enumerate(records):
         y = record[:, regressors.y] if targets is None else targets[e]
-        candidates += y.size
-        for i, (start, stop) in enumerate(_runs(record, regressors.needed)):
+        for i, (start, stop) in enumerate(runs_of(~np.isnan(record[:, regressors.needed]).any(axis=1))):
             part, used, squares = regressors.compress(record[start:stop], y[start:stop])
             rows += used
             energy += squares
@@ -204,24 +210,14 @@ def observer_problem(
     if rows < form.size + extra:
         raise RankError(f"{rows} equations for {form.size + extra} unknowns of the step for B, D and x0: use a longer "
                         "record, fewer basis functions or a lower order.")
-    feeds, states = regressors.feeds, form.experiments * form.n
     if extra:  # the equations seen through the instruments: what lies outside them is dropped
-        seen = total - feeds
-        keep = np.r_[: seen - feeds, seen:total, total]
-        system = root[:seen][:, keep]
-    else:
-        system = root
-    turned = system[:, :-1] @ regressors.turn(states)
-    triangle = np.triu(np.linalg.qr(np.column_stack([turned, system[:, -1]]), mode="r"))
+        seen = total - regressors.feeds
+        root = root[:seen, np.r_[: seen - regressors.feeds, seen : total + 1]]
+    triangle = np.triu(np.linalg.qr(root[:, [*form.columns, -1]], mode="r"))
     size = form.size
     remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
     problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear, energy)
-    return ObserverProblem(form, problem, rows, candidates, bool(extra))
-
-
-def _runs(record: Array, needed: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the first and last (exclusive) sample of every stretch in which the channels needed are complete."""
-    return runs_of(~np.isnan(record[:, needed]).any(axis=1))
+    return ObserverProblem(form, problem, rows, bool(extra))
 
 
 class _Regressors:
@@ -237,10 +233,8 @@ class _Regressors:
         self.common = form.l * form.offset + form.l * x.p + form.n * x.p + self.feeds
         self.needed = np.zeros(x.m + x.l * (1 + x.simulated), dtype=bool)
         self.needed[: x.m] = True
-        if x.q or self.injected:
-            self.needed[self.y] = True
-        if instruments:
-            self.needed[x.m + x.l :] = True
+        self.needed[self.y] = x.q > 0 or self.injected
+        self.needed[x.m + x.l :] = instruments
 
     def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
         """Return the triangular factor of the rows of a run with its target, the rows used, and the outputs' energy.
@@ -258,18 +252,13 @@ class _Regressors:
 
     def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
         """Yield the weighted rows of a run with their target, some samples of one output at a time."""
-        from optid.statistics.subspace_kernels import adjoint_responses
-
-        form = self.form
-        inner, state = np.ascontiguousarray(form.a - form.gain @ form.c), None
-        for start in range(0, len(run), self.chunk):
-            raw, y = run[start : start + self.chunk], target[start : start + self.chunk]
-            signals = self._signals(raw)
-            if state is None:
-                state = np.zeros((form.l, signals.shape[1], form.n))
-                state[:, 0] = form.c  # C_o F^k, the effect of x0
-            out = np.empty((len(raw), *state.shape))
-            adjoint_responses(inner, np.array(form.c), np.ascontiguousarray(signals), state, out)
+        form, starts = self.form, range(0, len(run), self.chunk)
+        parts = (self._signals(run[start : start + self.chunk]) for start in starts)
+        state = np.zeros((form.l, self._signals(run[:1]).shape[1], form.n))
+        state[:, 0] = form.c  # C_o F^k, the effect of x0
+        responses = adjoint_responses(form.a - form.gain @ form.c, form.c, state, parts)
+        for start, (signals, out) in zip(starts, responses):
+            y = target[start : start + self.chunk]
             for o in range(form.l):
                 present = ~np.isnan(y[:, o])
                 rows = self._rows(o, signals, out[:, o], y[:, o])
@@ -279,13 +268,13 @@ class _Regressors:
     def _signals(self, raw: Array) -> Array:
         """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
         x = self.form.expansion
-        found = x(raw)
-        parts = [np.zeros((len(raw), 1)), found[:, : x.p]]
+        found, one = x(raw), np.ones((len(raw), 1))
+        parts = [0 * one, found[:, : x.p]]
         if self.extra:
             parts.append(found[:, x.zeta_simulated.start :])
         parts.append(found[:, x.p : x.p + x.q])
         if self.injected:
-            parts += [np.ones((len(raw), 1)), raw[:, self.y]]
+            parts += [one, raw[:, self.y]]
         return np.concatenate(parts, axis=1)
 
     def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
@@ -305,28 +294,6 @@ class _Regressors:
             rows[:, direct:inner] -= np.einsum("kji,io->koj", out[:, 1 : 1 + p], form.gain).reshape(count, -1)
             rows[:, -1] -= np.einsum("kji,ij->k", out[:, past + 1 :], form.gain)
         return rows
-
-    def turn(self, states: int) -> Array:
-        """Return the matrix that carries z to the order [x0 | d | D | B | E] of the rows."""
-        form, x = self.form, self.form.expansion
-        n, l, p, q = form.n, form.l, x.p, x.q  # noqa: E741
-        direct = states + l * form.offset
-        inner, feed = direct + l * p, direct + l * p + n * p
-        turn = np.zeros((feed + n * q, form.size))
-        turn[: form.linear, : form.linear] = np.eye(form.linear)
-        starts = np.cumsum([0, *(functions for functions, _ in form.blocks)])
-        for i, (functions, entries) in enumerate(form.blocks):
-            columns = np.arange(form.size)[form.block(i)].reshape(entries, functions)
-            for b in range(entries):
-                position = starts[i] + np.arange(functions)
-                if i >= x.m:
-                    where = feed + (position - p) * n + b
-                elif b < n:
-                    where = inner + position * n + b
-                else:
-                    where = direct + (b - n) * p + position
-                turn[where, columns[b]] = 1.0
-        return turn
 
 
 def observer_gain(a: Array, c: Array, noise: float = 1.0) -> Array:

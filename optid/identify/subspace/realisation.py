@@ -1,101 +1,120 @@
-"""From an estimate of the extended observability matrix to (A, C)."""
+"""The unknowns of the step for B, D, E, offset and x0 by name: where a search starts, and how its answer is read."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import StructureError
-from optid.statistics.rq import RQ
+from optid.bases import Linear
+from optid.identify.subspace.observer import ObserverProblem
+from optid.structures.bilinear import starts
+from optid.structures.rank_one import reduce
+from optid.structures.whitening import leading_pair
 
-WEIGHTINGS = ("moesp", "cva", "plain")
+Values = Mapping[str, Array]
+
+
+class Factors(NamedTuple):
+    """What the step answers.
+
+    Attributes:
+        B: (n, m).
+        D: (l, m).
+        E: (n, s), one column per feedback family.
+        mus: coefficients of the nonlinearity of every input.
+        nus: coefficients of every feedback family in its orthonormal coordinates.
+        offset: (l,).
+    """
+
+    B: Array
+    D: Array
+    E: Array
+    mus: list[Array]
+    nus: list[Array]
+    offset: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Range:
-    """The weighted singular value decomposition behind an estimate of Gamma.
+class Realisation:
+    """The step in named unknowns: one pair of factors per channel, or one matrix.
 
     Attributes:
-        vectors: (rows l, rows l) left singular vectors of W r22.
-        values: singular values, largest first.
-        unweighted: W^-1, (rows l, rows l).
-        l: number of outputs.
+        step: the compressed least squares.
+        factored: whether channels are rank one in the programme itself.
     """
 
-    vectors: Array
-    values: Array
-    unweighted: Array
-    l: int  # noqa: E741 - the field's letter
+    step: ObserverProblem
+    factored: bool
 
-    @property
-    def rows(self) -> int:
-        """Number of block rows."""
-        return len(self.vectors) // self.l
+    def names(self, i: int) -> tuple[str, str, str]:
+        """Names of the two factors and of the matrix of channel i: ``mu[valve]``, ``mu feedback[level]``."""
+        x = self.step.form.expansion
+        if i < x.m:
+            kind, several, channel = "", x.m > 1, x.input_names[i]
+        else:
+            kind, several, channel = " feedback", x.l > 1, x.output_names[x.feedback[i - x.m].output]
+        mu, b, theta = (f"{name}{kind}[{channel}]" if several else name + kind for name in ("mu", "b", "Theta"))
+        return mu, b, theta
 
-    def gamma(self, n: int) -> Array:
-        """Return Gamma (rows l, n) in balanced coordinates: columns scaled by the roots of the singular values."""
-        return self.unweighted @ (self.vectors[:, :n] * np.sqrt(self.values[:n]))
+    def start(self) -> dict[str, Array]:
+        """Return the unrestricted minimiser; of factored channels the most promising factors.
+
+        Raises:
+            RankError: naming what the record does not determine.
+        """
+        step, form = self.step, self.step.form
+        z = step.least_squares()
+        point = None
+        if self.factored:
+            core = reduce(step.problem)
+            point = core.point(*starts(core, count=1)[0])
+        linear = z[: step.problem.linear] if point is None else point.w
+        states = form.n * form.experiments
+        x0 = linear[:states] if form.experiments == 1 else linear[:states].reshape(form.n, form.experiments, order="F")
+        found = {"x0": np.array(x0)} | ({"offset": np.array(linear[states:])} if form.offset else {})
+        for i, (p, b) in enumerate(form.blocks):
+            mu, entries, theta = self.names(i)
+            if point is None:
+                found[theta] = z[form.block(i)].reshape((p, b), order="F")
+            else:
+                empty = not np.any(point.bs[i])
+                found[mu] = np.zeros(p) if empty else point.mus[i]
+                found[entries] = np.full(b, 1 / np.sqrt(b)) if empty else point.bs[i]
+        return found
+
+    def factors(self, values: Values) -> Factors:
+        """Read a point; a matrix is split in the Kronecker metric of the least squares."""
+        form, pairs, core = self.step.form, [], None
+        x = form.expansion
+        for i, shape in enumerate(form.blocks):
+            first, second, whole = self.names(i)
+            if first in values:
+                mu, b = np.asarray(values[first]), np.asarray(values[second])
+            else:
+                theta = np.reshape(values[whole], shape)
+                core = core or reduce(self.step.problem)
+                if i in core.kept:
+                    place = core.kept.index(i)
+                    mu, b = leading_pair(theta, core.whitening.factors_mu[place], core.whitening.factors_b[place])
+                else:
+                    mu, b = (np.ones(1), theta[0]) if shape[0] == 1 else (theta[:, 0], np.ones(1))
+            pairs.append(_oriented(mu, b, linear=i < x.m and isinstance(x.inputs[i], Linear)))
+        n, l, m = form.n, form.l, x.m  # noqa: E741
+        mus, bs = [mu for mu, _ in pairs], [b for _, b in pairs]
+        direct = [b[n:] if len(b) > n else np.zeros(l) for b in bs[:m]]
+        return Factors(np.column_stack([b[:n] for b in bs[:m]]), np.column_stack(direct),
+                       np.column_stack([np.zeros((n, 0)), *bs[m:]]), mus[:m], mus[m:],
+                       np.asarray(values["offset"]) if form.offset else np.zeros(l))
 
 
-def estimate_range(blocks: RQ, l: int, weighting: str = "moesp", scale: Array | None = None) -> Range:  # noqa: E741
-    """Decompose the projected outputs.
-
-    Args:
-        blocks: the RQ decomposition.
-        l: number of outputs.
-        weighting: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of the future
-            outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990) or
-            "plain" (outputs in their units: at an order too low the larger ones come first).
-        scale: (l,) size of every output, by which its rows are divided: outputs in small units are not lost.
-
-    Raises:
-        StructureError: an unknown weighting.
-    """
-    if weighting not in WEIGHTINGS:
-        raise StructureError(f"weighting={weighting!r}: use one of {', '.join(WEIGHTINGS)}.")
-    sizes = np.tile(np.ones(l) if scale is None or weighting == "plain" else scale, len(blocks.r22) // l)
-    r22, unweighted = blocks.r22 / sizes[:, None], np.diag(sizes)
-    if weighting == "cva":
-        whole = np.concatenate([r22, blocks.residual / sizes[:, None]], axis=1)
-        left, values, _ = np.linalg.svd(whole, full_matrices=False)
-        values = np.maximum(values, 1e-8 * values[0])  # directions without noise weigh much, not infinitely much
-        r22, unweighted = (left / values) @ left.T @ r22, unweighted @ (left * values) @ left.T
-    vectors, values, _ = np.linalg.svd(r22)
-    return Range(vectors, values, unweighted, l)
-
-
-def shift_pair(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
-    """Return the blocks of Gamma without its last and without its first block row: (upper, lower), upper A = lower."""
-    return gamma[:-l], gamma[l:]
-
-
-def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
-    """Return (A, C) from Gamma (rows l, n) by least squares on its shift invariance."""
-    upper, lower = shift_pair(gamma, l)
-    return np.asarray(np.linalg.lstsq(upper, lower, rcond=None)[0], dtype=float), gamma[:l].copy()
-
-
-def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
-    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
-
-    Args:
-        gamma: (rows l, n) in units of the outputs.
-        scale: (l,) sizes of the outputs.
-    """
-    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
-    a, _ = realise(scaled, len(scale))
-    return a, gamma[: len(scale)].copy(), scaled
-
-
-def largest_gap(values: Array, largest: int) -> int:
-    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
-
-    Values below the rounding of the decomposition count as that rounding.
-
-    Args:
-        values: singular values, largest first.
-        largest: highest order to consider.
-    """
-    floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
-    ratios = floor[:-1] / floor[1:]
-    return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
+def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
+    """A linear channel has mu = 1; every other a b of unit length, its largest entry positive."""
+    if linear:
+        return np.ones(1), b * mu[0]
+    length = float(np.linalg.norm(b))
+    if length == 0.0:
+        return np.zeros_like(mu), np.full(len(b), 1 / np.sqrt(len(b)))
+    length *= float(np.sign(b[int(np.argmax(np.abs(b)))]))
+    return mu * length, b / length

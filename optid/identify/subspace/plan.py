@@ -1,27 +1,25 @@
 """What a subspace method is asked for, on a record in its own units."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from optid.bases import Linear, UserFunctions, fitted_bases
+from optid.bases import Linear, UserFunctions, feedback_bases, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.identify.arguments import one_of
-from optid.identify.design.expansion import feedback_bases
-from optid.identify.subspace.realisation import WEIGHTINGS
+from optid.identify.subspace.projection import WEIGHTINGS
 from optid.program.units import in_units, inner_bases, own_units
-from optid.solving.solve import Procedure
+from optid.solving.solve import Evidence, Procedure
 from optid.statistics.expansion import Expansion, expand
 
-OBSERVERS = ("auto", "none", "kalman")
-SPLITS = ("exact", "lumped")
-ORDERS = ("auto", "gap")
-STABILITIES = ("auto", "free")
 BEST = "best"
 """Word for the weighting that fits the record best."""
+
+WORDS = {"observer": ("auto", "none", "kalman"), "split": ("exact", "lumped"), "stability": ("auto", "free"),
+         "weighting": (*WEIGHTINGS, BEST)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +56,11 @@ class Plan:
     records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
-        for name, value, known in (("observer", self.observer, OBSERVERS), ("split", self.split, SPLITS),
-                                   ("stability", self.stability, STABILITIES),
-                                   ("weighting", self.weighting, (*WEIGHTINGS, BEST))):
-            one_of(name, value, known)
-        if not (self.nx in ORDERS or isinstance(self.nx, int | np.integer) and self.nx >= 1) or self.nx is True:
+        for name, known in WORDS.items():
+            if (value := getattr(self, name)) not in known:
+                raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
+        nx: Any = self.nx
+        if nx not in ("auto", "gap") and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
             raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
         if not self.units.y_scale:
             object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))
@@ -93,18 +91,15 @@ class Plan:
         return tuple(bool(one) for one in given)
 
 
-def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis: Any, feedback_basis: Any,
-            instruments: str, *, offset: bool = True, **settings: Any) -> Plan:
+def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
+            ) -> Plan:
     """Plan a method on a record taken to its own units (`optid.program.units`), see `in_record_units`.
 
     Args:
         name: of the formulation.
         data: the record, in memory.
-        nx: as in `formulations.hammerstein_ss.sid`.
-        block_rows: as there.
         basis: of the inputs.
         feedback_basis: of the outputs, None without feedback.
-        instruments: word of the instruments.
         offset: whether the model has a constant; without one nothing is centred.
         settings: further fields of the plan.
     """
@@ -116,7 +111,7 @@ def planned(name: str, data: Data, nx: int | str, block_rows: int | None, basis:
         units = Transform.identity(data.m, data.l)
     inner = [one and one.mapped(1 / scale, -level / scale)[0]
              for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
-    return Plan(name, in_units(data, units), nx, block_rows, inner_bases(inputs, units), inner or None, instruments,
+    return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), feedback_basis=inner or None,
                 offset=bool(offset), units=units, **settings)
 
 
@@ -125,4 +120,10 @@ def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
     evidence = yield from procedure
     if evidence is None or evidence.model is None:
         return evidence
-    return replace(evidence, model=evidence.model.with_transform(plan.units))
+    extend = evidence.extend and partial(_extended, evidence, plan.units)
+    return replace(evidence, model=evidence.model.with_transform(plan.units), extend=extend)
+
+
+def _extended(evidence: Evidence, units: Transform) -> tuple[Any, dict[str, Any]]:
+    model, figures = evidence.extended()
+    return model.with_transform(units), figures

@@ -1,19 +1,17 @@
-"""One picture of a study of the order."""
+"""The picture of a study of the order."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from optid.identify.order.study import OrderStudy
 from optid.show.panels import styled
-
-if TYPE_CHECKING:
-    from optid.identify.order.study import OrderStudy
 
 
 @styled
-def draw(study: "OrderStudy") -> Figure:
+def draw(study: OrderStudy) -> Figure:
     """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags.
 
     Args:
@@ -57,7 +55,7 @@ def draw(study: "OrderStudy") -> Figure:
     return figure
 
 
-def _draw_lags(study: "OrderStudy", axes: Any) -> None:
+def _draw_lags(study: OrderStudy, axes: Any) -> None:
     if study.lags is None:
         axes.text(0.5, 0.5, "no scan of lags", ha="center", va="center", transform=axes.transAxes)
         axes.set_axis_off()

@@ -1,0 +1,225 @@
+"""The low-rank problem of the nuclear-norm subspace method: its data, its weight, its observability matrix."""
+
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError, RankError, StructureError
+from optid.identify.subspace.observability import Observability, Preliminary, prepared
+from optid.identify.subspace.plan import Plan
+from optid.identify.subspace.projection import realise
+from optid.identify.validation import fit_percent
+from optid.identify.validation.predictions import MEASURED, SIMULATION, simulated
+from optid.program.program import Program
+from optid.program.solution import Solution
+from optid.statistics.expansion import Expansion
+from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
+
+Values = Mapping[str, Array]
+
+RANK = 1e-3  # singular values below this part of the largest are none
+NOTHING = 1e-5  # of the largest singular value of the measured outputs' matrix
+LARGEST = 10  # order at most where it is chosen
+SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposition costs
+
+
+@dataclass(frozen=True, eq=False)
+class Structured:
+    """The structured problem of a record, in outputs of mean zero and unit variance.
+
+    Attributes:
+        problem: the numbers.
+        centre: (l,) subtracted from the outputs.
+        scale: (l,) by which they were divided.
+        size: largest singular value of the matrix of the measured outputs.
+    """
+
+    problem: NuclearProblem
+    centre: Array
+    scale: Array
+    size: float
+
+    @property
+    def floor(self) -> float:
+        """Singular values below it are none: a weight so small that nothing is left of the matrix has rank zero."""
+        return NOTHING * self.size
+
+    def penalty(self, weight: float) -> float:
+        """Return lambda for a weight: the inverse noise variance times the size per output sample."""
+        return weight * self.size / max(int(np.sum(self.problem.known)), 1)
+
+    def decomposed(self, values: Values) -> tuple[Array, Array]:
+        """Return the left singular vectors, weights undone, in units of the outputs, and the singular values."""
+        problem = self.problem
+        theta = np.asarray(values["T"]) if "T" in values else np.zeros((0, problem.l))
+        left, sizes, _ = np.linalg.svd(problem.matrix(np.asarray(values["yhat"]), theta), full_matrices=False)
+        if problem.left is not None:
+            left = np.linalg.solve(problem.left, left)
+        return left * np.tile(self.scale, problem.rows)[:, None], sizes
+
+    def gamma(self, vectors: Array, sizes: Array, nx: int, values: Values) -> Array:
+        """Return the observability matrix (rows l, nx) of (A, C) in coordinates with states of about unit size.
+
+        What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T.
+        """
+        found = vectors[:, :nx] * np.sqrt(sizes[:nx]) / self.problem.shape[1] ** 0.25
+        predictor, l = self.problem.predictor, self.problem.l  # noqa: E741
+        if predictor is None:
+            return found
+        inner, c = realise(found, l)
+        k, signal = predictor.places.T
+        first = predictor.windows.shape[1] - l  # the outputs come last
+        theta = np.asarray(values["T"])[: len(k)]
+        markov = [theta[(k == lag) & (signal >= first)].T for lag in range(1, self.problem.rows)]
+        stacked = np.vstack([self.scale[:, None] * block / self.scale for block in markov])
+        gain = np.linalg.lstsq(found[:-l], stacked, rcond=None)[0]
+        a, blocks = inner + gain @ c, [c]
+        for _ in range(self.problem.rows - 1):
+            blocks.append(blocks[-1] @ a)
+        return np.vstack(blocks)
+
+
+def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program],
+                  preliminary: Preliminary) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
+    """Return the weight, and where it is free the order, whose model simulates the parts held out best, and figures.
+
+    Args:
+        plan: what was asked for.
+        weights: those to try.
+        hold_out: part of every experiment that is held out.
+        pose: returns the programme of a structured problem, with a parameter "weight".
+        preliminary: returns the least-squares model of an observability matrix.
+    """
+    part, rest = plan.data.split(1 - hold_out)
+    train = replace(plan, data=part)
+    expansion, alpha = prepared(replace(train, block_rows=prepared(plan)[1]))
+    structured = structure(train, expansion, alpha)
+    trials: list[tuple[float, float, int]] = []
+    program = pose(structured)
+    for weight in weights:
+        program.parameters["weight"].value = structured.penalty(weight)
+        solution = yield program
+        if solution.has_point:
+            program = replace(program, start={name: solution.values[name] for name in program.start})
+            scores = order_scores(train, expansion, structured, solution.values, rest, preliminary)
+            trials += [(score, weight, nx) for nx, score in scores.items()]
+    if not trials:
+        return weights[-1], plan.nx, {"weights tried": len(weights)}
+    score, weight, nx = max(trials)
+    return weight, nx, {"weights tried": len(weights), "simulation fit on the part held out in %": score}
+
+
+def order_scores(plan: Plan, expansion: Expansion, structured: Structured, values: Values, rest: Data,
+                 preliminary: Preliminary) -> dict[int, float]:
+    """Return the simulation fit in % on another record of the model of every order that a point allows.
+
+    Args:
+        plan: what was asked for; with an order, that one alone.
+        expansion: the signals of its record.
+        structured: the problem.
+        values: a point of its programme.
+        rest: the other record.
+        preliminary: as in `choose_weight`.
+    """
+    vectors, sizes = structured.decomposed(values)
+    most = min(rank_of(sizes, structured.floor), structured.problem.rows - 1)
+    orders = range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most)
+    found = {}
+    for nx in orders:
+        try:
+            gamma = structured.gamma(vectors, sizes, nx, values)
+            model = preliminary(Observability(plan, plan.records, expansion, gamma, structured.scale))
+            found[nx] = held_out_fit(model, rest)
+        except (RankError, DataError):  # an order this part of the record cannot carry is no candidate
+            continue
+    return {nx: score for nx, score in found.items() if np.isfinite(score)}
+
+
+def held_out_fit(model: Any, data: Data) -> float:
+    """Mean simulation fit in % over the outputs, initial states fitted; with feedback that of measured outputs."""
+    outputs = simulated(model, data, MEASURED if model.feedback else SIMULATION)
+    return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(outputs))))
+
+
+def rank_of(sizes: Array, floor: float = 0.0) -> int:
+    """Return the number of singular values above a thousandth of the largest and above a floor."""
+    return int(np.sum((sizes > RANK * sizes[0]) & (sizes > floor)))
+
+
+def order_of(sizes: Array, most: int, floor: float = 0.0) -> int:
+    """Return the rank, one at least, `LARGEST` at most."""
+    return int(np.clip(rank_of(sizes, floor), 1, min(LARGEST, most)))
+
+
+def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
+    """Build the structured problem of a record.
+
+    Args:
+        plan: what was asked for; its instruments word is the form.
+        expansion: the signals.
+        alpha: number of block rows.
+
+    Raises:
+        StructureError: feedback in a form other than "predictor", or a record too long.
+        RankError: too few usable windows.
+    """
+    l, form = expansion.l, plan.instruments  # noqa: E741
+    if form != "predictor" and expansion.q:
+        raise StructureError(f"form={form!r} projects on the complement of the inputs, which outputs that are fed back "
+                             "do not allow: use form='predictor'")
+    y = np.concatenate([record[:, expansion.m :] for record in plan.records])
+    if y.size > SAMPLES:
+        raise StructureError(f"{y.size} output samples: the nuclear-norm subspace method is for short records, up to "
+                             f"{SAMPLES}. Use hammerstein_ss.asivid or a part of the record")
+    centre = np.nanmean(y, axis=0) if plan.offset else np.zeros(l)
+    scale = np.nanstd(y, axis=0) if plan.offset else np.sqrt(np.nanmean(y**2, axis=0))
+    signals = np.concatenate([expansion(record) for record in plan.records])
+    signals = signals[:, list(expansion.eta) + (list(expansion.zeta) + list(expansion.y)) * (form == "predictor")]
+    if form == "predictor":
+        signals[:, -l:] = (signals[:, -l:] - centre) / scale
+    usable = ~np.isnan(signals).any(axis=1)
+    past = alpha if form == "instruments" else 0
+    lengths = [len(record) for record in plan.records]
+    starts = window_starts(lengths, alpha + past, np.split(usable, np.cumsum(lengths)[:-1])) + past
+    rows = expansion.p * alpha + 1 + (alpha * l if past else 0)
+    if len(starts) <= rows:
+        gaps = any(plan.data.missing[name] for name in plan.data.outputs) and form == "predictor"
+        remedy = ", or form='projection', whose windows may lack outputs" if gaps and not expansion.q else ""
+        raise RankError(f"{len(starts)} usable windows of {alpha + past} samples for {rows} known rows: use a longer "
+                        f"record, fewer block rows or fewer functions{remedy}")
+    outputs = (y - centre) / scale
+    windows = np.stack([signals[starts + i].T for i in range(alpha)])
+    problem = NuclearProblem(outputs, starts, alpha)
+    if form == "predictor":
+        direct = np.repeat([*plan.direct(), False], [*expansion.input_sizes, expansion.q + l])
+        problem = replace(problem, predictor=Predictor(windows, direct, plan.offset))
+    else:
+        known = windows.reshape(-1, len(starts))
+        known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known
+        problem = _weighted(problem, known, np.nan_to_num(np.hstack([signals, outputs])) if past else None)
+    measured = problem.matrix(problem.data, problem.explained(problem.hankel(problem.data)))
+    return Structured(problem, centre, scale, float(np.linalg.norm(measured, 2)))
+
+
+def _weighted(problem: NuclearProblem, known: Array, instruments: Array | None) -> NuclearProblem:
+    """Put the projection and, with instruments, the weights of the instrumental-variable method in place."""
+    basis, sizes, _ = np.linalg.svd(known.T, full_matrices=True)
+    rank = int(np.sum(sizes > 1e-10 * sizes[0]))
+    if instruments is None:
+        return replace(problem, right=basis[:, rank:])
+    starts, alpha = problem.starts, problem.rows
+    past = np.concatenate([instruments[starts - alpha + i].T for i in range(alpha)])
+    future = replace(problem, left=None, right=basis[:, rank:]).hankel(problem.data)
+    count = len(starts)
+    right = basis[:, rank:] @ (basis[:, rank:].T @ past.T) @ _inverse_root(past @ past.T / count) / count
+    return replace(problem, left=_inverse_root(future @ future.T / count), right=right)
+
+
+def _inverse_root(gram: Array) -> Array:
+    values, vectors = np.linalg.eigh(gram)
+    values = np.maximum(values, 1e-10 * values[-1])
+    return (vectors / np.sqrt(values)) @ vectors.T

@@ -1,0 +1,170 @@
+"""The (A, C) step of the subspace methods: instruments, projection, range of the observability matrix, order."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import DataWarning, StructureError
+from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
+from optid.statistics.rq import RQ, rq
+
+INSTRUMENTS = ("past", "inputs", "inputs+past", "simulated", "simulated+past")
+WEIGHTINGS = ("moesp", "cva", "plain")
+
+KEPT = 0.5
+"""Share of the windows left by missing samples below which the user is told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """What the projection step leaves.
+
+    Attributes:
+        statistics: moments of the windows of 2 block_rows samples.
+        blocks: the RQ decomposition.
+        instruments: word of the instruments.
+        scale: (l,) standard deviations of the outputs; one output is left as it is.
+        weighting: of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not
+            lost), "cva" (the inverse root of the covariance of the future outputs with the regressors removed, so that
+            singular values are canonical correlations: Larimore 1990) or "plain" (outputs in their units: at an order
+            too low the larger ones come first).
+    """
+
+    statistics: HankelStatistics
+    blocks: RQ
+    instruments: str
+    scale: Array
+    weighting: str = WEIGHTINGS[0]
+
+    @property
+    def block_rows(self) -> int:
+        """Number of block rows of the future."""
+        return self.statistics.rows // 2
+
+    @cached_property
+    def decomposition(self) -> tuple[Array, Array]:
+        """Left singular vectors of the weighted outputs, the weights undone, and the singular values, largest first."""
+        sizes = np.tile(self.scale, self.block_rows) if self.weighting != "plain" else np.ones(len(self.blocks.r22))
+        r22, unweighted = self.blocks.r22 / sizes[:, None], np.diag(sizes)
+        if self.weighting == "cva":
+            whole = np.concatenate([r22, self.blocks.residual / sizes[:, None]], axis=1)
+            left, values, _ = np.linalg.svd(whole, full_matrices=False)
+            values = np.maximum(values, 1e-8 * values[0])  # directions without noise weigh much, not infinitely much
+            r22, unweighted = (left / values) @ left.T @ r22, unweighted @ (left * values) @ left.T
+        vectors, values, _ = np.linalg.svd(r22)
+        return unweighted @ vectors, values
+
+    @property
+    def values(self) -> Array:
+        """Singular values, largest first."""
+        return self.decomposition[1]
+
+    @property
+    def rank(self) -> int:
+        """Number of singular values that are more than rounding, noise included."""
+        floor = 10 * len(self.statistics.gram) * np.finfo(float).eps * self.values[0]
+        return int(np.sum(self.values > floor))
+
+    def gamma(self, n: int) -> Array:
+        """Return Gamma (block_rows l, n) in balanced coordinates in which the states have about unit size."""
+        vectors, values = self.decomposition
+        return vectors[:, :n] * np.sqrt(values[:n]) / self.statistics.windows**0.25
+
+
+def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool = True,
+            form: str = "projection", tolerance: float | None = None, weighting: str = "moesp") -> Projection:
+    """Take the statistics and decompose.
+
+    Args:
+        records: raw channels [u | y] or [u | y | simulated y] per experiment.
+        expansion: the signals.
+        block_rows: of the future; the past has as many.
+        instruments: as in `Expansion.positions`.
+        offset: whether the system has a constant.
+        form: "projection" or "correlation".
+        tolerance: of the pseudo-inverse; None asks for regular regressors.
+        weighting: of the projected outputs.
+
+    Raises:
+        StructureError: unknown words.
+        RankError: records that are too short, or do not excite the regressors.
+    """
+    if instruments not in INSTRUMENTS:
+        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
+    statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
+    statistics.check()
+    if statistics.windows < KEPT * statistics.candidates:
+        warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "
+                      f"{2 * block_rows} samples: fewer block rows keep more.", DataWarning, stacklevel=2)
+    z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
+    blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
+    scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
+    return Projection(statistics, blocks, instruments, scale, weighting)
+
+
+def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
+    """Return (A, C) from Gamma (rows l, n) by least squares on its shift invariance."""
+    return np.asarray(np.linalg.lstsq(gamma[:-l], gamma[l:], rcond=None)[0], dtype=float), gamma[:l].copy()
+
+
+def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
+    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
+
+    Args:
+        gamma: (rows l, n) in units of the outputs.
+        scale: (l,) sizes of the outputs.
+    """
+    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
+    return realise(scaled, len(scale))[0], gamma[: len(scale)].copy(), scaled
+
+
+def largest_gap(values: Array, largest: int) -> int:
+    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
+
+    Values below the rounding of the decomposition count as that rounding.
+
+    Args:
+        values: singular values, largest first.
+        largest: highest order to consider.
+    """
+    floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
+    ratios = floor[:-1] / floor[1:]
+    return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
+
+
+def check_order(nx: int, block_rows: int, outputs: int) -> None:
+    """Refuse an order that the block rows cannot carry.
+
+    Raises:
+        StructureError: with the largest order possible.
+    """
+    if block_rows <= nx:
+        raise StructureError(f"{block_rows} block rows for order {nx}: more block rows than states are needed; use "
+                             f"block_rows={nx + 1} or more, or nx={block_rows - 1} or less.")
+    if nx > (block_rows - 1) * outputs:
+        raise StructureError(f"order {nx} with {block_rows} block rows and {outputs} outputs: at most "
+                             f"{(block_rows - 1) * outputs}.")
+
+
+def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:
+    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output.
+
+    Args:
+        projection: with simulated feedback functions among its signals.
+        expansion: the signals.
+    """
+    statistics, shares, start = projection.statistics, [], 0
+    simulated = np.concatenate([[0], statistics.at(expansion.zeta_simulated, [0])])
+    for family in expansion.feedback:
+        own = statistics.at(expansion.zeta[start : start + family.size], [0])
+        triangle = statistics.triangle(np.concatenate([simulated, own]))
+        part, whole = triangle[1 : simulated.size, simulated.size :], triangle[1:, simulated.size :]
+        shares.append((float(np.sum(part**2) / np.sum(whole**2)), expansion.output_names[family.output]))
+        start += family.size
+    return min(shares)

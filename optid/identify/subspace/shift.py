@@ -1,0 +1,245 @@
+"""The shift-invariance step under constraints on the poles: its sequence of programmes, and large orders deflated.
+
+``min_A ‖Gamma_up A - Gamma_dn‖`` has a closed form; with poles restricted to regions it is not convex in A. The fit
+weighted by P, with A = Q P^-1, is a semidefinite programme. The weight is then undone by convex steps that cannot raise
+the unweighted residual: A alone with P fixed, and the P that leaves A the largest margin. The least-squares residual
+bounds what any A can reach, so that every answer carries a certified suboptimality.
+
+The programme in P and Q grows with the fourth power of the order, so that large orders are deflated first: in the
+Schur form of the least-squares solution the residual splits into columns, and with its invariant subspaces kept, the
+poles that obey stay as they are and the others are constrained a few at a time. The bound is the same.
+"""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import StructureError
+from optid.program.program import Program
+from optid.program.solution import Solution, Status
+
+DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
+ROUNDS = 6  # pairs of programmes in A and in P at most
+ENOUGH = 1e-2  # fall of the residual, relative to the suboptimality left, below which rounds stop
+TINY = 1e-9  # suboptimality relative to the size of Gamma that is none
+LARGEST = 16  # states whose A is found by one programme
+AT_ONCE = 8  # poles that are constrained by one programme where there are more states
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """The answer of the step.
+
+    Attributes:
+        a: (n, n), or None where no programme had a point.
+        residual: ‖Gamma_up A - Gamma_dn‖ (Frobenius) at ``a``; nan without a point.
+        bound: the least-squares residual, below which no A can come.
+        least_squares: (n, n) the unconstrained solution.
+        applied: whether constraints were needed.
+        status: OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the
+            suboptimality is positive, INACCURATE where a back end was or where a pole lies outside its region.
+        reason: one sentence for people.
+        certificate: (n, n) P of the inequalities; None where no programme had a point, and after a deflation.
+    """
+
+    a: Array | None
+    residual: float
+    bound: float
+    least_squares: Array
+    applied: bool
+    status: Status
+    reason: str
+    certificate: Array | None = None
+
+    @property
+    def suboptimality(self) -> float:
+        """Certified: the residual exceeds the smallest possible one by at most this much."""
+        return self.residual - self.bound
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftStep:
+    """The step in coordinates z, x = T z, in which Gamma_up T has orthonormal columns, with its rows compressed.
+
+    Attributes:
+        top: (2 n, n) compressed Gamma_up T.
+        low: (2 n, n) compressed Gamma_dn T.
+        free: (n, n) least-squares solution in z.
+        basis: (n, n) T.
+        change: (n, n) T^-1, the weight on the right that gives residuals in the original coordinates.
+        size: norm of Gamma_dn.
+    """
+
+    top: Array
+    low: Array
+    free: Array
+    basis: Array
+    change: Array
+    size: float
+
+    @classmethod
+    def of(cls, up: Array, down: Array, free: Array) -> "ShiftStep":
+        """Compress Gamma_up and Gamma_dn, (r, n) each, with the least-squares solution A."""
+        n = up.shape[1]
+        change = np.asarray(np.linalg.qr(up, mode="r"))
+        sizes = np.abs(np.diag(change))
+        if np.min(sizes) <= 1e-12 * np.max(sizes):
+            raise StructureError(f"the observability matrix without its last block row has rank below {n}: the order "
+                                 "is too large for these data or this number of block rows")
+        basis = np.linalg.inv(change)
+        rows = np.asarray(np.linalg.qr(np.hstack([up @ basis, down @ basis]), mode="r"))
+        return cls(rows[:, :n], rows[:, n:], change @ free @ basis, basis, change, float(np.linalg.norm(down)))
+
+    def inner(self, a: Array) -> Array:
+        """Take A from x to z."""
+        return self.change @ a @ self.basis
+
+    def recover(self, values: Mapping[str, Array]) -> Array:
+        """Return A in x from A, or from P and Q = A P, in z."""
+        a = values["A"] if "A" in values else np.linalg.solve(np.asarray(values["P"]), np.asarray(values["Q"]).T).T
+        return self.basis @ a @ self.change
+
+
+Programmes = tuple[Callable[..., Program], Callable[..., Program], Callable[..., Program]]
+"""The programmes of the step: (step, rules) -> joint, in P and Q = A P, its residual weighted by P; (step, P, A, rules)
+-> refined, in A alone from a start, its residual unweighted; (step, A, rules) -> centred, the largest margin of P."""
+
+Shifting = Generator[Program, Solution, Shift]
+
+
+def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: Programmes) -> Shifting:
+    """Solve ``min ‖up A - down‖`` with the poles where the rules want them; use as ``shift = yield from ...``.
+
+    No programme is posed where the least-squares solution obeys every rule already: the weighted fit would contract
+    poles that need no help.
+
+    Args:
+        up: (r, n) observability matrix without its last block row.
+        down: (r, n) the same without its first.
+        rules: constraints about the poles; a builder of another kind is always imposed.
+        programmes: of the step.
+
+    Returns:
+        The solution; with ``a`` None where the regions are empty together or the back end failed. The last programme
+        posed is then the one to explain.
+
+    Raises:
+        StructureError: shapes that do not fit, or a rule that does not apply to a matrix A.
+    """
+    if up.ndim != 2 or up.shape != down.shape or up.shape[0] < up.shape[1]:
+        raise StructureError(f"the shift step needs two matrices of one shape with at least as many rows as states; "
+                             f"got {up.shape} and {down.shape}")
+    free = np.linalg.lstsq(up, down, rcond=None)[0]
+    bound = float(np.linalg.norm(up @ free - down))
+    verified = all(getattr(rule, "verify", None) is not None for rule in rules)
+    if not _disobeyed(free, rules) and verified:
+        return Shift(free, bound, bound, free, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
+    if len(free) > LARGEST and verified and (blocks := _pole_blocks(free, rules)) is not None:
+        return (yield from _deflated(up, down, free, blocks, rules, programmes))
+    step, (joint, refined, centred) = ShiftStep.of(up, down, free), programmes
+    solution = yield joint(step, rules)
+    if not solution.has_point or not _definite(solution.values["P"]):
+        status = solution.status  # a singular P is no point
+        status = Status.FAILED if status in (Status.OPTIMAL, Status.LOCAL) else status
+        return Shift(None, float("nan"), bound, free, True, status, solution.reason or solution.claimed)
+    p, a = solution.values["P"], step.recover(solution.values)
+    best, status, reason = float(np.linalg.norm(up @ a - down)), solution.status, solution.reason
+    for last in [False] * (ROUNDS - 1) + [True]:
+        solution = yield refined(step, p, a, rules)
+        if not solution.has_point:
+            break
+        trial = step.recover(solution.values)
+        residual, fall = float(np.linalg.norm(up @ trial - down)), 0.0
+        if residual < best and not set(_disobeyed(trial, rules)) - set(_disobeyed(a, rules)):
+            fall, a, best = best - residual, trial, residual
+            status, reason = solution.status, solution.reason
+        if last or fall <= ENOUGH * (best - bound) or best - bound <= TINY * step.size:
+            break
+        solution = yield centred(step, a, rules)
+        if not solution.has_point or not _definite(solution.values["P"]):
+            break
+        p = solution.values["P"]
+    return _judged((best, a, p), bound, free, status, reason, rules, step.size)
+
+
+def _pole_blocks(free: Array, rules: Sequence[Any]) -> tuple[Array, Array, list[int]] | None:
+    """Return the real Schur form of A, its basis, and the ends of its blocks: poles that obey, then some at a time.
+
+    None where the rules speak of the poles together: none of them disobeys by itself.
+    """
+    from scipy.linalg import schur
+
+    def obeys(re: float, im: float) -> bool:
+        return not _disobeyed(np.array([[re, im], [-im, re]]), rules)
+
+    try:
+        found: Any = schur(free, output="real", sort=obeys)
+    except np.linalg.LinAlgError:  # poles too close to be told from each other: all of them are constrained
+        found = (*schur(free, output="real"), 0)
+    triangle, basis, kept = found
+    n, ends = len(free), [int(kept)]
+    if ends[0] == n:
+        return None
+    while ends[-1] < n:
+        end = min(ends[-1] + AT_ONCE, n)
+        ends.append(end - (end < n and triangle[end, end - 1] != 0))  # a pair stays together
+    return triangle, basis, ends
+
+
+def _deflated(up: Array, down: Array, free: Array, blocks: tuple[Array, Array, list[int]],
+              rules: Sequence[Any], programmes: Programmes) -> Shifting:
+    """Solve the step block by block of a Schur form: A = Z T Z', T block upper triangular.
+
+    The columns of ``(up A - down) Z`` that belong to a block are ``up_1 X + up_2 S - down_2``, with X free: without the
+    range of up_1, a small step in S.
+    """
+    triangle, basis, ends = blocks
+    up_z, down_z = up @ basis, down @ basis
+    t = np.zeros_like(triangle)
+    t[: ends[0], : ends[0]] = triangle[: ends[0], : ends[0]]
+    statuses, reasons = [], []
+    for first, last in zip(ends, ends[1:]):
+        own, before = slice(first, last), slice(0, first)
+        range_before = np.linalg.qr(up_z[:, before])[0]
+        outside = [part - range_before @ (range_before.T @ part) for part in (up_z[:, own], down_z[:, own])]
+        shift = yield from constrained_shift(outside[0], outside[1], rules, programmes)
+        if shift.a is None:
+            return replace(shift, bound=float(np.linalg.norm(up @ free - down)), least_squares=free)
+        t[own, own] = shift.a
+        t[before, own] = np.linalg.lstsq(up_z[:, before], down_z[:, own] - up_z[:, own] @ shift.a, rcond=None)[0]
+        statuses.append(shift.status)
+        reasons.append(shift.reason)
+    a, bound = basis @ t @ basis.T, float(np.linalg.norm(up @ free - down))
+    worst = next(((s, r) for s, r in zip(statuses, reasons) if s not in (Status.OPTIMAL, Status.LOCAL)),
+                 (Status.LOCAL, ""))
+    return _judged((float(np.linalg.norm(up @ a - down)), a, None), bound, free, *worst, rules,
+                   float(np.linalg.norm(down)))
+
+
+def _judged(best: tuple[float, Array, Array | None], bound: float, free: Array, status: Status,
+            reason: str, rules: Sequence[Any], size: float) -> Shift:
+    residual, a, p = best
+    excess = residual - bound
+    said = f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"
+    outside = _disobeyed(a, rules)
+    if outside:
+        status, reason = Status.INACCURATE, "; ".join(outside)
+    if status in (Status.OPTIMAL, Status.LOCAL):
+        status, reason = (Status.OPTIMAL if excess <= TINY * size else Status.LOCAL), said
+    else:
+        reason = f"{said}; {reason}" if reason else said
+    return Shift(a, residual, bound, free, True, status, reason, p)
+
+
+def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:
+    model = SimpleNamespace(poles=np.linalg.eigvals(a))
+    checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
+    return [sentence for check in checks if (sentence := check(model))]
+
+
+def _definite(p: Array) -> bool:
+    return bool(np.all(np.isfinite(p))) and float(np.min(np.linalg.eigvalsh((p + p.T) / 2))) > DEFINITE / 10
