@@ -1,4 +1,4 @@
-"""Formulations and named constraints by name: entry points, so that a third party's are on equal footing."""
+"""Formulations, constraints and renderers by name: entry points, so that a third party's are on equal footing."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -11,7 +11,9 @@ from optid.errors import LookupFailed, StructureError, nearest
 FORMULATIONS = "optid.formulations"
 CONSTRAINTS = "optid.constraints"
 FAULTS = "optid.fault_formulations"
-_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults"}
+RENDERERS = "optid.renderers"
+_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults",
+          RENDERERS: "renderer"}
 
 
 @cache
@@ -50,6 +52,17 @@ def fault_formulation(name: str) -> Callable[..., Any]:
         LookupFailed: no such name; the message has the nearest one.
     """
     return entry_point(FAULTS, name).load()
+
+
+def render(result: Any, form: str = "text") -> Any:
+    """Return a result in a form, such as "text", by the renderer registered as "<class name>.<form>".
+
+    Results are data: they know no table and no figure, and import nothing that draws or prints them.
+
+    Raises:
+        LookupFailed: no such renderer; the message has the nearest name.
+    """
+    return entry_point(RENDERERS, f"{type(result).__name__}.{form}").load()(result)
 
 
 def named_constraint(text: str) -> Any:

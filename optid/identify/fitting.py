@@ -18,7 +18,7 @@ from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
-from optid.registry import check_arguments, defaults, formulation, named_constraint
+from optid.registry import check_arguments, defaults, formulation, named_constraint, render
 from optid.solving.solve import Outcome, Procedure, run
 
 
@@ -117,9 +117,7 @@ class Fit:
         return uncertainty(self)
 
     def __str__(self) -> str:
-        from optid.show.printing import describe
-
-        return describe(self)
+        return render(self)
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text("Fit(...)" if cycle else str(self))

@@ -22,6 +22,7 @@ from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.coefficients import checked_horizon
 from optid.models.functions import has_feedback, static_functions
+from optid.registry import render
 
 LAGS = 25
 
@@ -91,10 +92,7 @@ class Validation:
         return {word: table for word, table in named.items() if table}
 
     def __str__(self) -> str:
-        """Return the tables of errors and tests, 80 columns wide."""
-        from optid.show.printing import describe_checks
-
-        return describe_checks(self)
+        return render(self)
 
 
 def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon: int = 1) -> Validation:

@@ -14,6 +14,7 @@ from optid.identify.validation.checks import Validation, validate
 from optid.identify.validation.horizons import HorizonCurve, fit_by_horizon
 from optid.identify.validation.measures import fit_percent
 from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, simulated
+from optid.registry import render
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +57,7 @@ class Comparison:
         return self.names[int(np.nanargmax(means))]
 
     def __str__(self) -> str:
-        """Return the table, 80 columns wide."""
-        from optid.show.comparing import describe_comparison
-
-        return describe_comparison(self)
+        return render(self)
 
 
 def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizon: int = 1, x0: Any = "fit"

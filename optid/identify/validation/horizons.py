@@ -12,6 +12,7 @@ from optid.errors import DataError
 from optid.identify.validation.measures import fit_percent
 from optid.identify.validation.predictions import one_step, simulated
 from optid.models.coefficients import checked_horizon
+from optid.registry import render
 
 HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 """Samples ahead at which the fit is evaluated, as far as the record reaches."""
@@ -34,10 +35,7 @@ class HorizonCurve:
     simulation: Array
 
     def __str__(self) -> str:
-        from optid.show.checks import horizon_table
-        from optid.show.printing import set_table
-
-        return "\n".join(set_table(horizon_table(self)))
+        return render(self)
 
 
 def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None) -> HorizonCurve:
