@@ -6,7 +6,16 @@ from problems import BASIS, record
 import optid
 from formulations.constraints import pole_regions, responses, shape
 from optid.errors import LookupFailed, StructureError
-from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, RENDERERS, check_arguments, formulation, named_constraint, registered
+from optid.registry import (
+    CONSTRAINTS,
+    FAULTS,
+    FORMULATIONS,
+    RENDERERS,
+    check_arguments,
+    formulation,
+    named_constraint,
+    registered,
+)
 
 
 def test_every_entry_point_loads_and_is_callable():
