@@ -9,9 +9,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError
-from optid.identify.validation.measures import fit_percent
+from optid.identify.validation.measures import common_fits
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.coefficients import checked_horizon
 from optid.registry import render
 
 HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
@@ -48,19 +47,18 @@ def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None
 
     Raises:
         DataError: other channels or another sampling time than the model's, or nothing that can be predicted.
-        StructureError: a horizon that is not a whole number from 1.
+        StructureError: a horizon that is not a positive integer.
     """
     raw = data.raw()
     longest = max(e.n_samples for e in raw.experiments)
     chosen = [h for h in HORIZONS if h <= max(1, longest // 4)] if horizons is None else list(horizons)
-    ahead = [np.vstack(one_step(model, raw, checked_horizon(h))) for h in chosen]
-    y = np.vstack([e.y for e in raw.experiments])
-    predicted = ~np.any([np.isnan(yhat) for yhat in ahead], axis=0)
-    y = np.where(predicted, y, np.nan)
-    if np.isnan(y).all():
-        raise DataError(f"no sample can be predicted {max(chosen)} samples ahead; use shorter horizons")
+    ahead = [one_step(model, raw, h) for h in chosen]
+    for h, arrays in zip(chosen, ahead):
+        if np.isnan(np.vstack(arrays)).all():
+            raise DataError(f"no sample can be predicted {h} samples ahead; use shorter horizons")
     try:
-        free = fit_percent(y, np.vstack(simulated(model, raw)))
+        free = simulated(model, raw)
     except DataError:
-        free = np.full(raw.l, np.nan)
-    return HorizonCurve(raw.outputs, tuple(chosen), np.array([fit_percent(y, yhat) for yhat in ahead]), free)
+        free = [np.full(e.y.shape, np.nan) for e in raw.experiments]
+    fits = common_fits(raw, [*ahead, free])
+    return HorizonCurve(raw.outputs, tuple(chosen), fits[:-1], fits[-1])

@@ -73,15 +73,16 @@ def fit_percent(y: Array, predicted: Array) -> Array:
     return fits
 
 
-def measured(data: Data, predicted: Sequence[Array]) -> dict[str, Measures]:
-    """Compare every output over all experiments with its prediction, one (N, l) per experiment."""
-    y, yhat = np.vstack([e.y for e in data.experiments]), np.vstack(list(predicted))
-    return {name: Measures.of(y[:, o], yhat[:, o]) for o, name in enumerate(data.outputs)}
+def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
+    """Return the fits in % of several predictions of a record, (k, l), over the samples that all of them predict.
 
-
-def measured_each(data: Data, predicted: Sequence[Array]) -> dict[str, tuple[Measures, ...]]:
-    """Compare every output with its prediction, experiment by experiment."""
-    return {
-        name: tuple(Measures.of(e.y[:, o], yhat[:, o]) for e, yhat in zip(data.experiments, predicted))
-        for o, name in enumerate(data.outputs)
-    }
+    Args:
+        data: the record.
+        several: predicted outputs, one (N, l) per experiment each. One that predicts nothing does not count for the
+            others; its fit is NaN.
+    """
+    y = np.vstack([e.y for e in data.experiments])
+    stacked = [np.vstack(list(arrays)) for arrays in several]
+    lost = [np.isnan(predicted) for predicted in stacked if not np.isnan(predicted).all()]
+    y = np.where(np.any(lost, axis=0), np.nan, y) if lost else y
+    return np.array([fit_percent(y, predicted) for predicted in stacked])

@@ -20,8 +20,12 @@ def predictors(model: Any) -> tuple[str, ...]:
 
 
 def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
-    """Return the predictions (N, l) of every experiment, so many steps ahead; NaN where there is none."""
-    return listed(model.predict(data, horizon))
+    """Return the predictions (N, l) of every experiment, so many steps ahead; NaN where there is none.
+
+    Raises:
+        StructureError: a horizon that is not a positive integer.
+    """
+    return _as_list(model.predict(data, horizon))
 
 
 def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
@@ -36,9 +40,9 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
     Raises:
         DataError: a missing input, or a simulation that leaves the range of the data.
     """
-    return listed((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
+    return _as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
 
 
-def listed(arrays: Any) -> list[Array]:
-    """Return one array per experiment, as a list."""
+def _as_list(arrays: Any) -> list[Array]:
+    """One array per experiment."""
     return list(arrays) if isinstance(arrays, list | tuple) else [arrays]
