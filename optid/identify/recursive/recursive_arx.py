@@ -11,26 +11,26 @@ arithmetic and does not lose symmetry or definiteness in long runs.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.bases import parse
+from optid.bases import from_dict, parse
 from optid.bases.basis import Basis
 from optid.data.channels import channel_units, check_distinct, listed, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, theta_matrices
 from optid.identify.recursive.intake import as_block, prior_factor, row_weights
-from optid.identify.recursive.splitting import block_grams, leading_pair, theta_matrices
-from optid.identify.recursive.trace import Trace
+from optid.identify.recursive.saved_state import SavedState
 from optid.models import HammersteinARX
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
+from optid.statistics.blocks import check_inside
 from optid.statistics.factors import dependent_column
 from optid.statistics.sums import rows_present
 from optid.structures.whitening import invert_triangular
@@ -40,8 +40,11 @@ CHUNK = 4096
 
 SPLITS = ("whitened", "plain")
 
+SETTINGS = ("input_units", "output_units", "dt", "forgetting")
+COUNTS = ("samples", "candidates", "rows", "since_restart")
 
-class RecursiveARX:
+
+class RecursiveARX(SavedState):
     """A Hammerstein-ARX model that is updated as samples arrive.
 
     It is a state: `update` changes it. The estimate is over-parametrised, one matrix Theta_c per input; `model` splits
@@ -60,6 +63,8 @@ class RecursiveARX:
         past_y: (reach, l) the last outputs.
         since_restart: samples since `restart`.
     """
+
+    kind, arrays = "recursion", ("root", "past_u", "past_y")
 
     def __init__(
         self,
@@ -131,10 +136,9 @@ class RecursiveARX:
             DataError: detrended or scaled data.
         """
         _check_raw(data)
-        lo, hi = data.ranges() if isinstance(data, Stream) else _ranges(data)
         bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
         return cls(
-            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, lo, hi)], inputs=data.inputs,
+            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, *data.ranges())], inputs=data.inputs,
             outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings,
         )
 
@@ -206,7 +210,7 @@ class RecursiveARX:
         u, y = as_block(u, layout.inputs, "u", self.samples), as_block(y, layout.outputs, "y", self.samples)
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
-        self._check_inside(u)
+        check_inside(u, layout, "", self.samples)
         weights = row_weights(weights, len(u))
         source, lag = _columns(layout)
         innovations = np.full(y.shape, np.nan)
@@ -231,15 +235,6 @@ class RecursiveARX:
             self.since_restart += count
             self.past_u, self.past_y = past_u[count:], past_y[count:]
         return innovations, traced
-
-    def _check_inside(self, u: Array) -> None:
-        for channel, basis, x in zip(self.layout.inputs, self.layout.bases, u.T):
-            if basis.outside == "error" and basis.n_outside(x):
-                k = next(k for k in range(len(x)) if basis.n_outside(x[k : k + 1]))
-                raise DataError(
-                    f"input {channel!r}, sample {self.samples + k}: {x[k]:g} is outside the interval {basis.interval} "
-                    "of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
-                )
 
     # -- what is known now -------------------------------------------------------------------------------------------
 
@@ -327,29 +322,19 @@ class RecursiveARX:
 
     # -- files -------------------------------------------------------------------------------------------------------
 
-    def save(self, path: str | Path) -> Path:
-        """Write the whole state to an npz file, from which `load` continues bit for bit.
-
-        The file appears complete or not at all.
-        """
-        from optid.identify.recursive.file import save
-
-        return save(self, path)
+    def _head(self) -> dict[str, Any]:
+        layout = self.layout
+        settings = {"na": int(layout.na), "nb": [int(b) for b in layout.nb], "nk": [int(k) for k in layout.nk],
+                    "inputs": layout.inputs, "outputs": layout.outputs, **{key: getattr(self, key) for key in SETTINGS}}
+        return {"settings": settings, "bases": [basis.to_dict() for basis in layout.bases],
+                "counts": {name: getattr(self, name) for name in COUNTS}}
 
     @classmethod
-    def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "RecursiveARX":
-        """Restore a state.
-
-        Args:
-            path: file written by `save`.
-            functions: the functions of UserFunctions bases by name, which a file does not hold.
-
-        Raises:
-            ModelFileError: truncated, of another version, or not a state of a recursion.
-        """
-        from optid.identify.recursive.file import load
-
-        return load(path, functions)
+    def _of_head(cls, head: dict[str, Any], functions: dict[str, Any] | None) -> "RecursiveARX":
+        state = cls(basis=[from_dict(basis, functions) for basis in head["bases"]], **head["settings"])
+        for name in COUNTS:
+            setattr(state, name, int(head["counts"][name]))
+        return state
 
 
 def _each(value: Any, m: int) -> tuple[Any, ...]:
@@ -360,10 +345,6 @@ def _each(value: Any, m: int) -> tuple[Any, ...]:
 def _check_raw(data: Data | Stream) -> None:
     if not data.transform.is_identity:
         raise DataError("The data were detrended or scaled; a recursion works in raw units: use data.raw().")
-
-
-def _ranges(data: Data) -> tuple[list[float], list[float]]:
-    return [c.low for c in data.channels[: data.m]], [c.high for c in data.channels[: data.m]]
 
 
 def _columns(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

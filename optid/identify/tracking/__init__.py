@@ -4,7 +4,6 @@ from optid.lazy import on_first_use
 
 _HOME = {
     "SubspaceTracker": "tracker",
-    "load_tracker": "file",
     "principal_angles": "geometry",
     "projection_loss": "geometry",
     "loss_gradient": "geometry",

@@ -11,9 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-
-FADED = 1e-120
-"""Diagonal entry of R below which nothing is forgotten any further, so that silence does not end as zero over zero."""
+from optid.identify.recursive.kernel import rotate
 
 WEAK = 1e-8
 """Pivot of the Gram matrix of the rows of W that are present, relative to its diagonal, below which they do not
@@ -26,7 +24,7 @@ RENEWED = 1024
 @njit(cache=True, nogil=True, error_model="numpy")
 def track(
     basis: Array, root: Array, sums: Array, counts: NDArray[np.int64], x: Array, forgetting: float, orthonormal: bool,
-    residuals: Array, coordinates: Array,
+    residuals: Array,
 ) -> None:
     """Follow the subspace through one stretch of samples; state arrays change in place.
 
@@ -39,7 +37,6 @@ def track(
         forgetting: in (0, 1].
         orthonormal: whether W is kept orthonormal (OPAST).
         residuals: (T,) out: |x - W y| over the entries present, before the update; NaN where not used.
-        coordinates: (T, r) out: y; NaN where not used.
     """
     n, r = basis.shape
     fade = np.sqrt(forgetting)
@@ -48,8 +45,6 @@ def track(
     for t in range(len(x)):
         counts[0] += 1
         residuals[t] = np.nan
-        for j in range(r):
-            coordinates[t, j] = np.nan
         present = 0
         for i in range(n):
             if not np.isnan(x[t, i]):
@@ -76,24 +71,12 @@ def track(
                 energy += e[i] * e[i]
         residuals[t] = np.sqrt(energy)
         for j in range(r):
-            coordinates[t, j] = y[j]
             row[j] = y[j]
         counts[1] += 1
         sums[0] = forgetting * sums[0] + 1.0
         share = (present - r) / (n - r) if n > r else 1.0
         sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else sums[1] / max(sums[0] - 1.0, 1.0))
-        for i in range(r):
-            old = (fade if root[i, i] > FADED else 1.0) * root[i, i]
-            diagonal = np.sqrt(old * old + row[i] * row[i])
-            factor = old / root[i, i] if root[i, i] > 0.0 else 1.0
-            if diagonal == 0.0:
-                continue
-            cosine, sine = old / diagonal, row[i] / diagonal
-            root[i, i] = diagonal
-            for j in range(i + 1, r):
-                above = factor * root[i, j]
-                root[i, j] = cosine * above + sine * row[j]
-                row[j] = cosine * row[j] - sine * above
+        rotate(root, row, 0, r, fade)
         _gain(root, y, g)
         size = 0.0
         for j in range(r):
