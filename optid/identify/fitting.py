@@ -13,7 +13,7 @@ from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
-from optid.identify.record_checks import examine, examine_instruments, examine_residuals, examine_rows
+from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
@@ -216,10 +216,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     if statistics is not None:
         figures |= {"rows": statistics.rows, "candidates": statistics.candidates, "condition": statistics.condition,
                     "method": statistics.method}
-        findings = findings + examine_rows(statistics.rows, statistics.candidates, statistics.condition)
-    if "condition of R11" in figures:
-        findings = findings + examine_instruments(figures["condition of R11"])
-    findings = findings + examine_residuals(figures)
+    findings = findings + examine_figures(figures)
     return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),
