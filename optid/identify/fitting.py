@@ -69,7 +69,7 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        from optid.identify.validation import fit_percent
+        from optid.identify.validation.measures import common_fits
         from optid.identify.validation.predictions import one_step
 
         if hasattr(self.program.compressed, "one_step_fit"):
@@ -77,7 +77,7 @@ class Fit:
         if isinstance(self.data, Stream):
             return np.full(len(self.data.outputs), np.nan)
         raw = self.data.raw()
-        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(one_step(self.model, raw)))
+        return common_fits(raw, [one_step(self.model, raw)])[0]
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
@@ -97,17 +97,16 @@ class Fit:
         return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
 
     def _simulated_fit(self, word: str) -> np.ndarray:
-        from optid.identify.validation import fit_percent
+        from optid.identify.validation.measures import common_fits
         from optid.identify.validation.predictions import simulated
 
-        if isinstance(self.data, Stream) or any(self.data.missing[name] for name in self.data.inputs):
-            return np.full(len(self.data.outputs), np.nan)
-        raw = self.data.raw()
-        try:
-            outputs = simulated(self.model, raw, word)
-        except DataError:  # it leaves the range of the data
-            return np.full(len(self.data.outputs), np.nan)
-        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(outputs))
+        if not isinstance(self.data, Stream) and not any(self.data.missing[name] for name in self.data.inputs):
+            raw = self.data.raw()
+            try:
+                return common_fits(raw, [simulated(self.model, raw, word)])[0]
+            except DataError:  # it leaves the range of the data
+                pass
+        return np.full(len(self.data.outputs), np.nan)
 
     @cached_property
     def uncertainty(self) -> Any:
@@ -201,9 +200,9 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
               started: float) -> Fit:
     built_at = time.perf_counter()
     outcome = run(problem, solver, **settings)
-    outcome = replace(outcome, solution=replace(
-        outcome.solution, times=replace(outcome.solution.times,
-                                        build=outcome.solution.times.build + built_at - started)))
+    times = outcome.solution.times
+    times = replace(times, build=times.build + built_at - started)
+    outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
     model = outcome.model
@@ -211,11 +210,9 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     transform = getattr(data, "transform", None)
     if model is not None and transform is not None and not transform.is_identity:
         model = model.with_transform(transform)
-    statistics = getattr(outcome.program.compressed, "statistics", None)
-    figures = dict(outcome.figures)
+    statistics, figures = getattr(outcome.program.compressed, "statistics", None), dict(outcome.figures)
     if statistics is not None:
-        figures |= {"rows": statistics.rows, "candidates": statistics.candidates, "condition": statistics.condition,
-                    "method": statistics.method}
+        figures |= {key: getattr(statistics, key) for key in ("rows", "candidates", "condition", "method")}
     findings = findings + examine_figures(figures)
     return Fit(model=model, solution=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
