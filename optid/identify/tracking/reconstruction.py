@@ -7,14 +7,14 @@ eigenvectors of N^T C N leave, bounded by the interlacing of eigenvalues (Cauchy
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from optid.arrays import Array
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.tracking.geometry import as_basis, as_covariance, check_dimension, orthonormal
+from optid.identify.tracking.geometry import as_basis, as_covariance, check_dimension, check_indices, orthonormal
 
 INSIDE = 1e-8
 
@@ -58,11 +58,9 @@ class Reconstruction:
 
 def optimal_reconstruction(covariance: ArrayLike, r: int) -> Reconstruction:
     """Project on the r dominant eigenvectors of a covariance (n, n): P = U_1 U_1^T."""
-    c = as_covariance(covariance)
-    check_dimension(r, len(c))
-    values, vectors = _descending(c)
-    loss = float(np.sum(values[r:]))
-    return Reconstruction(vectors[:, :r], loss, loss, loss, "optimal")
+    check_dimension(r, len(np.asarray(covariance)))
+    found = suboptimal_reconstruction(covariance, range(r))
+    return replace(found, worst_loss=found.loss, kind="optimal")
 
 
 def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> Reconstruction:
@@ -72,19 +70,15 @@ def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> 
         StructureError: eigenvectors that do not exist or are named twice.
     """
     c = as_covariance(covariance)
-    chosen = [int(i) for i in indices]
-    if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < len(c) for i in chosen):
-        raise StructureError(f"indices={chosen}: distinct eigenvectors from 0 to {len(c) - 1} are needed.")
+    chosen = check_indices(indices, len(c), "indices")
     values, vectors = _descending(c)
-    r = len(chosen)
-    loss = float(np.sum(np.delete(values, chosen)))
-    worst = float(np.sum(values[: len(c) - r]))
-    return Reconstruction(vectors[:, chosen], loss, float(np.sum(values[r:])), worst, "sub-optimal")
+    return Reconstruction(vectors[:, chosen], float(np.sum(np.delete(values, chosen))),
+                          float(np.sum(values[len(chosen) :])), float(np.sum(values[: len(c) - len(chosen)])),
+                          "sub-optimal")
 
 
-def constrained_reconstruction(
-    covariance: ArrayLike, r: int, *, within: ArrayLike | None = None, containing: ArrayLike | None = None
-) -> Reconstruction:
+def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLike | None = None,
+                               containing: ArrayLike | None = None) -> Reconstruction:
     """Find the best projector of rank r whose range lies within a subspace and contains another.
 
     Args:
@@ -110,17 +104,12 @@ def constrained_reconstruction(
             raise StructureError(f"r={r}: {kept.shape[1]} directions are to be kept.")
         if np.linalg.norm(kept - space @ (space.T @ kept)) > INSIDE:
             raise StructureError("containing: a direction that must be kept is not among the surviving ones.")
-    rest = space
-    if kept.shape[1]:
-        inner = np.linalg.svd(space.T @ kept, full_matrices=True)[0][:, kept.shape[1] :]
-        rest = space @ inner
-    _, vectors = _descending(rest.T @ c @ rest) if rest.shape[1] else (None, np.zeros((0, 0)))
-    basis = np.hstack([kept, rest @ vectors[:, : r - kept.shape[1]]])
+    rest = space @ np.linalg.svd(space.T @ kept, full_matrices=True)[0][:, kept.shape[1] :]
+    basis = np.hstack([kept, rest @ _descending(rest.T @ c @ rest)[1][:, : r - kept.shape[1]]])
     values = _descending(c)[0]
-    lost, free = len(c) - space.shape[1], r - kept.shape[1]
     # interlacing: the i-th eigenvalue in a subspace of codimension d is at least the (i + d)-th of C
-    first = lost + kept.shape[1]
-    held = float(np.sum(values[first : first + free])) + float(np.sum(values[len(c) - kept.shape[1] :]))
+    lost, free = len(c) - space.shape[1] + kept.shape[1], r - kept.shape[1]
+    held = float(np.sum(values[lost : lost + free])) + float(np.sum(values[len(c) - kept.shape[1] :]))
     loss = float(np.trace(c) - np.trace(basis.T @ c @ basis))
     return Reconstruction(basis, loss, float(np.sum(values[r:])), float(np.sum(values)) - held, "constrained")
 
@@ -131,10 +120,10 @@ def surviving(n: int, lost: Sequence[int]) -> Array:
     Raises:
         StructureError: coordinates that do not exist, or none left.
     """
-    gone = {int(i) for i in lost}
+    gone = sorted({int(i) for i in lost})
     if not all(0 <= i < n for i in gone) or len(gone) >= n:
-        raise StructureError(f"lost={sorted(gone)}: coordinates from 0 to {n - 1}, not all of them, are needed.")
-    return np.delete(np.eye(n), sorted(gone), axis=1)
+        raise StructureError(f"lost={gone}: coordinates from 0 to {n - 1}, not all of them, are needed.")
+    return np.delete(np.eye(n), gone, axis=1)
 
 
 def oblique_projector(onto: ArrayLike, along: ArrayLike | None = None, *, noise: ArrayLike | None = None) -> Array:
@@ -150,17 +139,14 @@ def oblique_projector(onto: ArrayLike, along: ArrayLike | None = None, *, noise:
         StructureError: both `along` and `noise`, or S and G of different shape.
         RankError: a singular G^T S, S meets the null space of G^T, or a singular covariance.
     """
-    s = np.asarray(onto, dtype=float)
-    s = as_basis(s, len(s), "onto")
+    s = as_basis(onto, len(np.asarray(onto)), "onto")
     orthonormal(s, "onto")
     if along is not None and noise is not None:
         raise StructureError("along and noise both choose the direction of the projection: give one of them.")
-    g = s
-    if along is not None:
-        g = as_basis(along, len(s), "along")
-        if g.shape != s.shape:
-            raise StructureError(f"onto has shape {s.shape} and along {g.shape}: they must agree.")
-    elif noise is not None:
+    g = s if along is None else as_basis(along, len(s), "along")
+    if g.shape != s.shape:
+        raise StructureError(f"onto has shape {s.shape} and along {g.shape}: they must agree.")
+    if noise is not None:
         c = as_covariance(noise)
         if len(c) != len(s):
             raise StructureError(f"onto has {len(s)} rows and the covariance {len(c)}: they must agree.")
@@ -207,9 +193,8 @@ def filled(x: ArrayLike, basis: ArrayLike | None = None, *, covariance: ArrayLik
     return rows.reshape(samples.shape)
 
 
-def _from_present(
-    pattern: NDArray[np.bool_], basis: ArrayLike | None, covariance: ArrayLike | None, sample: int
-) -> Array:
+def _from_present(pattern: NDArray[np.bool_], basis: ArrayLike | None, covariance: ArrayLike | None, sample: int
+                  ) -> Array:
     """Weights (present, missing) for one pattern of missing entries."""
     present = ~pattern
     if covariance is not None:
