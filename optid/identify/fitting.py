@@ -69,8 +69,7 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        from optid.identify.validation.measures import common_fits
-        from optid.identify.validation.predictions import one_step
+        from optid.identify.validation.predictions import common_fits, one_step
 
         if hasattr(self.program.compressed, "one_step_fit"):
             return self.program.compressed.one_step_fit(self.solution.values)
@@ -97,8 +96,7 @@ class Fit:
         return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
 
     def _simulated_fit(self, word: str) -> np.ndarray:
-        from optid.identify.validation.measures import common_fits
-        from optid.identify.validation.predictions import simulated
+        from optid.identify.validation.predictions import common_fits, simulated
 
         if not isinstance(self.data, Stream) and not any(self.data.missing[name] for name in self.data.inputs):
             raw = self.data.raw()

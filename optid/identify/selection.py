@@ -9,8 +9,7 @@ import numpy as np
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.fitting import Fit, fit, resolve
-from optid.identify.validation.measures import common_fits
-from optid.identify.validation.predictions import one_step
+from optid.identify.validation.predictions import common_fits, one_step
 
 PENALTIES = ("ridge", "curvature", "weight")
 GRID = 13

@@ -17,8 +17,15 @@ from optid.identify.validation.correlations import (
     between_outputs,
     cross_correlation,
 )
-from optid.identify.validation.measures import Measures
-from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, predictors, simulated
+from optid.identify.validation.predictions import (
+    MEASURED,
+    ONE_STEP,
+    SIMULATION,
+    Measures,
+    one_step,
+    predictors,
+    simulated,
+)
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.coefficients import checked_horizon
 from optid.models.functions import has_feedback, static_functions

@@ -11,9 +11,14 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataWarning, StructureError
 from optid.identify.validation.checks import Validation, validate
-from optid.identify.validation.horizons import HorizonCurve, fit_by_horizon
-from optid.identify.validation.measures import common_fits
-from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION
+from optid.identify.validation.predictions import (
+    MEASURED,
+    ONE_STEP,
+    SIMULATION,
+    HorizonCurve,
+    common_fits,
+    fit_by_horizon,
+)
 from optid.registry import render
 
 

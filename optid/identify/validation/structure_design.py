@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import interpolated
-from optid.identify.validation.families import Family
-from optid.identify.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
+from optid.identify.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
 
 DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
