@@ -79,7 +79,8 @@ class Measures:
         """Compare y (N,) with predicted (N,); NaN in either leaves the sample out."""
         here = ~(np.isnan(y) | np.isnan(predicted))
         if not here.any():
-            return cls(*[float("nan")] * 6, 0)
+            nan = float("nan")
+            return cls(nan, nan, nan, nan, nan, nan, 0)
         y, error = y[here], (y - predicted)[here]
         e_n = float(np.mean(error**2))
         snr = float(np.mean(y**2)) / e_n if e_n > 0 else float("inf")
