@@ -41,7 +41,7 @@ def track(
     n, r = basis.shape
     fade = np.sqrt(forgetting)
     y, row, g, e = np.empty(r), np.empty(r), np.empty(r), np.empty(n)
-    gram = np.empty((r, r))
+    factor = np.empty((r, r))
     for t in range(len(x)):
         counts[0] += 1
         residuals[t] = np.nan
@@ -58,7 +58,7 @@ def track(
                 if not np.isnan(x[t, i]):
                     y[j] += basis[i, j] * x[t, i]
         if present < n:
-            if present < r or not _solved(basis, x[t], gram, y):
+            if present < r or not _solved(basis, x[t], factor, y):
                 counts[2] += 1
                 continue
         energy = 0.0
@@ -102,7 +102,7 @@ def track(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gain(root: Array, y: Array, g: Array) -> None:
-    """Solve R^T R g = y."""
+    """Solve R^T R g = y; g may be y."""
     r = len(y)
     for i in range(r):
         total = y[i]
@@ -117,36 +117,25 @@ def _gain(root: Array, y: Array, g: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solved(basis: Array, x: Array, gram: Array, y: Array) -> bool:
+def _solved(basis: Array, x: Array, factor: Array, y: Array) -> bool:
     """Replace y = W_p^T x_p by the least-squares coordinates (W_p^T W_p)^-1 y of the rows p present, if they exist."""
     n, r = basis.shape
-    for a in range(r):
-        for b in range(a + 1):
+    for a in range(r):  # Cholesky, upper
+        for b in range(a, r):
             total = 0.0
             for i in range(n):
                 if not np.isnan(x[i]):
                     total += basis[i, a] * basis[i, b]
-            gram[a, b] = total
-    for a in range(r):  # Cholesky, lower
-        whole = gram[a, a]
-        for b in range(a + 1):
-            total = gram[a, b]
-            for c in range(b):
-                total -= gram[a, c] * gram[b, c]
-            if a == b:
-                if not total > WEAK * max(whole, WEAK):
-                    return False
-                gram[a, a] = np.sqrt(total)
+            least = WEAK * max(total, WEAK)
+            for c in range(a):
+                total -= factor[c, a] * factor[c, b]
+            if b > a:
+                factor[a, b] = total / factor[a, a]
+            elif total > least:
+                factor[a, a] = np.sqrt(total)
             else:
-                gram[a, b] = total / gram[b, b]
-    for a in range(r):
-        for c in range(a):
-            y[a] -= gram[a, c] * y[c]
-        y[a] /= gram[a, a]
-    for a in range(r - 1, -1, -1):
-        for c in range(a + 1, r):
-            y[a] -= gram[c, a] * y[c]
-        y[a] /= gram[a, a]
+                return False
+    _gain(factor, y, y)
     return True
 
 
