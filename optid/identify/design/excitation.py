@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid import signals
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.identify.design.expansion import Bases, FeedbackBases
@@ -154,8 +154,8 @@ def _check(kind: str, band: Any, shaped: bool, candidates: int, rows: int, level
     if shaped and kind not in ("multisine", "chirp"):
         raise StructureError(f"shaping changes the spectrum of a multisine or the envelope of a chirp, not {kind!r}.")
     for name, value, least in (("candidates", candidates, 1), ("rows", rows, 1), ("levels", levels, 2)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least):
-            raise StructureError(f"{name} = {value!r}: a whole number, at least {least}, is needed.")
+        if value is not None:
+            check_integer(value, name, least)
 
 
 def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
-from optid.errors import DataError, StructureError
+from optid.errors import DataError
 
 SILENT = 1e-4
 """Input power, relative to its largest over frequency, below which nothing is read off."""
@@ -67,9 +67,7 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
         DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
     """
     longest = max(e.n_samples for e in data.experiments)
-    size = max(32, longest // max(4, data.m + 1)) if segment is None else segment
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 8:
-        raise StructureError(f"segment = {segment!r}: a whole number of samples, at least 8, is needed.")
+    size = max(32, longest // max(4, data.m + 1)) if segment is None else check_integer(segment, "segment", 8)
     window = np.hanning(size + 1)[:-1]
     m, l = data.m, data.l  # noqa: E741 - the field's letter
     sums, count = np.zeros((size // 2 + 1, m + l, m + l), dtype=complex), 0

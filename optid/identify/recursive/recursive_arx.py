@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases import from_dict, parse
 from optid.bases.basis import Basis
 from optid.data.channels import channel_units, check_distinct, listed, sampling_time
@@ -67,20 +67,10 @@ class RecursiveARX(SavedState):
     kind, arrays = "recursion", ("root", "past_u", "past_y")
 
     def __init__(
-        self,
-        *,
-        na: int,
-        nb: int | Sequence[int],
-        basis: Basis | str | Sequence[Basis | str],
-        nk: int | Sequence[int] = 0,
-        inputs: str | Sequence[str] = "u",
-        outputs: str | Sequence[str] = "y",
-        dt: float = 1.0,
-        forgetting: float = 1.0,
-        theta0: ArrayLike = 0.0,
-        P0: ArrayLike = np.inf,
-        input_units: str | Sequence[str] | None = None,
-        output_units: str | Sequence[str] | None = None,
+        self, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+        nk: int | Sequence[int] = 0, inputs: str | Sequence[str] = "u", outputs: str | Sequence[str] = "y",
+        dt: float = 1.0, forgetting: float = 1.0, theta0: ArrayLike = 0.0, P0: ArrayLike = np.inf,
+        input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
     ) -> None:
         """Start from what is known before the first sample.
 
@@ -171,10 +161,8 @@ class RecursiveARX(SavedState):
             every: the estimate is recorded after every so many samples, counted from the first one seen.
             weights: as in `update`.
         """
-        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-            raise StructureError(f"every={every!r}: record after every so many samples, a whole number from 1.")
-        first = self.samples
-        innovations, theta = self._absorb(u, y, weights, int(every))
+        first, every = self.samples, check_integer(every, "every")
+        innovations, theta = self._absorb(u, y, weights, every)
         after = np.arange(first + 1, self.samples + 1)
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
@@ -214,9 +202,8 @@ class RecursiveARX(SavedState):
         weights = row_weights(weights, len(u))
         source, lag = _columns(layout)
         innovations = np.full(y.shape, np.nan)
-        marks = np.zeros(len(u), bool)
-        if every:
-            marks[(np.arange(self.samples, self.samples + len(u)) + 1) % every == 0] = True
+        after = np.arange(self.samples + 1, self.samples + len(u) + 1)
+        marks = after % every == 0 if every else np.zeros(len(u), bool)
         traced, recorded = np.empty((int(marks.sum()), layout.n_columns, layout.l)), 0
         for start in range(0, len(u), CHUNK):
             part = slice(start, start + CHUNK)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
-from optid.identify.tracking.geometry import as_basis, as_covariance, check_dimension, orthonormal
+from optid.identify.tracking.geometry import as_basis, as_covariance, orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def fantope_certificate(
     if gone and not 0 <= gone[0] <= gone[-1] < len(c):
         raise StructureError(f"lost={list(lost)}: coordinates from 0 to {len(c) - 1} are needed.")
     kept = [i for i in range(len(c)) if i not in gone]
-    check_dimension(w.shape[1], len(kept))
+    check_integer(w.shape[1], "r", high=len(kept))
     if gone and float(np.abs(w[list(gone)]).max()) > 1e-8:
         raise DataError(f"the basis uses the lost coordinates {list(gone)}: restrict it to the surviving ones first.")
     r, values = w.shape[1], np.linalg.eigvalsh(c[np.ix_(kept, kept)])[::-1]

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
 
 SYMMETRIC = 1e-8
@@ -186,17 +186,11 @@ def stationary_points(covariance: ArrayLike, r: int, among: Sequence[int] | None
     c = as_covariance(covariance)
     vectors = np.linalg.eigh(c)[1][:, ::-1]
     pool = check_indices(range(len(c)) if among is None else among, len(c), "among")
-    check_dimension(r, len(pool))
+    check_integer(r, "r", high=len(pool))
     if comb(len(pool), r) > MANY:
         raise StructureError(f"{comb(len(pool), r)} invariant subspaces: give fewer eigenvectors in `among`.")
     found = [stationary_point(c, vectors[:, list(chosen)], chosen) for chosen in combinations(pool, r)]
     return sorted(found, key=lambda point: point.loss)
-
-
-def check_dimension(r: int, n: int) -> None:
-    """Refuse a dimension that is not an integer from 1 to n."""
-    if isinstance(r, bool) or not isinstance(r, int | np.integer) or not 1 <= r <= n:
-        raise StructureError(f"r={r!r} must be an integer from 1 to {n}.")
 
 
 def check_indices(indices: Sequence[int], n: int, what: str) -> list[int]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.tracking.geometry import as_basis, as_covariance, check_dimension, check_indices, orthonormal
+from optid.identify.tracking.geometry import as_basis, as_covariance, check_indices, orthonormal
 
 INSIDE = 1e-8
 
@@ -58,7 +58,7 @@ class Reconstruction:
 
 def optimal_reconstruction(covariance: ArrayLike, r: int) -> Reconstruction:
     """Project on the r dominant eigenvectors of a covariance (n, n): P = U_1 U_1^T."""
-    check_dimension(r, len(np.asarray(covariance)))
+    check_integer(r, "r", high=len(np.asarray(covariance)))
     found = suboptimal_reconstruction(covariance, range(r))
     return replace(found, worst_loss=found.loss, kind="optimal")
 
@@ -93,7 +93,7 @@ def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLi
         RankError: dependent columns.
     """
     c = as_covariance(covariance)
-    check_dimension(r, len(c))
+    check_integer(r, "r", high=len(c))
     space = np.eye(len(c)) if within is None else orthonormal(as_basis(within, len(c), "within"), "within")
     if space.shape[1] < r:
         raise StructureError(f"r={r}: the surviving directions have dimension {space.shape[1]} only.")

@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
 from optid.identify.recursive.intake import as_block
 from optid.identify.recursive.saved_state import SavedState
-from optid.identify.tracking.geometry import as_basis, check_dimension, orthonormal, principal_angles
+from optid.identify.tracking.geometry import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
@@ -64,9 +64,8 @@ class SubspaceTracker(SavedState):
             StructureError: arguments out of range.
             RankError: a guess with dependent columns.
         """
-        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 2:
-            raise StructureError(f"n={n!r}: a whole number from 2 is needed.")
-        check_dimension(r, int(n) - 1)
+        self.n = check_integer(n, "n", 2)
+        self.r = check_integer(r, "r", high=self.n - 1)
         if method not in METHODS or missing not in MISSING:
             raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
                                  f"{', '.join(MISSING)}.")
@@ -74,7 +73,7 @@ class SubspaceTracker(SavedState):
             raise StructureError(f"forgetting={forgetting!r}: a number above 0, at most 1, is needed.")
         if not (np.isfinite(information) and information > 0):
             raise StructureError(f"information={information!r}: a positive number is needed.")
-        self.n, self.r, self.method, self.forgetting, self.missing = int(n), int(r), method, float(forgetting), missing
+        self.method, self.forgetting, self.missing = method, float(forgetting), missing
         self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
         if len(self.names) != self.n:
             raise StructureError(f"{len(self.names)} names for {self.n} coordinates.")
@@ -94,7 +93,7 @@ class SubspaceTracker(SavedState):
         Raises:
             DataError: another shape, an infinite entry, or a missing one where missing="refuse", by name and sample.
         """
-        from optid.identify.tracking.kernel import track
+        from optid.identify.tracking.kernel import track  # compiled code is loaded with the first sample
 
         block = as_block(x, self.names, "x", int(self.counts[0]))
         lost = np.isnan(block)
@@ -117,8 +116,7 @@ class SubspaceTracker(SavedState):
     @property
     def projector(self) -> Array:
         """Orthogonal projector (n, n) on the tracked subspace."""
-        basis = self.basis
-        return basis @ basis.T
+        return self.basis @ self.basis.T
 
     @property
     def energies(self) -> Array:
@@ -161,12 +159,10 @@ class SubspaceTracker(SavedState):
         return cls(**head["settings"])
 
     def __str__(self) -> str:
-        seen, used, passed = (int(c) for c in self.counts)
-        head = (f"{self.method.upper()}, {self.r} of {self.n} dimensions ({', '.join(self.names)}), forgetting "
-                f"{self.forgetting:g}")
-        if len(head) > 80:
-            head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
+        seen, used, passed = self.counts.tolist()
+        head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
+        named = head.replace(" dimensions", f" dimensions ({', '.join(self.names)})")
         lost = f", {passed} passed over" if passed else ""
         energies = " ".join(f"{v:.4g}" for v in self.energies[:8])
-        return f"{head}\n{seen} samples, {used} used{lost}\nenergies {energies}; noise {self.floor:.4g}; " \
-               f"directions with signal {self.rank}"
+        return (f"{named if len(named) <= 80 else head}\n{seen} samples, {used} used{lost}\n"
+                f"energies {energies}; noise {self.floor:.4g}; directions with signal {self.rank}")
