@@ -103,7 +103,8 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) 
     top = value if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
         kind = "a positive integer" if low == 1 else f"an integer >= {low}"
-        raise StructureError(f"{name}={value!r} must be {kind if high is None else f'an integer from {low} to {high}'}.")
+        kind = kind if high is None else f"an integer from {low} to {high}"
+        raise StructureError(f"{name}={value!r} must be {kind}.")
     return int(value)
 
 

@@ -30,9 +30,7 @@ class Trace:
     @property
     def a(self) -> Array:
         """Coefficients of A over time: (K, na), or (K, na, l, l) for several outputs."""
-        na, l = self.layout.na, self.layout.l  # noqa: E741
-        a = self.theta[:, : na * l].reshape(-1, na, l, l).transpose(0, 1, 3, 2)
-        return a[:, :, 0, 0] if l == 1 else a
+        return past_coefficients(self.theta, self.layout)
 
     def split(self, c: int = 0, beta: float = 1.0) -> tuple[Array, Array, Array]:
         """Split Theta of input c by the plain SVD in the gauge of Algorithm 3.1: mu = beta s_1 u_1, b = v_1 / beta.
@@ -60,13 +58,18 @@ class Trace:
         return mu, b, ratio
 
 
+def past_coefficients(theta: Array, layout: Layout) -> Array:
+    """Return the coefficients of A, (..., na) or (..., na, l, l) for several outputs, from theta (..., n, l)."""
+    na, l = layout.na, layout.l  # noqa: E741
+    a = theta[..., : na * l, :].reshape(*theta.shape[:-2], na, l, l).swapaxes(-1, -2)
+    return a[..., 0, 0] if l == 1 else a
+
+
 def theta_matrices(theta: Array, layout: Layout) -> tuple[Array, ...]:
     """Return Theta_c (P_c, nb_c l) from the coefficients (n, l)."""
-    found = []
-    for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)):
-        block = theta[layout.block(c)].reshape(b, basis.size, layout.l)
-        found.append(block.transpose(1, 2, 0).reshape(basis.size, layout.l * b))
-    return tuple(found)
+    blocks = (theta[layout.block(c)].reshape(b, basis.size, -1)
+              for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)))
+    return tuple(block.transpose(1, 2, 0).reshape(block.shape[1], -1) for block in blocks)
 
 
 def block_grams(root: Array, layout: Layout) -> list[Array]:
@@ -87,10 +90,8 @@ def leading_pair(matrix: Array, gram: Array | None, lags: int, outputs: int) -> 
         lags: nb.
         outputs: l.
     """
-    if gram is None:
-        left, size, right = np.linalg.svd(matrix, full_matrices=False)
-        return size[0] * left[:, 0], right[0]
-    factor_mu, factor_b = whitening.kronecker_factors(gram, (len(matrix), lags))
-    factor_b = np.kron(np.eye(outputs), factor_b)  # every output has the same regressor
-    mu, b = whitening.leading_pair(matrix, factor_mu, factor_b)
-    return np.asarray(mu, dtype=float), np.asarray(b, dtype=float)
+    factor_mu, factor_b = np.eye(len(matrix)), np.eye(lags)
+    if gram is not None:
+        factor_mu, factor_b = whitening.kronecker_factors(gram, (len(matrix), lags))
+    # every output has the same regressor
+    return whitening.leading_pair(matrix, factor_mu, np.kron(np.eye(outputs), factor_b))

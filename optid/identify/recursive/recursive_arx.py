@@ -23,7 +23,7 @@ from optid.data.channels import channel_units, check_distinct, listed, sampling_
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, theta_matrices
+from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, past_coefficients, theta_matrices
 from optid.identify.recursive.intake import as_block, prior_factor, row_weights
 from optid.identify.recursive.saved_state import SavedState
 from optid.models import HammersteinARX
@@ -102,8 +102,7 @@ class RecursiveARX(SavedState):
             if one.interval is None and type(one).__name__ != "Linear":
                 raise StructureError(
                     f"The basis of input {channel!r} has no interval: a recursion does not know the range of the input "
-                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper))."
-                )
+                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper)).")
         if not 0 < forgetting <= 1:
             raise StructureError(f"forgetting={forgetting!r}: a factor above 0 and at most 1, such as 0.995.")
         self.forgetting = float(forgetting)
@@ -174,13 +173,10 @@ class RecursiveARX(SavedState):
         """
         _check_raw(data)
         if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
-            raise DataError(
-                f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
-                f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select."
-            )
-        experiments = [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]
+            raise DataError(f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
+                            f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select.")
         innovations = []
-        for chunks in experiments:
+        for chunks in [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]:
             self.restart()
             innovations.append(np.concatenate([self.update(u, y) for u, y in chunks]))
         return innovations
@@ -259,8 +255,7 @@ class RecursiveARX(SavedState):
         if column is not None:
             raise RankError(
                 f"The {self.rows} rows so far do not determine the coefficient of {self.layout.names()[column]}. Wait "
-                "for samples that excite it, use fewer lags or basis functions, or give a finite P0."
-            )
+                "for samples that excite it, use fewer lags or basis functions, or give a finite P0.")
         return self.root[:n, :n]
 
     @property
@@ -291,9 +286,8 @@ class RecursiveARX(SavedState):
         layout, theta = self.layout, self.theta
         grams = block_grams(self.root, layout) if split == "whitened" else [None] * layout.m
         pairs = [leading_pair(matrix, gram, b, layout.l) for matrix, gram, b in zip(self.matrices, grams, layout.nb)]
-        a = theta[: layout.na * layout.l].reshape(layout.na, layout.l, layout.l).transpose(0, 2, 1)
         return HammersteinARX(
-            a=a[:, 0, 0] if layout.l == 1 else a,
+            a=past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
             nk=layout.nk, offset=theta[layout.offset], dt=self.dt, inputs=layout.inputs, outputs=layout.outputs,
@@ -301,11 +295,10 @@ class RecursiveARX(SavedState):
         ).regauge(gauge)
 
     def __repr__(self) -> str:
-        return (
-            f"RecursiveARX: {', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}, na {self.layout.na}, "
-            f"nb {self.layout.nb}, nk {self.layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
-            f"{self.samples} samples"
-        )
+        layout = self.layout
+        return (f"RecursiveARX: {', '.join(layout.inputs)} -> {', '.join(layout.outputs)}, na {layout.na}, "
+                f"nb {layout.nb}, nk {layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
+                f"{self.samples} samples")
 
     # -- files -------------------------------------------------------------------------------------------------------
 
