@@ -25,8 +25,7 @@ from optid.identify.tangent import Quantity
 from optid.identify.uncertainty import Uncertainty, aligned
 from optid.models import HammersteinARX, simulation
 
-FAILED = 0.1
-"""Share of refits without a point above which the user is told."""
+FAILED = 0.1  # share of refits without a point above which the user is told
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,7 @@ from optid.program.program import Program
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
 
-STEP = 1e-5
-"""Step of the central differences, relative to the size of the parameter."""
-
+STEP = 1e-5  # step of the central differences, relative to the size of the parameter
 MEANINGS = {
     "gaussian": "confidence intervals of least squares, Student's quantile",
     "projected": "confidence intervals under inequalities: hull of projected posterior and basic bootstrap",

@@ -21,18 +21,10 @@ KINDS = ("multisine", "chirp", "noise", "levels")
 TWO_LEVELS = "two levels cannot identify a static nonlinearity: any function is a straight line there"
 REFUSED = {"prbs": TWO_LEVELS, "binary": TWO_LEVELS,
            "sinusoid": "a sinusoid through a polynomial of degree p has p harmonics and excites 2 p + 1 regressors"}
-SWEEPS = 4
-"""Sweeps of a chirp."""
-
-FAINT = 0.05
-"""A frequency belongs to the band when its measured gain is above this share of the largest."""
-
-TRUSTED = 0.5
-"""Coherence below which the measured gain says more of the disturbance than of the plant."""
-
-WANTED, WIDER = 1e4, 1.3
-"""A band that was not asked for grows by this factor until the condition number is no larger."""
-
+SWEEPS = 4  # sweeps of a chirp
+FAINT = 0.05  # a frequency belongs to the band when its measured gain is above this share of the largest
+TRUSTED = 0.5  # coherence below which the measured gain says more of the disturbance than of the plant
+WANTED, WIDER = 1e4, 1.3  # a band that was not asked for grows by this factor until the condition number is no larger
 BOOST = 4.0
 """Shaping raises no frequency by more than this factor over another: what is left of a resonance would drown in dead
 zone and noise."""

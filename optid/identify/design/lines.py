@@ -9,13 +9,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.stretches import runs_of
 
-LONGEST = 4096
-"""Samples looked at; more would tell nothing new about a few lines."""
-
-LOBE = 5
-"""Bins that hold a line: all but a thousandth of it, after a Hann window."""
-
-
+LONGEST = 4096  # samples looked at; more would tell nothing new about a few lines
+LOBE = 5  # bins that hold a line: all but a thousandth of it, after a Hann window
 JOINT, STEPS = 6, 3
 """The first few frequencies are refined together after each new one, so many times; later ones stay where they are."""
 

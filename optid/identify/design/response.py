@@ -8,8 +8,7 @@ from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError
 
-SILENT = 1e-4
-"""Input power, relative to its largest over frequency, below which nothing is read off."""
+SILENT = 1e-4  # input power, relative to its largest over frequency, below which nothing is read off
 
 
 @dataclass(frozen=True, eq=False)

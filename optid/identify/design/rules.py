@@ -18,12 +18,10 @@ from optid.statistics.expansion import LINEAR, NEARLY_LINEAR
 
 Severity = Literal["fine", "warning", "error"]
 
-FEW_LEVELS = 20
-"""Below this many distinct values a curve between them is interpolation, not identification."""
+FEW_LEVELS = 20  # below this many distinct values a curve between them is interpolation, not identification
 HIDDEN, DOMINANT = 1e-3, 1e-2
 """Share of the variance beside a few sinusoids that is noise on a singular record, or a weak excitation."""
-WORST_CONDITION = 1e7
-"""Condition number beyond which the estimates keep less than half of their digits."""
+WORST_CONDITION = 1e7  # condition number beyond which the estimates keep less than half of their digits
 
 
 @dataclass(frozen=True)

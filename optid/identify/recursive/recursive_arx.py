@@ -35,9 +35,7 @@ from optid.statistics.factors import dependent_column
 from optid.statistics.sums import rows_present
 from optid.structures.whitening import invert_triangular
 
-CHUNK = 4096
-"""Samples whose basis functions are evaluated at a time."""
-
+CHUNK = 4096  # samples whose basis functions are evaluated at a time
 SPLITS = ("whitened", "plain")
 
 SETTINGS = ("input_units", "output_units", "dt", "forgetting")

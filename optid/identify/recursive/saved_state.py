@@ -7,8 +7,7 @@ from typing import Any, ClassVar, Self
 from optid.errors import ModelFileError, OptidError
 from optid.models.state_file import read_state, set_arrays, write_state
 
-VERSION = 1
-"""Version of the file."""
+VERSION = 1  # version of the file
 
 
 class SavedState(ABC):

@@ -19,11 +19,8 @@ from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
 
 SYMMETRIC = 1e-8
-FLAT = 1e-8
-"""Curvature, or gradient, relative to the largest eigenvalue of C that is zero up to rounding."""
-
-MANY = 10_000
-"""Invariant subspaces listed at most."""
+FLAT = 1e-8  # curvature, or gradient, relative to the largest eigenvalue of C that is zero up to rounding
+MANY = 10_000  # invariant subspaces listed at most
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,7 @@ from optid.registry import render
 
 LAGS = 25
 
-ROUNDING = 1e-12
-"""An error below this share of the largest output is rounding."""
+ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
 @dataclass(frozen=True, eq=False)

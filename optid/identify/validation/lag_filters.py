@@ -17,21 +17,14 @@ from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3
-LATEST = 30
-"""Longest delay looked for, in samples."""
-
+LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1
-"""Poles more than the order that the data show: what is too weak for that may still matter to a sharp test."""
-
-FEW = 3
-"""Functions per input with which the dynamics are looked for."""
-
+SPARE = 1  # poles more than the order that the data show: what is too weak for that may still matter to a sharp test
+FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
 
-SETTLED = 1e-3
-"""Share of its largest value below which an impulse response has ended."""
+SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
 
 
 @dataclass(frozen=True, eq=False)

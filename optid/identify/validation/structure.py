@@ -36,14 +36,11 @@ NOTICEABLE = 0.015
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
 
-DISTINCT = 1e-4
-"""Smallest eigenvalue of the correlations of alternatives that counts as a direction of its own."""
-
+DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
 
-DIGITS = 1e-8
-"""A residual below this share of the standard deviation of the output is rounding."""
+DIGITS = 1e-8  # a residual below this share of the standard deviation of the output is rounding
 
 
 @dataclass(frozen=True)

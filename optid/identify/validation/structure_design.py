@@ -17,12 +17,8 @@ DEGREE, HATS, SAMPLES = 3, 5, 250
 FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
 """The same for the leading filter: there f is known to a few tenths of a percent."""
 
-EXTRA = 3
-"""Pulses beyond the order of the filters."""
-
-LONGEST = 600
-"""Samples after which the filters are cut, at most."""
-
+EXTRA = 3  # pulses beyond the order of the filters
+LONGEST = 600  # samples after which the filters are cut, at most
 CHUNK = 16384
 PRESENT = 0.9
 """Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
