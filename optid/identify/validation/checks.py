@@ -136,8 +136,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         name = model.outputs[int(np.argmin(present))]
         raise DataError(
             f"No sample of output {name!r} can be predicted: the model looks back {model.memory} samples, the longest "
-            f"experiment has {max(e.n_samples for e in raw.experiments)}. Use a longer record, or one with fewer gaps."
-        )
+            f"experiment has {max(e.n_samples for e in raw.experiments)}. Use a longer record, or one with fewer gaps.")
     notes: list[str] = []
     if horizon > 1:
         predicted[f"{horizon} steps"] = tuple(one_step(model, raw, horizon))
@@ -148,32 +147,35 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
     structure = _structure(model, raw, notes)
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
-    several = {word: _errors([e.y for e in raw.experiments], arrays, raw) for word, arrays in predicted.items()}
     y = np.vstack([e.y for e in raw.experiments])
-    errors = {word: {name: both[0] for name, both in _errors([y], [np.vstack(arrays)], raw).items()}
-              for word, arrays in predicted.items()}
-    lags = max(1, min(lags, int(present.min()) // 4))
+    pairs = {word: [(y, np.vstack(arrays)), *zip((e.y for e in raw.experiments), arrays)]
+             for word, arrays in predicted.items()}
+    errors = {word: {name: [Measures.of(y[:, o], p[:, o]) for y, p in several] for o, name in enumerate(raw.outputs)}
+              for word, several in pairs.items()}  # over all experiments, then over each
     # a residual that is nothing but rounding is neither white nor independent of anything
-    rounding = [errors[ONE_STEP][name].rmse <= ROUNDING * float(np.nanmax(np.abs(y[:, o])))
+    rounding = [errors[ONE_STEP][name][0].rmse <= ROUNDING * float(np.nanmax(np.abs(y[:, o])))
                 for o, name in enumerate(raw.outputs)]
     tested = [np.where(rounding, 0.0, r) for r in residuals]
-    columns = {name: [r[:, o] for r in tested] for o, name in enumerate(raw.outputs)}
-    inputs = {name: [e.u[:, c] for e in raw.experiments] for c, name in enumerate(raw.inputs)}
     return Validation(
-        data=raw.name, horizon=horizon, predictors=errors, experiments=several if raw.n_experiments > 1 else {},
-        autocorrelations={name: autocorrelation(columns[name], name, lags) for name in columns},
-        cross_correlations={(name, channel): cross_correlation(columns[name], inputs[channel], name, channel, lags)
-                            for name in columns for channel in inputs},
-        between={(name, other): between_outputs(columns[name], columns[other], name, other, lags)
-                 for name in columns for other in columns if other != name},
-        structure=structure, outside=outside, notes=tuple(notes), predicted=predicted, residuals=residuals,
-    )
+        data=raw.name, horizon=horizon,
+        predictors={word: {name: found[0] for name, found in table.items()} for word, table in errors.items()},
+        experiments={word: {name: tuple(found[1:]) for name, found in table.items()}
+                     for word, table in errors.items() if raw.n_experiments > 1},
+        **_residual_tests(raw, tested, max(1, min(lags, int(present.min()) // 4))),
+        structure=structure, outside=outside, notes=tuple(notes), predicted=predicted, residuals=residuals)
 
 
-def _errors(measured: Sequence[Array], predicted: Sequence[Array], data: Data) -> dict[str, tuple[Measures, ...]]:
-    """Errors of every output, one for each pair of measured and predicted arrays (N, l)."""
-    return {name: tuple(Measures.of(y[:, o], yhat[:, o]) for y, yhat in zip(measured, predicted))
-            for o, name in enumerate(data.outputs)}
+def _residual_tests(data: Data, residuals: Sequence[Array], lags: int) -> dict[str, dict[Any, Correlation]]:
+    """Test the residuals (N, l) of every experiment: each with its past, with every input and with the others' past."""
+    columns = {name: [r[:, o] for r in residuals] for o, name in enumerate(data.outputs)}
+    inputs = {name: [e.u[:, c] for e in data.experiments] for c, name in enumerate(data.inputs)}
+    return {
+        "autocorrelations": {name: autocorrelation(r, name, lags) for name, r in columns.items()},
+        "cross_correlations": {(name, channel): cross_correlation(r, u, name, channel, lags)
+                               for name, r in columns.items() for channel, u in inputs.items()},
+        "between": {(name, other): between_outputs(r, columns[other], name, other, lags)
+                    for name, r in columns.items() for other in columns if other != name},
+    }
 
 
 def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> tuple[Array, ...]:
@@ -199,10 +201,8 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
         if shares[name] and basis.interval is not None:
             lo, hi = basis.interval
             channel = "output" if function.fed_back else "input"
-            notes.append(
-                f"{100 * shares[name]:.2g} % of {channel} {name!r} lies outside [{lo:g}, {hi:g}], where "
-                f"{function.word} was identified; there it is set to {basis.outside!r}."
-            )
+            notes.append(f"{100 * shares[name]:.2g} % of {channel} {name!r} lies outside [{lo:g}, {hi:g}], where "
+                         f"{function.word} was identified; there it is set to {basis.outside!r}.")
     return shares
 
 
@@ -219,6 +219,5 @@ def _structure(model: Any, data: Data, notes: list[str]) -> Structure | None:
     if not found.passed:
         notes.append(
             f"The record does not look Hammerstein: another structure saves {100 * found.saving:.2g} % of the residual "
-            f"variance (p = {found.p_value:.1g}). Consider a Wiener or Volterra model, or nonlinear feedback."
-        )
+            f"variance (p = {found.p_value:.1g}). Consider a Wiener or Volterra model, or nonlinear feedback.")
     return found
