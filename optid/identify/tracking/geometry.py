@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import subspace_angles
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
@@ -116,11 +117,7 @@ def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
     a, b = orthonormal(first, "first subspace"), orthonormal(second, "second subspace")
     if len(a) != len(b):
         raise DataError(f"the subspaces live in {len(a)} and {len(b)} dimensions.")
-    if a.shape[1] < b.shape[1]:
-        a, b = b, a
-    left, cosines, right = np.linalg.svd(a.T @ b, full_matrices=False)
-    sines = np.linalg.svd(b - a @ (a.T @ b), compute_uv=False)[::-1]
-    return np.where(cosines**2 < 0.5, np.arccos(np.clip(cosines, 0, 1)), np.arcsin(np.clip(sines, 0, 1)))
+    return subspace_angles(a, b)[::-1]
 
 
 def projection_loss(covariance: ArrayLike, basis: ArrayLike) -> float:
