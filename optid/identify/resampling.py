@@ -18,7 +18,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.data.stretches import interpolated
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
 from optid.identify.tangent import Quantity
@@ -152,13 +152,7 @@ def _simulated(model: HammersteinARX, u: Array, y: Array, errors: Array) -> Arra
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.memory
     u, start = interpolated(u), interpolated(y)[:n]
-    right = simulation.driven(model, u[n:]) + errors[n:]
-    state = simulation.following_state(model, u[:n], start)
-    count = min(n, len(right))
-    right[:count] += state[:count]
-    outputs = np.vstack([start, simulation.filtered(model, right)])
-    if not np.isfinite(outputs).all():
-        raise DataError("the simulation of the fitted model leaves the range of numbers, so it cannot be resampled; "
-                        "identify it with a stability constraint")
+    free = simulation.simulate_record(model, u[n:], simulation.following_state(model, u[:n], start))
+    outputs = np.vstack([start, free + simulation.filtered(model, errors[n:])])
     outputs[np.isnan(y)] = np.nan
     return outputs
