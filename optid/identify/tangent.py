@@ -32,8 +32,7 @@ STEP = 1e-5  # step of the central differences, relative to the size of the para
 MEANINGS = {
     "gaussian": "confidence intervals of least squares, Student's quantile",
     "projected": "confidence intervals under inequalities: hull of projected posterior and basic bootstrap",
-    "penalised": "intervals of the posterior whose prior is the penalty: they cover on average over f, not pointwise",
-}
+    "penalised": "intervals of the posterior whose prior is the penalty: they cover on average over f, not pointwise"}
 
 Quantity = Callable[[Any], ArrayLike]
 """A function of the model: a number or an array of fixed shape."""

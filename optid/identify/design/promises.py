@@ -48,8 +48,7 @@ class Promise:
             "band": f"{self.band[0]:.4g} to {self.band[1]:.4g}",
             "amplitude": ", ".join(f"{low:.4g} to {high:.4g}" for low, high in self.amplitude),
             "crest factor": ", ".join(f"{c:.3g}" for c in self.crest),
-            "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)",
-        }
+            "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)"}
         lines = [*facts.items(), *((check.rule, check) for check in self.checks), ("how", self.how)]
         return "\n".join(f"{name:<26} {value}" for name, value in lines)
 

@@ -117,8 +117,7 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     sentence = (
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
         f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
-        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions"
-    )
+        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions")
     return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
 
 

@@ -126,8 +126,7 @@ class RecursiveARX(SavedState):
         bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
         return cls(
             basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, *data.ranges())], inputs=data.inputs,
-            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings,
-        )
+            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     # -- samples ---------------------------------------------------------------------------------------------------
 
@@ -207,8 +206,7 @@ class RecursiveARX(SavedState):
             signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
             self.rows = recursion_kernel.absorb(
                 self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
-                innovations[part], marks[part], traced[recorded : recorded + marked],
-            )
+                innovations[part], marks[part], traced[recorded : recorded + marked])
             recorded += marked
             complete = np.arange(self.since_restart, self.since_restart + count) >= reach
             self.candidates += int(np.count_nonzero(complete & (weights[part] > 0)))

@@ -174,8 +174,7 @@ def _residual_tests(data: Data, residuals: Sequence[Array], lags: int) -> dict[s
         "cross_correlations": {(name, channel): cross_correlation(r, u, name, channel, lags)
                                for name, r in columns.items() for channel, u in inputs.items()},
         "between": {(name, other): between_outputs(r, columns[other], name, other, lags)
-                    for name, r in columns.items() for other in columns if other != name},
-    }
+                    for name, r in columns.items() for other in columns if other != name}}
 
 
 def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> tuple[Array, ...]:

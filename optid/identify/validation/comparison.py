@@ -110,5 +110,4 @@ def _named(models: Sequence[Any]) -> dict[str, Any]:
         words.append(f"{model.title} ({orders})" if orders else model.title)
     return {
         word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
-        for i, (word, model) in enumerate(zip(words, models))
-    }
+        for i, (word, model) in enumerate(zip(words, models))}
