@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
-from cvxpy.constraints.zero import Equality, Zero
 from cvxpy.expressions.expression import Expression
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.gradients import jacobians
+from optid.program.gradients import flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program
 
 NO_EFFECT = 1e-10
@@ -222,30 +222,28 @@ def _constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, A
         for member in group:
             if any(id(v) in derived for v in member.variables()):
                 continue
-            if isinstance(member, Equality | Zero):
-                equal.append(_gradient(program, names, name, member.args[0] if len(member.args) == 1 else member.expr))
-                continue
-            expression, sign = _one_sided(name, member)
-            if expression is not None:
-                above.append(sign * _gradient(program, names, name, expression))
-                slack.append(np.maximum(sign * np.ravel(np.asarray(expression.value), order="F"), 0.0))
+            if isinstance(member, EQUALITIES):
+                equal.append(_gradient(program, names, name, member.expr))
+            elif (positive := _one_sided(name, member)) is not None:
+                above.append(_gradient(program, names, name, positive))
+                slack.append(np.maximum(flat_value(positive), 0.0))
     return np.vstack(equal), np.vstack(above), np.concatenate(slack)
 
 
-def _one_sided(name: str, member: Constraint) -> tuple[Expression | None, float]:
-    """Return (expression, sign) with sign * expression >= 0; None for a matrix or cone constraint far from active."""
-    if isinstance(member, Inequality | NonPos):
-        return member.expr, -1.0
+def _one_sided(name: str, member: Constraint) -> Expression | None:
+    """Return an expression that must be >= 0; None for a matrix or cone constraint far from active."""
+    if isinstance(member, INEQUALITIES):
+        return -member.expr
     if isinstance(member, NonNeg):
-        return member.args[0], 1.0
+        return member.args[0]
     if isinstance(member, PSD):
         values = np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))
         if values[0] > 1e-3 * np.max(np.abs(values)):
-            return None, 0.0
+            return None
     if isinstance(member, SOC):
         head, tail = np.atleast_1d(member.args[0].value), np.atleast_1d(member.args[1].value)
         if np.all(head - np.linalg.norm(tail, axis=0) > 1e-3 * np.abs(head)):
-            return None, 0.0
+            return None
     raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
                          "use optid.bootstrap for intervals")
 
