@@ -159,12 +159,11 @@ def _check(kind: str, band: Any, shaped: bool, **counts: int | None) -> None:
 def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:
     """Return (low, high) of every input."""
     try:
-        pairs = np.transpose(like.ranges()) if amplitude is None else np.broadcast_to(
-            np.asarray(amplitude, dtype=float), (like.m, 2))
+        given = np.transpose(like.ranges()) if amplitude is None else np.asarray(amplitude, dtype=float)
+        return [(float(low), float(high)) for low, high in np.broadcast_to(given, (like.m, 2))]
     except (TypeError, ValueError):
         raise StructureError(f"amplitude = {amplitude!r}: (low, high), or one such pair for each of the {like.m} "
                              "inputs, is needed.") from None
-    return [(float(low), float(high)) for low, high in pairs]
 
 
 def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tuple[float, float]:

@@ -108,6 +108,5 @@ def _named(models: Sequence[Any]) -> dict[str, Any]:
     for model in models:
         orders = ", ".join(f"{key} {' '.join(map(str, np.ravel(value)))}" for key, value in model.orders.items())
         words.append(f"{model.title} ({orders})" if orders else model.title)
-    return {
-        word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
-        for i, (word, model) in enumerate(zip(words, models))}
+    return {word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
+            for i, (word, model) in enumerate(zip(words, models))}
