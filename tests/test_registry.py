@@ -15,6 +15,7 @@ from optid.registry import (
     formulation,
     named_constraint,
     registered,
+    render,
 )
 
 
@@ -63,6 +64,11 @@ def test_a_word_means_what_the_function_means():
 def test_words_that_are_wrong(text, error, words):
     with pytest.raises(error, match=words):
         named_constraint(text)
+
+
+def test_a_result_without_a_renderer_is_refused_by_name():
+    with pytest.raises(LookupFailed, match="no renderer is called 'Data.text'"):
+        render(record())
 
 
 @pytest.mark.parametrize("name", ["hammerstein_arx.exat", 3, None])

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import toeplitz
+from scipy.special import chdtrc
 
 from optid.arrays import Array
 
@@ -79,8 +81,6 @@ def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], outpu
         channel: name of the input.
         lags: largest lag.
     """
-    from scipy.linalg import toeplitz
-
     e, u = _standardised(residuals), _standardised(inputs)
     around = np.arange(-lags, lags + 1)
     values, counts = _products(e, u, around)
@@ -97,8 +97,6 @@ def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], outpu
 
 def _portmanteau(values: Array, weights: Array, inflation: float = 1.0) -> float:
     """Probability that a chi-square variable exceeds the weighted sum of squares of so many values."""
-    from scipy.special import chdtrc
-
     return float(chdtrc(values.size, float(np.sum(weights * values**2) * inflation)))
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
@@ -90,8 +91,6 @@ def delay_of(data: Data, latest: int = LATEST) -> int:
         data: the record.
         latest: longest delay looked for.
     """
-    from scipy.special import fdtrc
-
     families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
     p = sum(family.size for family in families)
     shortest = min(e.n_samples for e in data.experiments)
