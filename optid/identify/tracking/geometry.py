@@ -82,14 +82,14 @@ def as_basis(basis: ArrayLike, n: int, what: str = "basis") -> Array:
     return w
 
 
-def orthonormal(basis: ArrayLike, what: str = "basis") -> Array:
-    """Return an orthonormal basis (n, r) of the columns.
+def orthonormal(basis: ArrayLike, what: str = "basis", n: int | None = None) -> Array:
+    """Return an orthonormal basis (n, r) of the columns; any n where none is given.
 
     Raises:
+        DataError: another shape, or an entry that is not finite.
         RankError: columns that depend on one another.
     """
-    w = np.asarray(basis, dtype=float)
-    w = as_basis(w, len(w), what)
+    w = as_basis(basis, len(np.asarray(basis)) if n is None else n, what)
     length = np.linalg.norm(w, axis=0)
     if not length.all():
         raise RankError(f"{what}: column {int(np.argmin(length)) + 1} is zero.")

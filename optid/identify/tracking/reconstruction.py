@@ -98,12 +98,12 @@ def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLi
     """
     c = as_covariance(covariance)
     check_integer(r, "r", high=len(c))
-    space = np.eye(len(c)) if within is None else orthonormal(as_basis(within, len(c), "within"), "within")
+    space = np.eye(len(c)) if within is None else orthonormal(within, "within", len(c))
     if space.shape[1] < r:
         raise StructureError(f"r={r}: the surviving directions have dimension {space.shape[1]} only.")
     kept = np.zeros((len(c), 0))
     if containing is not None:
-        kept = orthonormal(as_basis(containing, len(c), "containing"), "containing")
+        kept = orthonormal(containing, "containing", len(c))
         if kept.shape[1] > r:
             raise StructureError(f"r={r}: {kept.shape[1]} directions are to be kept.")
         if np.linalg.norm(kept - space @ (space.T @ kept)) > INSIDE:
@@ -179,7 +179,7 @@ def fantope_certificate(covariance: ArrayLike, basis: ArrayLike, t: float | None
         StructureError: lost coordinates that do not exist or leave fewer than r, a t that is not finite.
     """
     c = as_covariance(covariance)
-    w = orthonormal(as_basis(basis, len(c)))
+    w = orthonormal(basis, n=len(c))
     gone, space = sorted({int(i) for i in lost}), surviving(len(c), lost)
     check_integer(w.shape[1], "r", high=space.shape[1])
     if gone and float(np.abs(w[gone]).max()) > 1e-8:
@@ -268,7 +268,7 @@ def _from_present(pattern: NDArray[np.bool_], basis: ArrayLike | None, covarianc
     if covariance is not None:
         c = as_covariance(covariance)
         return np.linalg.pinv(c[np.ix_(present, present)], hermitian=True, rcond=1e-12) @ c[np.ix_(present, pattern)]
-    w = orthonormal(as_basis(basis, len(pattern)))  # type: ignore[arg-type]
+    w = orthonormal(basis, n=len(pattern))  # type: ignore[arg-type]
     values = np.linalg.svd(w[present], compute_uv=False)
     if present.sum() < w.shape[1] or values[-1] < 1e-6:
         raise RankError(f"sample {sample}: its {int(present.sum())} entries do not determine {w.shape[1]} coordinates; "

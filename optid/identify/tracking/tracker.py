@@ -77,7 +77,7 @@ class SubspaceTracker(SavedState):
         self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
         if len(self.names) != self.n:
             raise StructureError(f"{len(self.names)} names for {self.n} coordinates.")
-        guess = np.eye(self.n)[:, : self.r] if start is None else orthonormal(as_basis(start, self.n, "start"), "start")
+        guess = np.eye(self.n)[:, : self.r] if start is None else orthonormal(start, "start", self.n)
         if guess.shape[1] != self.r:
             raise StructureError(f"start has {guess.shape[1]} columns for a subspace of dimension {self.r}.")
         self.W = np.ascontiguousarray(guess)
