@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.errors import DataError, DataWarning
+from optid.errors import DataError, DataWarning, StructureError
 
 Array = NDArray[np.floating]
 
@@ -88,6 +88,20 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
     k, c = np.argwhere(np.abs(samples) > LARGEST)[0]
     raise DataError(f"{labels[c]}: sample {first + k} is {samples[k, c]:g}. Write NaN where a sample is missing, or "
                     "remove the fault that produced it.")
+
+
+def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) -> int:
+    """Return an integer argument as an int.
+
+    Raises:
+        StructureError: no integer, or one outside the bounds.
+    """
+    top = value if high is None else high
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
+        kind = "a positive integer" if low == 1 else f"an integer >= {low}"
+        kind = kind if high is None else f"an integer from {low} to {high}"
+        raise StructureError(f"{name}={value!r} must be {kind}.")
+    return int(value)
 
 
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Formulations and named constraints by name: entry points, so that a third party's are on equal footing."""
+"""Formulations, constraints and renderers by name: entry points, so that a third party's are on equal footing."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -54,6 +54,17 @@ def fault_formulation(name: str) -> Callable[..., Any]:
     return entry_point(FAULTS, name).load()
 
 
+def render(result: Any, form: str = "text") -> Any:
+    """Return a result in a form, such as "text", by the renderer registered as "<class name>.<form>".
+
+    Results are data: they know no table and no figure, and import nothing that draws or prints them.
+
+    Raises:
+        LookupFailed: no such renderer; the message has the nearest name.
+    """
+    return entry_point(RENDERERS, f"{type(result).__name__}.{form}").load()(result)
+
+
 def named_constraint(text: str) -> Any:
     """Build a constraint from a word such as ``monotone:increasing`` or ``gain:1.0``.
 
@@ -104,19 +115,6 @@ def defaults(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the arguments of a formulation that may be left out, with their values then."""
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is not p.empty}
-
-
-def render(result: Any, form: str) -> Any:
-    """Return a result in a form for people, such as "text" or "figure".
-
-    Args:
-        result: of any class that has a renderer.
-        form: the entry point "<class name>.<form>" of the group "optid.renderers" is called with the result.
-
-    Raises:
-        LookupFailed: no such renderer.
-    """
-    return entry_point(RENDERERS, f"{type(result).__name__}.{form}").load()(result)
 
 
 def _number(text: str) -> Any:

@@ -6,7 +6,7 @@ from problems import BASIS, record
 
 import optid
 from optid.errors import DataError, DataWarning
-from optid.identify.record_checks import examine, examine_rows
+from optid.identify.record_checks import examine, examine_figures
 
 RNG = np.random.default_rng(0)
 U, Y = RNG.uniform(-1, 1, 400), RNG.normal(size=400)
@@ -98,10 +98,11 @@ def test_every_channel_is_examined_by_name():
 
 
 def test_conditioning_and_missing_rows():
-    assert examine_rows(100, 100, 10.0) == []
+    figures = {"rows": 100, "candidates": 100, "condition": 10.0}
+    assert examine_figures(figures) == []
     with pytest.warns(DataWarning, match="condition number 1.0e"):
-        assert len(examine_rows(100, 100, 1e9)) == 1
-    assert examine_rows(40, 100, 10.0) == ["only 40 % of the rows are free of missing samples"]
+        assert len(examine_figures(figures | {"condition": 1e9})) == 1
+    assert examine_figures(figures | {"rows": 40}) == ["only 40 % of the rows are free of missing samples"]
 
 
 def test_findings_belong_to_the_fit():

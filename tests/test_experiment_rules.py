@@ -9,7 +9,7 @@ from optid import plants, signals
 from optid.errors import DataError, DataWarning
 from optid.identify.design.lines import longest_run, many_lines, remaining_shares
 from optid.identify.design.rules import check_condition, check_instruments, check_levels, check_lines
-from optid.identify.record_checks import examine, examine_instruments
+from optid.identify.record_checks import examine, examine_figures
 
 RNG = np.random.default_rng(0)
 QUARTIC = optid.Polynomial(4).fitted(-1, 1)
@@ -124,9 +124,9 @@ def test_fit_names_a_single_sinusoid():
 
 
 def test_instruments_that_hardly_reach_are_told():
-    assert examine_instruments(1e5) == []
+    assert examine_figures({"condition of R11": 1e5}) == []
     with pytest.warns(DataWarning, match="instruments hardly reach the regressors: cond.R11. = 1.0e\\+09"):
-        assert len(examine_instruments(1e9)) == 1
+        assert len(examine_figures({"condition of R11": 1e9})) == 1
 
 
 def test_a_fit_by_subspace_is_held_to_the_condition_of_its_instruments():

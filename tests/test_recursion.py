@@ -249,7 +249,7 @@ def test_the_model_is_that_of_algorithm_3_1_on_the_whole_record(split, case):
 
 def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
     """Where the Gram matrix is exactly a Kronecker product, the whitened SVD is the least-squares optimum."""
-    from optid.identify.recursive.splitting import leading_pair
+    from optid.identify.recursive.estimates import leading_pair
 
     rng = np.random.default_rng(0)
     theta, left, right = (rng.standard_normal(shape) for shape in ((5, 3), (5, 5), (3, 3)))

@@ -6,11 +6,21 @@ from problems import BASIS, record
 import optid
 from formulations.constraints import pole_regions, responses, shape
 from optid.errors import LookupFailed, StructureError
-from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, check_arguments, formulation, named_constraint, registered
+from optid.registry import (
+    CONSTRAINTS,
+    FAULTS,
+    FORMULATIONS,
+    RENDERERS,
+    check_arguments,
+    formulation,
+    named_constraint,
+    registered,
+    render,
+)
 
 
 def test_every_entry_point_loads_and_is_callable():
-    for group in (FORMULATIONS, CONSTRAINTS, FAULTS):
+    for group in (FORMULATIONS, CONSTRAINTS, FAULTS, RENDERERS):
         assert registered(group)
         for point in registered(group).values():
             assert callable(point.load())
@@ -54,6 +64,11 @@ def test_a_word_means_what_the_function_means():
 def test_words_that_are_wrong(text, error, words):
     with pytest.raises(error, match=words):
         named_constraint(text)
+
+
+def test_a_result_without_a_renderer_is_refused_by_name():
+    with pytest.raises(LookupFailed, match="no renderer is called 'Data.text'"):
+        render(record())
 
 
 @pytest.mark.parametrize("name", ["hammerstein_arx.exat", 3, None])

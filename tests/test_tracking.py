@@ -14,7 +14,6 @@ from optid.identify.tracking import (
     constrained_reconstruction,
     fantope_certificate,
     filled,
-    load_tracker,
     loss_gradient,
     loss_hessian,
     oblique_projector,
@@ -131,7 +130,7 @@ def test_restart_from_a_file_is_bit_identical(method, tmp_path):
     expected = whole.update(x)
     parts = SubspaceTracker(6, 2, method=method, names=list("abcdef"))
     found = [parts.update(x[:1777])]
-    parts = load_tracker(parts.save(tmp_path / "state.npz"))
+    parts = SubspaceTracker.load(parts.save(tmp_path / "state.npz"))
     found.append(parts.update(x[1777:]))
     assert np.array_equal(np.concatenate(found), expected, equal_nan=True)
     for name in ("W", "root", "sums", "counts"):
@@ -143,10 +142,10 @@ def test_damaged_state_is_refused(tmp_path):
     path = SubspaceTracker(6, 2).save(tmp_path / "state.npz")
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ModelFileError, match="complete state"):
-        load_tracker(path)
+        SubspaceTracker.load(path)
     np.savez(tmp_path / "other.npz", head="{}", W=0, root=0, sums=0, counts=0)
     with pytest.raises(ModelFileError, match="version 1"):
-        load_tracker(tmp_path / "other.npz")
+        SubspaceTracker.load(tmp_path / "other.npz")
 
 
 def test_missing_entries_are_filled_from_the_subspace():
@@ -188,7 +187,7 @@ def test_bad_samples_are_refused_by_name():
     tracker.update(np.ones((5, 3)))
     with pytest.raises(DataError, match="level is missing at sample 6"):
         tracker.update([[1, 1, 1], [1, np.nan, 1]])
-    with pytest.raises(DataError, match="heat is infinite at sample 5"):
+    with pytest.raises(DataError, match="'heat': sample 5 is inf"):
         tracker.update([1, 1, np.inf])
     with pytest.raises(DataError, match=r"\(N, 3\)"):
         tracker.update(np.ones((2, 4)))

@@ -13,12 +13,12 @@ from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
-from optid.identify.record_checks import examine, examine_instruments, examine_residuals, examine_rows
+from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
-from optid.registry import check_arguments, defaults, formulation, named_constraint
+from optid.registry import check_arguments, defaults, formulation, named_constraint, render
 from optid.solving.solve import Outcome, Procedure, run
 
 
@@ -96,15 +96,14 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        from optid.identify.validation import fit_percent
-        from optid.identify.validation.predictions import one_step
+        from optid.identify.validation.predictions import common_fits, one_step
 
         if hasattr(self.program.compressed, "one_step_fit"):
             return self.program.compressed.one_step_fit(self.solution.values)
         if isinstance(self.data, Stream):
             return np.full(len(self.data.outputs), np.nan)
         raw = self.data.raw()
-        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(one_step(self.model, raw)))
+        return common_fits(raw, [one_step(self.model, raw)])[0]
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
@@ -124,17 +123,15 @@ class Fit:
         return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
 
     def _simulated_fit(self, word: str) -> np.ndarray:
-        from optid.identify.validation import fit_percent
-        from optid.identify.validation.predictions import simulated
+        from optid.identify.validation.predictions import common_fits, simulated
 
-        if isinstance(self.data, Stream) or any(self.data.missing[name] for name in self.data.inputs):
-            return np.full(len(self.data.outputs), np.nan)
-        raw = self.data.raw()
-        try:
-            outputs = simulated(self.model, raw, word)
-        except DataError:  # it leaves the range of the data
-            return np.full(len(self.data.outputs), np.nan)
-        return fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(outputs))
+        if not isinstance(self.data, Stream) and not any(self.data.missing[name] for name in self.data.inputs):
+            raw = self.data.raw()
+            try:
+                return common_fits(raw, [simulated(self.model, raw, word)])[0]
+            except DataError:  # it leaves the range of the data
+                pass
+        return np.full(len(self.data.outputs), np.nan)
 
     @cached_property
     def uncertainty(self) -> Any:
@@ -144,9 +141,7 @@ class Fit:
         return uncertainty(self)
 
     def __str__(self) -> str:
-        from optid.show.printing import describe
-
-        return describe(self)
+        return render(self)
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text("Fit(...)" if cycle else str(self))
@@ -230,22 +225,17 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
               started: float) -> Fit:
     built_at = time.perf_counter()
     outcome = run(problem, solver, **settings)
-    outcome = replace(outcome, solution=replace(
-        outcome.solution, times=replace(outcome.solution.times,
-                                        build=outcome.solution.times.build + built_at - started)))
+    times = outcome.solution.times
+    times = replace(times, build=times.build + built_at - started)
+    outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
     model = outcome.model
     findings = findings + _disobeyed(model, arguments.get("constraints", ()))
-    statistics = getattr(outcome.program.compressed, "statistics", None)
-    figures = dict(outcome.figures)
+    statistics, figures = getattr(outcome.program.compressed, "statistics", None), dict(outcome.figures)
     if statistics is not None:
-        figures |= {"rows": statistics.rows, "candidates": statistics.candidates, "condition": statistics.condition,
-                    "method": statistics.method}
-        findings = findings + examine_rows(statistics.rows, statistics.candidates, statistics.condition)
-    if "condition of R11" in figures:
-        findings = findings + examine_instruments(figures["condition of R11"])
-    findings = findings + examine_residuals(figures)
+        figures |= {key: getattr(statistics, key) for key in ("rows", "candidates", "condition", "method")}
+    findings = findings + examine_figures(figures)
     return Fit(identified=_in_raw_units(model, data), solved=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),

@@ -18,14 +18,9 @@ from scipy.special import stdtrit
 from optid.arrays import Array
 from optid.errors import StructureError
 
-DRAWS = 8192
-"""Random draws of an interval under inequalities: their noise is about 0.7 % of its width."""
-
-SETS = 64
-"""Sets of active rows that are tried for all points; where there are many more, each point finds its own."""
-
-REACH = 8.0
-"""Inequalities further away than this many standard deviations of their slack cannot move an interval."""
+DRAWS = 8192  # random draws of an interval under inequalities: their noise is about 0.7 % of its width
+SETS = 64  # sets of active rows that are tried for all points; where there are many more, each point finds its own
+REACH = 8.0  # inequalities further away than this many standard deviations of their slack cannot move an interval
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,24 +13,12 @@ from scipy.special import fdtrc, ndtri
 
 from optid.arrays import Array
 
-LONGEST = 3
-"""Wild readings in a row that still count as isolated."""
-
-WINDOW = 15
-"""Samples of the running median, the course that wild readings leave; more than half of them must be sound."""
-
-SHORT = 10_000
-"""Samples up to which sorting every window takes less time than the import of scipy.ndimage."""
-
-MOST = 0.12
-"""Share of wild readings up to which they are looked for."""
-
-LEAST_SAMPLES = 50
-"""Samples of a channel below which nothing can be said."""
-
-FAR = 6.0
-"""Robust standard deviations of the departures from the course that a wild reading is off at least."""
-
+LONGEST = 3  # wild readings in a row that still count as isolated
+WINDOW = 15  # samples of the running median, the course that wild readings leave; more than half of them must be sound
+SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
+MOST = 0.12  # share of wild readings up to which they are looked for
+LEAST_SAMPLES = 50  # samples of a channel below which nothing can be said
+FAR = 6.0  # robust standard deviations of the departures from the course that a wild reading is off at least
 GAP = 1.2
 """Ratio at least of the smallest wild departure to the largest sound one, so that levels of a quantiser are no gap."""
 
@@ -46,19 +34,10 @@ GAP_RISK, TAIL_RISK = 2e-3, 1e-4
 FLATTEST = 0.1
 """Least steepness of a tail: that of a Gaussian one at 3 standard deviations, for signals that are bounded."""
 
-TRIED = 20
-"""Splits into wild and sound readings that are tried, those at the widest gaps."""
-
-TAIL = 0.05
-"""Share of the departures that is the tail of any distribution."""
-
-NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a standard normal variable."""
-
-CHANCE = 1e-3
-"""Probability that residuals of Gaussian noise show a wild reading anywhere in the record."""
-
-
+TRIED = 20  # splits into wild and sound readings that are tried, those at the widest gaps
+TAIL = 0.05  # share of the departures that is the tail of any distribution
+NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
+CHANCE = 1e-3  # probability that residuals of Gaussian noise show a wild reading anywhere in the record
 TIE = 1e-9
 """Where one row alone tells, a reading that is a past output there counts as wild, for its leverage; the output not."""
 

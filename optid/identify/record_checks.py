@@ -34,53 +34,65 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         What weakens the answer, one sentence each; every sentence is also issued as a `DataWarning`.
 
     Raises:
-        DataError: a constant or missing input, too few levels to determine the basis, or too few spectral lines to
+        DataError: a constant or missing channel, too few levels to determine the basis, or too few spectral lines to
             determine its coefficients at every lag.
     """
     arguments = arguments or {}
+    forced = arguments.get("tolerance") is not None
     found: list[str] = []
     for c, (name, basis) in enumerate(zip(data.inputs, bases)):
-        u = np.concatenate([e.u[:, c] for e in data.experiments])
-        u = u[~np.isnan(u)]
-        found += _levels(name, u, basis)
-        forced = arguments.get("tolerance") is not None
-        found += _lines(name, [e.u[:, c] for e in data.experiments], basis, _lags(arguments, c), forced)
-        found += _range(name, u, basis)
-        found += _outliers("input", name, [e.u[:, c] for e in data.experiments], arguments)
+        records = [e.u[:, c] for e in data.experiments]
+        u = _present("input", name, records)
+        found += _sentences(check_levels(name, u, basis))
+        if (lags := _lags(arguments, c)) is not None:
+            check = check_lines(name, records, basis, lags)
+            found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
+        if (outside := basis.n_outside(u)) and basis.interval is not None:
+            low, high = basis.interval
+            found.append(f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval "
+                         f"[{low:g}, {high:g}] of its basis; there the basis is set to {basis.outside!r}")
+        found += _outliers("input", name, records, arguments)
     for o, name in enumerate(data.outputs):
-        y = np.concatenate([e.y[:, o] for e in data.experiments])
-        y = y[~np.isnan(y)]
-        if y.size == 0:
-            raise DataError(f"output {name!r} has no sample at all; choose another column or drop the output")
-        if np.ptp(y) == 0:
-            raise DataError(f"output {name!r} is constant ({y[0]:g}): there is nothing to explain; check the column")
-        found += _outliers("output", name, [e.y[:, o] for e in data.experiments], arguments)
-        found += _digits(name, y)
+        records = [e.y[:, o] for e in data.experiments]
+        y = _present("output", name, records)
+        found += _outliers("output", name, records, arguments)
+        size, level = float(np.std(y)), abs(float(np.mean(y)))
+        digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
+        if digits < FEW_DIGITS:
+            found.append(f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal "
+                         "digits of its variation: no result is more accurate; record it about its level")
     return _warned(found)
 
 
-def _levels(name: str, u: np.ndarray, basis: Basis) -> list[str]:
-    if u.size == 0:
-        raise DataError(f"input {name!r} has no sample at all; choose another column or drop the input")
-    if np.ptp(u) == 0:
-        raise DataError(f"input {name!r} is constant ({u[0]:g}): nothing can be identified from it; "
-                        "excite the input or drop the channel")
-    return _told(check_levels(name, u, basis))
+def examine_figures(figures: Mapping[str, Any]) -> list[str]:
+    """Say how the compressed problem stands, and which readings a robust loss has left out by their residuals.
 
-
-def _lines(name: str, records: Sequence[np.ndarray], basis: Basis, lags: int | None, forced: bool) -> list[str]:
-    if lags is None:
-        return []
-    check = check_lines(name, records, basis, lags)
-    return _told(replace(check, severity="warning") if check.severity == "error" and forced else check)
-
-
-def _told(check: Check) -> list[str]:
-    """Return the sentence of a warning, nothing of what is fine.
-
-    Raises:
-        DataError: of an error.
+    Args:
+        figures: of a fit, as far as they are there: rows used, the candidates there would be without missing samples,
+            estimated condition number of the column-scaled expanded regressor, and the condition number of R11, the
+            regressors of a subspace method projected on its instruments.
     """
+    found = []
+    for key, check in (("condition", check_condition), ("condition of R11", check_instruments)):
+        found += _sentences(check(figures[key])) if key in figures else []
+    found += [f"{key}, {samples}, were left out with every row that holds one"
+              for key, samples in figures.items() if key.startswith(BY_RESIDUALS)]
+    found = _warned(found)
+    rows, candidates = figures.get("rows", 0), figures.get("candidates", 0)
+    if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
+        found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
+    return found
+
+
+def list_samples(found: Sequence[np.ndarray]) -> str:
+    """Name the first samples of every experiment, as in "samples 3, 17, 40 and 5 more"."""
+    places = [f"{k} of experiment {e + 1}" if len(found) > 1 else str(k) for e, part in enumerate(found) for k in part]
+    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
+    return f"{'sample' if len(places) == 1 else 'samples'} {', '.join(places[:NAMED])}{more}"
+
+
+def _sentences(check: Check) -> list[str]:
+    """Return the sentence of a warning, nothing of what is fine; an error is raised."""
     if check.severity == "error":
         raise DataError(check.sentence)
     return [check.sentence] if check.severity == "warning" else []
@@ -91,6 +103,19 @@ def _warned(found: list[str]) -> list[str]:
     for sentence in found:
         warnings.warn(sentence, DataWarning, stacklevel=5)
     return found
+
+
+def _present(role: str, name: str, records: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the samples of a channel that are present; there must be two different ones."""
+    x = np.concatenate(records)
+    x = x[~np.isnan(x)]
+    if x.size == 0:
+        raise DataError(f"{role} {name!r} has no sample at all; choose another column or drop the {role}")
+    if np.ptp(x) == 0:
+        remedy = ("nothing can be identified from it; excite the input or drop the channel" if role == "input" else
+                  "there is nothing to explain; check the column")
+        raise DataError(f"{role} {name!r} is constant ({x[0]:g}): {remedy}")
+    return x
 
 
 def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
@@ -106,15 +131,6 @@ def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
     return int(given) if isinstance(given, int | np.integer) and given > 0 else None
 
 
-def _range(name: str, u: np.ndarray, basis: Basis) -> list[str]:
-    outside = basis.n_outside(u)
-    if not outside or basis.interval is None:
-        return []
-    low, high = basis.interval
-    return [f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval [{low:g}, {high:g}] of its "
-            f"basis; there the basis is set to {basis.outside!r}"]
-
-
 def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Mapping[str, Any]) -> list[str]:
     found = find_outliers(records)
     count = sum(part.size for part in found)
@@ -128,55 +144,5 @@ def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Ma
         advice += ", or use loss='huber', which leaves out every row that holds one"
     else:
         advice = f"check the record and {advice}"
-    return [f"{_counted(count)} of {role} {name!r} ({list_samples(found)}) "
+    return [f"{'1 reading' if count == 1 else f'{count} readings'} of {role} {name!r} ({list_samples(found)}) "
             f"{'is' if count == 1 else 'are'} wild, isolated and far off the others: {advice}"]
-
-
-def _counted(count: int) -> str:
-    return "1 reading" if count == 1 else f"{count} readings"
-
-
-def list_samples(found: Sequence[np.ndarray]) -> str:
-    """Name the first samples of every experiment, as in "samples 3, 17, 40 and 5 more"."""
-    places = [f"{k} of experiment {e + 1}" if len(found) > 1 else str(k) for e, part in enumerate(found) for k in part]
-    more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
-    return f"{'sample' if len(places) == 1 else 'samples'} {', '.join(places[:NAMED])}{more}"
-
-
-def examine_residuals(figures: Mapping[str, Any]) -> list[str]:
-    """Say which readings a robust loss has left out because their residuals show that they are wild."""
-    return _warned([f"{key}, {samples}, were left out with every row that holds one"
-                    for key, samples in figures.items() if key.startswith(BY_RESIDUALS)])
-
-
-def _digits(name: str, y: np.ndarray) -> list[str]:
-    """Say how many digits the samples have left beside their level, once these are few."""
-    size, level = float(np.std(y)), abs(float(np.mean(y)))
-    digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
-    if digits >= FEW_DIGITS:
-        return []
-    return [f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal digits of its "
-            "variation: no result is more accurate; record it about its level"]
-
-
-def examine_rows(rows: int, candidates: int, condition: float) -> list[str]:
-    """Say how the compressed problem stands: rows kept and conditioning of the expanded regressor.
-
-    Args:
-        rows: rows used.
-        candidates: rows there would be without missing samples.
-        condition: estimated condition number of the column-scaled expanded regressor.
-    """
-    found = _warned(_told(check_condition(condition)))
-    if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
-        found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
-    return found
-
-
-def examine_instruments(condition: float) -> list[str]:
-    """Say how well the instruments of a subspace method reach its regressors.
-
-    Args:
-        condition: condition number of R11, the regressors projected on the instruments.
-    """
-    return _warned(_told(check_instruments(condition)))

@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,17 +19,14 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
-from optid.identify.uncertainty import Quantity, Uncertainty, aligned
+from optid.identify.fitting import Fit
+from optid.identify.fitting import fit as refit
+from optid.identify.tangent import Quantity
+from optid.identify.uncertainty import Uncertainty, aligned
+from optid.models import HammersteinARX
 from optid.models.recursions import autoregression
 
-if TYPE_CHECKING:
-    from optid.identify.fitting import Fit
-    from optid.models import HammersteinARX
-
-Kind = Literal["percentile", "basic"]
-
-FAILED = 0.1
-"""Share of refits without a point above which the user is told."""
+FAILED = 0.1  # share of refits without a point above which the user is told
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +39,9 @@ class Refits:
         kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
     """
 
-    reference: "HammersteinARX"
-    models: tuple["HammersteinARX", ...] = field(repr=False)
-    kind: Kind
+    reference: HammersteinARX
+    models: tuple[HammersteinARX, ...] = field(repr=False)
+    kind: Literal["percentile", "basic"]
 
     @property
     def meaning(self) -> str:
@@ -73,11 +70,11 @@ class Bootstrap:
 
     percentile: Uncertainty
     basic: Uncertainty
-    models: tuple["HammersteinARX", ...] = field(repr=False)
+    models: tuple[HammersteinARX, ...] = field(repr=False)
     failed: int
 
 
-def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, solver: str = "auto") -> Bootstrap:
+def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, solver: str = "auto") -> Bootstrap:
     """Refit to records simulated with resampled residuals.
 
     Rows of residuals are drawn together for all outputs, centred and inflated by the degrees of freedom. The first
@@ -100,8 +97,6 @@ def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, s
     """
     from rich.console import Console
     from rich.progress import track
-
-    from optid.identify.fitting import fit as refit
 
     if isinstance(fit.data, Stream):
         raise StructureError("a stream cannot be simulated again; read the record, or use fit.uncertainty")
@@ -128,12 +123,12 @@ def bootstrap(fit: "Fit", runs: int = 200, seed: int = 0, level: float = 0.95, s
     if len(models) < 2:
         raise StructureError(f"{failed} of {runs} refits gave no point: there is no scatter to report")
     refits = tuple(models)
-    percentile, basic = (Uncertainty(fit, float(level), Refits(fit.model, refits, kind))
+    percentile, basic = (Uncertainty(fit.model, float(level), Refits(fit.model, refits, kind))
                          for kind in ("percentile", "basic"))
     return Bootstrap(percentile, basic, refits, failed)
 
 
-def _records(fit: "Fit", runs: int, seed: int) -> Iterator[Data]:
+def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
     """Yield the resampled records, in the units of the record fitted."""
     data: Data = fit.data  # type: ignore[assignment]
     model = fit.program.recover(fit.solution.values)
@@ -145,7 +140,7 @@ def _records(fit: "Fit", runs: int, seed: int) -> Iterator[Data]:
         yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
 
 
-def _residuals(model: "HammersteinARX", data: Data) -> Array:
+def _residuals(model: HammersteinARX, data: Data) -> Array:
     """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
     rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
     rows = rows[~np.isnan(rows).any(axis=1)]
@@ -154,7 +149,7 @@ def _residuals(model: "HammersteinARX", data: Data) -> Array:
     return (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - parameters / l, 1.0))
 
 
-def _simulated(model: "HammersteinARX", u: Array, y: Array, errors: Array) -> Array:
+def _simulated(model: HammersteinARX, u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.memory
     u, start = interpolated(u), interpolated(y)[:n]

@@ -9,6 +9,7 @@ import numpy as np
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.fitting import Fit, fit, resolve
+from optid.identify.validation.predictions import common_fits, one_step
 
 PENALTIES = ("ridge", "curvature", "weight")
 GRID = 13
@@ -41,7 +42,7 @@ class Path:
         lines = [f"{self.penalty:>12}   objective   hold-out one-step fit (%)   singular values 2/1"]
         for i, (weight, one, score) in enumerate(zip(self.weights, self.fits, self.scores)):
             mark = " <" if np.isfinite(score) and i == self.best else ""
-            lines.append(f"{weight:12.4g}   {one.solution.objective:9.4g}   {score:25.3f}   {_second(one):19.2e}{mark}")
+            lines.append(f"{weight:12.4g}   {one.solution.objective:9.4g}   {score:25.3f}   {_ratio(one):19.2e}{mark}")
         return "\n".join(lines)
 
 
@@ -113,19 +114,11 @@ def default_weights(data: Data) -> np.ndarray:
 def _score(one: Fit, test: Data | None) -> float:
     if test is None:
         return float("nan")
-    from optid.identify.validation import fit_percent
-
     raw = test.raw()
-    predicted = one.model.predict(raw)
-    several = predicted if isinstance(predicted, list | tuple) else [predicted]
-    return float(np.nanmean(fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(several))))
+    return float(np.nanmean(common_fits(raw, [one_step(one.model, raw)])))
 
 
-def _second(one: Fit) -> float:
+def _ratio(one: Fit) -> float:
     """Largest ratio of the second to the first singular value over the channels."""
-    ratios = [0.0]
-    for theta in one.program.compressed.matrices(one.solution.values):
-        values = np.linalg.svd(theta, compute_uv=False)
-        if values.size > 1 and values[0] > 0:
-            ratios.append(float(values[1] / values[0]))
-    return max(ratios)
+    values = [np.linalg.svd(theta, compute_uv=False) for theta in one.program.compressed.matrices(one.solution.values)]
+    return max([0.0, *(float(v[1] / v[0]) for v in values if v.size > 1 and v[0] > 0)])

@@ -5,65 +5,98 @@ gauge and the user's equalities leave free, in coordinates where the information
 depend on the gauge, such as ``mu bᵀ`` or a prediction, then has a covariance that does not depend on it either.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
-from cvxpy.constraints.zero import Equality, Zero
 from cvxpy.expressions.expression import Expression
+from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.gradients import jacobians
+from optid.program.gradients import flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program
 
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
 
+STEP = 1e-5  # step of the central differences, relative to the size of the parameter
 MEANINGS = {
     "gaussian": "confidence intervals of least squares, Student's quantile",
     "projected": "confidence intervals under inequalities: hull of projected posterior and basic bootstrap",
-    "penalised": "intervals of the posterior whose prior is the penalty: they cover on average over f, not pointwise",
-}
+    "penalised": "intervals of the posterior whose prior is the penalty: they cover on average over f, not pointwise"}
+
+Quantity = Callable[[Any], ArrayLike]
+"""A function of the model: a number or an array of fixed shape."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """A fit as a local linear regression.
+    """A fit as a local linear regression, the source of intervals that need no refit.
 
     Attributes:
-        names: variables of the programme, in the order of x.
-        shapes: their shapes.
+        rebuild: from the values of the variables, by name, to the model in the units, gauge and signs of the fit.
+        shapes: shapes of the variables of the programme by name, in the order of x.
         x: (n_x,) solution, every variable flattened column by column.
         directions: (n_x, n) dx/dv, v the whitened tangent coordinates.
         local: the estimate in these coordinates.
-        noise: (l, l) covariance of the equation error e, in units of the data fitted.
-        dof: degrees of freedom per output of that estimate.
-        parameters: effective number of parameters.
+        noise: (l, l) covariance of the equation error e, in raw units.
         meaning: what the intervals are, one of `MEANINGS`.
     """
 
-    names: tuple[str, ...]
-    shapes: tuple[tuple[int, ...], ...]
+    rebuild: Callable[[dict[str, Array]], Any]
+    shapes: dict[str, tuple[int, ...]]
     x: Array
     directions: Array
     local: LocalEstimate = field(repr=False)
     noise: Array
-    dof: float
-    parameters: float
     meaning: str
 
-    def values(self, x: Array) -> dict[str, Array]:
-        """Name the parts of x."""
-        return unpacked(self.names, self.shapes, x)
+    def covariance(self, quantity: Quantity) -> Array:
+        """Covariance (q, q) of a quantity, flattened, without regard to inequalities."""
+        scattered = self.slopes(quantity) @ self.local.scatter
+        return scattered @ scattered.T
+
+    def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
+        """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
+        return self.local.limits(self.slopes(quantity), level)
+
+    def slopes(self, quantity: Quantity) -> Array:
+        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by central differences.
+
+        Raises:
+            StructureError: the quantity changes its shape with the model.
+        """
+        columns = []
+        for above, below, gap in self._neighbours:
+            high, low = (np.ravel(np.asarray(quantity(model), dtype=float)) for model in (above, below))
+            if high.shape != low.shape:
+                raise StructureError("the quantity changes its shape with the model, so it has no derivative")
+            columns.append((high - low) / gap)
+        return np.column_stack(columns) @ self.directions
+
+    @cached_property
+    def _neighbours(self) -> list[tuple[Any, Any, float]]:
+        """Models a small step above and below in every unknown of the programme, and the distance between them."""
+        sizes, found = np.abs(self.x), []
+        scale = np.concatenate([np.full(part.size, max(float(np.max(part)), 1e-300))
+                                for part in _unpacked(self.shapes, sizes).values()])
+        for j, step in enumerate(STEP * np.maximum(sizes, 1e-2 * scale)):
+            ends = self.x + np.outer([step, -step], np.eye(self.x.size)[j])
+            above, below = (self.rebuild(_unpacked(self.shapes, x)) for x in ends)
+            found.append((above, below, float(ends[0, j] - ends[1, j])))
+        return found
 
 
-def linearise(fit: Any, draws: int, seed: int) -> Tangent:
+def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, seed: int) -> Tangent:
     """Linearise a fit.
 
     Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
@@ -72,6 +105,7 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
 
     Args:
         fit: a fit whose programme carries its compressed least-squares problem.
+        rebuild: as in `Tangent`.
         draws: random draws for intervals under inequalities.
         seed: their seed.
 
@@ -80,19 +114,17 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
             linearisation.
         RankError: a parameter without effect on the predictions, such as the numerator of an input whose f is zero.
     """
-    program, compressed, found = fit.program, fit.program.compressed, fit.solution.values
     _refuse(fit)
-    names = tuple(name for name in program.variables if name not in program.derived)
-    shapes = tuple(program.variables[name].shape for name in names)
-    x = np.concatenate([np.ravel(found[name], order="F") for name in names])
+    program, compressed, found = fit.program, fit.program.compressed, fit.solution.values
+    shapes = {name: v.shape for name, v in program.variables.items() if name not in program.derived}
+    x = np.concatenate([np.ravel(found[name], order="F") for name in shapes])
     program.assign(found)
-    equalities, inequalities, slack = _constraint_rows(program, names)
+    equalities, inequalities, slack = _constraint_rows(program, tuple(shapes))
 
-    lift, lifted = _differences(lambda x: compressed.lifted(unpacked(names, shapes, x)), x)
-    coefficients, regression = _differences(lambda x: compressed.regression(unpacked(names, shapes, x)).ravel(), x)
+    lift, lifted = _differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
+    coefficients, regression = _differences(lambda x: compressed.regression(_unpacked(shapes, x)).ravel(), x)
     problem, statistics = compressed.problem, compressed.statistics
-    effect = problem.root @ lift
-    free, triangle, basis = _whitened(effect, equalities, names, shapes)
+    free, triangle, basis = _whitened(problem.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
     pull = basis.T @ (problem.root @ lifted - problem.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
@@ -117,20 +149,25 @@ def linearise(fit: Any, draws: int, seed: int) -> Tangent:
     scatter = _square_root(covariance) @ basis.T
     local = LocalEstimate(centre, scatter, dof, inequalities @ directions, slack, draws, seed)
     meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
-    return Tangent(names, shapes, x, directions, local, program.unit * noise, dof, parameters, MEANINGS[meaning])
+    transform = getattr(fit.data, "transform", None)
+    scale = np.ones(l) if transform is None else np.array(transform.y_scale)
+    return Tangent(rebuild, shapes, x, directions, local, program.unit * noise * np.outer(scale, scale),
+                   MEANINGS[meaning])
 
 
-def unpacked(names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...], x: Array) -> dict[str, Array]:
+def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:
     """Split a flat vector into named arrays, each filled column by column."""
-    edges = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
-    return {name: part.reshape(shape, order="F") for name, shape, part in zip(names, shapes, np.split(x, edges))}
+    edges = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
+    return {name: part.reshape(shape, order="F") for (name, shape), part in zip(shapes.items(), np.split(x, edges))}
 
 
 def _refuse(fit: Any) -> None:
     if not fit.solution.has_point:
         raise StructureError("the fit has no point, so there is nothing to put intervals around")
-    if not all(hasattr(fit.program.compressed, part) for part in ("problem", "statistics", "regression", "lifted")):
-        raise StructureError(f"{fit.formulation!r} is no compressed least-squares problem; use optid.bootstrap")
+    if not hasattr(fit.program.compressed, "lifted"):
+        advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
+        raise StructureError("they follow from compressed least squares, which "
+                             f"{fit.formulation!r} does not keep{advice}")
     loss = str(fit.arguments.get("loss", "squares"))
     if loss != "squares":
         raise StructureError(f"loss {loss!r} is not least squares, so that its standard errors do not follow from the "
@@ -153,11 +190,10 @@ def _differences(function: Any, x: Array) -> tuple[Array, Array]:
     return jacobian, base
 
 
-def _whitened(effect: Array, equalities: Array, names: tuple[str, ...], shapes: tuple[tuple[int, ...], ...]
-              ) -> tuple[Array, Array, Array]:
+def _whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
     """Return (free directions, R, Q) with effect @ free = Q R, after scaling every unknown by its effect."""
     sizes = np.linalg.norm(effect, axis=0)
-    for name, part in unpacked(names, shapes, sizes).items():
+    for name, part in _unpacked(shapes, sizes).items():
         if np.any(part <= NO_EFFECT * np.max(sizes)):
             raise RankError(f"{name!r} has an entry without any effect on the predictions: its error is unbounded. "
                             "Leave the channel out, or fix the entry by a constraint")
@@ -186,30 +222,28 @@ def _constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, A
         for member in group:
             if any(id(v) in derived for v in member.variables()):
                 continue
-            if isinstance(member, Equality | Zero):
-                equal.append(_gradient(program, names, name, member.args[0] if len(member.args) == 1 else member.expr))
-                continue
-            expression, sign = _one_sided(name, member)
-            if expression is not None:
-                above.append(sign * _gradient(program, names, name, expression))
-                slack.append(np.maximum(sign * np.ravel(np.asarray(expression.value), order="F"), 0.0))
+            if isinstance(member, EQUALITIES):
+                equal.append(_gradient(program, names, name, member.expr))
+            elif (positive := _one_sided(name, member)) is not None:
+                above.append(_gradient(program, names, name, positive))
+                slack.append(np.maximum(flat_value(positive), 0.0))
     return np.vstack(equal), np.vstack(above), np.concatenate(slack)
 
 
-def _one_sided(name: str, member: Constraint) -> tuple[Expression | None, float]:
-    """Return (expression, sign) with sign * expression >= 0; None for a matrix or cone constraint far from active."""
-    if isinstance(member, Inequality | NonPos):
-        return member.expr, -1.0
+def _one_sided(name: str, member: Constraint) -> Expression | None:
+    """Return an expression that must be >= 0; None for a matrix or cone constraint far from active."""
+    if isinstance(member, INEQUALITIES):
+        return -member.expr
     if isinstance(member, NonNeg):
-        return member.args[0], 1.0
+        return member.args[0]
     if isinstance(member, PSD):
         values = np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))
         if values[0] > 1e-3 * np.max(np.abs(values)):
-            return None, 0.0
+            return None
     if isinstance(member, SOC):
         head, tail = np.atleast_1d(member.args[0].value), np.atleast_1d(member.args[1].value)
         if np.all(head - np.linalg.norm(tail, axis=0) > 1e-3 * np.abs(head)):
-            return None, 0.0
+            return None
     raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
                          "use optid.bootstrap for intervals")
 

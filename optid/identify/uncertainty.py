@@ -7,10 +7,9 @@ keeps its coverage where treating active constraints as equalities loses it. `op
 same quantities from refits.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,17 +18,7 @@ from optid.arrays import Array
 from optid.bases.expansions import Linear
 from optid.errors import StructureError
 from optid.identify.intervals import DRAWS
-from optid.identify.tangent import Tangent, linearise
-
-if TYPE_CHECKING:
-    from optid.identify.fitting import Fit
-    from optid.models import HammersteinARX
-
-Quantity = Callable[["HammersteinARX"], ArrayLike]
-"""A function of the model: a number or an array of fixed shape."""
-
-STEP = 1e-5
-"""Step of the central differences, relative to the size of the parameter."""
+from optid.identify.tangent import Quantity, linearise
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +41,12 @@ class Interval:
 
 
 class Source(Protocol):
-    """Where intervals come from: the linearised problem, or refits.
-
-    Attributes:
-        meaning: what the intervals are, in words.
-    """
+    """Where intervals come from: `optid.identify.tangent.Tangent`, or refits (`optid.identify.resampling.Refits`)."""
 
     @property
-    def meaning(self) -> str: ...  # noqa: D102
+    def meaning(self) -> str:
+        """What the intervals are, in words."""
+        ...
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
@@ -68,15 +55,15 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Intervals around a fit, in raw units and in the gauge of ``fit.model``.
+    """Intervals around a fitted model, in raw units and in its gauge.
 
     Attributes:
-        fit: the fit.
+        model: the fitted model.
         level: probability that an interval contains the truth.
-        source: where they come from; `Linearised` or `optid.identify.resampling.Refits`.
+        source: where they come from.
     """
 
-    fit: "Fit" = field(repr=False)
+    model: Any = field(repr=False)
     level: float
     source: Source = field(repr=False)
 
@@ -103,12 +90,12 @@ class Uncertainty:
     @cached_property
     def b(self) -> tuple[Interval, ...]:
         """Coefficients of B, one per input, in the gauge of the model."""
-        return tuple(self.of(lambda model, c=c: model.b[c]) for c in range(self.fit.model.m))
+        return tuple(self.of(lambda model, c=c: model.b[c]) for c in range(self.model.m))
 
     @cached_property
     def mu(self) -> tuple[Interval, ...]:
         """Coefficients of the nonlinearities, one per input, in the gauge of the model."""
-        return tuple(self.of(lambda model, c=c: model.nonlinearities[c].mu) for c in range(self.fit.model.m))
+        return tuple(self.of(lambda model, c=c: model.nonlinearities[c].mu) for c in range(self.model.m))
 
     @cached_property
     def offset(self) -> Interval:
@@ -120,7 +107,7 @@ class Uncertainty:
     @cached_property
     def f(self) -> tuple[Interval, ...]:
         """Band of every nonlinearity on the grid of its basis; see `band`."""
-        return tuple(self.band(c) for c in range(self.fit.model.m))
+        return tuple(self.band(c) for c in range(self.model.m))
 
     def band(self, channel: int = 0, at: ArrayLike | None = None, offset: bool = True) -> Interval:
         """Return the pointwise band of a nonlinearity in the gauge of the model.
@@ -131,13 +118,11 @@ class Uncertainty:
             offset: include the offset of f where the model knows it (``model.c0``); where it does not, or with False,
                 the band is that of f without constant, which has no width where the basis vanishes.
         """
-        model = self.fit.model
+        model = self.model
         basis = model.nonlinearities[channel].basis
         points = basis.grid() if at is None else np.atleast_1d(np.asarray(at, dtype=float))
-        if isinstance(basis, Linear) or not offset or model.c0 is None:
-            found = self.of(lambda model: model.nonlinearities[channel](points))
-        else:
-            found = self.of(lambda model: model.nonlinearities[channel](points) + model.c0)
+        with_offset = offset and not isinstance(basis, Linear) and model.c0 is not None
+        found = self.of(lambda model: model.nonlinearities[channel](points) + (model.c0 if with_offset else 0.0))
         return replace(found, at=points)
 
     def frequency_response(self, w: ArrayLike | None = None) -> tuple[Interval, Interval]:
@@ -150,9 +135,9 @@ class Uncertainty:
             magnitude and phase, each of shape (k, l, m), in the gauge of the model. The magnitude is treated on a
             logarithmic scale, so that its band is positive.
         """
-        nyquist = np.pi / self.fit.model.dt
+        nyquist = np.pi / self.model.dt
         points = np.linspace(nyquist / 200, nyquist, 200) if w is None else np.atleast_1d(np.asarray(w, dtype=float))
-        reference = self.fit.model.frequency_response(points)
+        reference = self.model.frequency_response(points)
         phase = np.unwrap(np.angle(reference), axis=0)
         log = self.of(lambda model: np.log(np.abs(model.frequency_response(points))))
         turn = self.of(lambda model: phase + np.angle(model.frequency_response(points) / reference))
@@ -169,7 +154,7 @@ class Uncertainty:
         Raises:
             StructureError: a quantity that is not real or changes its shape with the model.
         """
-        value = np.asarray(quantity(self.fit.model))
+        value = np.asarray(quantity(self.model))
         if np.iscomplexobj(value):
             raise StructureError("the quantity is complex; take its real and imaginary part, or modulus and angle")
         error, lower, upper = self.source.limits(quantity, self.level)
@@ -180,79 +165,11 @@ class Uncertainty:
     def table(self) -> list[tuple[str, float, float, float, float]]:
         """Return (name, estimate, standard error, lower, upper) of every coefficient that tables of the model show."""
         found = self.of(lambda model: np.array([value for _, value in model.coefficients()]))
-        return [(name, *_row(found, i)) for i, (name, _) in enumerate(self.fit.model.coefficients())]
+        rows = np.column_stack([found.value, found.error, found.lower, found.upper]).tolist()
+        return [(name, *row) for (name, _), row in zip(self.model.coefficients(), rows)]
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Intervals from the linearised problem.
-
-    Attributes:
-        fit: the fit.
-        tangent: its linearisation.
-    """
-
-    fit: "Fit"
-    tangent: Tangent
-
-    @property
-    def meaning(self) -> str:
-        """What the intervals are, in words."""
-        return self.tangent.meaning
-
-    @property
-    def noise(self) -> Array:
-        """Estimated covariance (l, l) of the equation error e, in raw units."""
-        transform = getattr(self.fit.data, "transform", None)
-        scale = np.ones(len(self.tangent.noise)) if transform is None else np.array(transform.y_scale)
-        return self.tangent.noise * np.outer(scale, scale)
-
-    def covariance(self, quantity: Quantity) -> Array:
-        """Covariance (q, q) of a quantity, flattened, without regard to inequalities."""
-        scattered = self.slopes(quantity) @ self.tangent.local.scatter
-        return scattered @ scattered.T
-
-    def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
-        """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
-        return self.tangent.local.limits(self.slopes(quantity), level)
-
-    def slopes(self, quantity: Quantity) -> Array:
-        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by central differences.
-
-        Raises:
-            StructureError: the quantity changes its shape with the model.
-        """
-        columns = []
-        for above, below, gap in self._neighbours:
-            high, low = (np.ravel(np.asarray(quantity(model), dtype=float)) for model in (above, below))
-            if high.shape != low.shape:
-                raise StructureError("the quantity changes its shape with the model, so it has no derivative")
-            columns.append((high - low) / gap)
-        return np.column_stack(columns) @ self.tangent.directions
-
-    @cached_property
-    def _neighbours(self) -> list[tuple["HammersteinARX", "HammersteinARX", float]]:
-        """Models a small step above and below in every unknown of the programme, and the distance between them."""
-        x, found = self.tangent.x, []
-        sizes = self.tangent.values(np.abs(x))
-        scale = np.concatenate([np.full(part.size, max(float(np.max(part)), 1e-300)) for part in sizes.values()])
-        for j, step in enumerate(STEP * np.maximum(np.abs(x), 1e-2 * scale)):
-            above, below = x.copy(), x.copy()
-            above[j] += step
-            below[j] -= step
-            found.append((self._model(above), self._model(below), float(above[j] - below[j])))
-        return found
-
-    def _model(self, x: Array) -> "HammersteinARX":
-        """Build the reported model from the unknowns of the programme, with the signs of ``fit.model``."""
-        model = self.fit.program.recover(self.tangent.values(x))
-        transform = getattr(self.fit.data, "transform", None)
-        if transform is not None:
-            model = model.with_transform(transform)
-        return aligned(model, self.fit.model)
-
-
-def uncertainty(fit: "Fit", level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
+def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
     """Linearise a fit and return its standard errors, intervals and bands.
 
     Args:
@@ -268,11 +185,13 @@ def uncertainty(fit: "Fit", level: float = 0.95, draws: int = DRAWS, seed: int =
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    if not hasattr(fit.program.compressed, "lifted"):
-        advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
-        raise StructureError("they follow from compressed least squares, which "
-                             f"{fit.formulation!r} does not keep{advice}")
-    return Uncertainty(fit, _checked_level(level), Linearised(fit, linearise(fit, draws, seed)))
+    level, transform = _checked_level(level), getattr(fit.data, "transform", None)
+
+    def rebuild(values: dict[str, Array]) -> Any:
+        model = fit.program.recover(values)
+        return aligned(model if transform is None else model.with_transform(transform), fit.model)
+
+    return Uncertainty(fit.model, level, linearise(fit, rebuild, draws, seed))
 
 
 def aligned(model: Any, reference: Any) -> Any:
@@ -282,12 +201,6 @@ def aligned(model: Any, reference: Any) -> Any:
         return model
     return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)),
                    nonlinearities=tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities)))
-
-
-def _row(interval: Interval, i: int) -> tuple[float, float, float, float]:
-    value, error, lower, upper = (float(np.ravel(part)[i]) for part in
-                                  (interval.value, interval.error, interval.lower, interval.upper))
-    return value, error, lower, upper
 
 
 def _checked_level(level: float) -> float:

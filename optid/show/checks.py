@@ -1,13 +1,14 @@
-"""What a validation found, as rows: errors, tests, and the fit against the horizon."""
+"""Tables of validations and comparisons: errors, tests, and the fit against the horizon."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.models.functions import static_functions
 from optid.show.wording import Table, number, percent
 
 if TYPE_CHECKING:
-    from optid.identify.validation import HorizonCurve, Validation
+    from optid.identify.validation import Comparison, HorizonCurve, Validation
 
 
 def validation_tables(checked: "Validation") -> list[Table]:
@@ -71,3 +72,35 @@ def horizon_table(curve: "HorizonCurve") -> Table:
     if not np.isnan(curve.simulation).all():
         rows.append(("simulation", *(percent(fit).removesuffix(" %") for fit in curve.simulation)))
     return Table("Fit in % against the prediction horizon", ("samples ahead", *curve.outputs), rows)
+
+
+def comparison_table(found: "Comparison") -> Table:
+    """Fit of every output by every predictor, and the residual tests, one row per model and output."""
+    rows = []
+    for i, (name, checked) in enumerate(zip(found.names, found.validations)):
+        for o, output in enumerate(found.data.outputs):
+            own = [t for t in checked.cross_correlations.values() if t.output == output]
+            fits = [percent(found.fits[word][i, o]) for word in found.fits]
+            white = "yes" if checked.autocorrelations[output].passed else "no"
+            label = name if len(found.data.outputs) == 1 else f"{name}: {output}"
+            rows.append((label, *fits, white, "yes" if all(t.passed for t in own) else "no"))
+    what = "model" if len(found.data.outputs) == 1 else "model: output"
+    note = "Fits over the samples that all models predict."
+    if len(found.names) > 1 and "simulation" in found.fits:
+        note += f" Best simulation: {found.best()}."
+    head = (what, *found.fits, "white", "independent")
+    return Table(f"Fit on {found.data.name or 'the record'}", head, rows, note)
+
+
+def facts_table(found: "Comparison") -> Table:
+    """Kind, orders, number of coefficients and largest pole of every model."""
+    rows = [
+        (
+            name,
+            model.title,
+            str(len(model.coefficients()) + sum(f.nonlinearity.mu.size for f in static_functions(model))),
+            number(float(np.max(np.abs(model.poles), initial=0.0)), 4),
+        )
+        for name, model in zip(found.names, found.models)
+    ]
+    return Table("Models", ("model", "kind", "numbers", "largest pole"), rows)

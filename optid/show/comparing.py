@@ -1,54 +1,15 @@
-"""Several models on one page: the table, and what their predictions look like on top of each other."""
+"""Figures of several models on one record: their simulations, fits against the horizon, and poles."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from optid.models.functions import static_functions
 from optid.show import panels
 from optid.show.panels import CLOSEUP, INK, LINES, plain, styled, with_unit
-from optid.show.printing import set_table
-from optid.show.wording import Table, number, percent
 
 if TYPE_CHECKING:
     from optid.identify.validation.comparison import Comparison
-
-def comparison_table(found: "Comparison") -> Table:
-    """Fit of every output by every predictor, and the residual tests, one row per model and output."""
-    rows = []
-    for i, (name, checked) in enumerate(zip(found.names, found.validations)):
-        for o, output in enumerate(found.data.outputs):
-            own = [t for t in checked.cross_correlations.values() if t.output == output]
-            fits = [percent(found.fits[word][i, o]) for word in found.fits]
-            white = "yes" if checked.autocorrelations[output].passed else "no"
-            label = name if len(found.data.outputs) == 1 else f"{name}: {output}"
-            rows.append((label, *fits, white, "yes" if all(t.passed for t in own) else "no"))
-    what = "model" if len(found.data.outputs) == 1 else "model: output"
-    note = "Fits over the samples that all models predict."
-    if len(found.names) > 1 and "simulation" in found.fits:
-        note += f" Best simulation: {found.best()}."
-    head = (what, *found.fits, "white", "independent")
-    return Table(f"Fit on {found.data.name or 'the record'}", head, rows, note)
-
-
-def facts_table(found: "Comparison") -> Table:
-    """Kind, orders, number of coefficients and largest pole of every model."""
-    rows = [
-        (
-            name,
-            model.title,
-            str(len(model.coefficients()) + sum(f.nonlinearity.mu.size for f in static_functions(model))),
-            number(float(np.max(np.abs(model.poles), initial=0.0)), 4),
-        )
-        for name, model in zip(found.names, found.models)
-    ]
-    return Table("Models", ("model", "kind", "numbers", "largest pole"), rows)
-
-
-def describe_comparison(found: "Comparison") -> str:
-    """Return the comparison as text, at most 80 columns wide."""
-    return "\n".join(set_table(comparison_table(found)))
 
 
 @styled

@@ -10,7 +10,7 @@ from optid.show.wording import Table
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
-    from optid.identify.validation import Validation
+    from optid.identify.validation import Comparison, HorizonCurve, Validation
 
 WIDTH, LEFT = 80, 36
 
@@ -75,6 +75,16 @@ def describe_checks(checked: "Validation") -> str:
     for table in checks.validation_tables(checked):
         lines += [*set_table(table), ""]
     return "\n".join([*lines[:-1], *(line for note in checked.notes for line in _wrapped(f"Note: {note}"))])
+
+
+def describe_horizons(curve: "HorizonCurve") -> str:
+    """Return the fit against the prediction horizon as text, at most 80 columns wide."""
+    return "\n".join(set_table(checks.horizon_table(curve)))
+
+
+def describe_comparison(found: "Comparison") -> str:
+    """Return the comparison of several models as text, at most 80 columns wide."""
+    return "\n".join(set_table(checks.comparison_table(found)))
 
 
 _SHORT = ("Objective", "Bound", "Relative gap")

@@ -80,8 +80,8 @@ def _compared(found: "Comparison", command: str) -> dict[str, Any]:
         "version": __version__,
         "title": f"{len(found.names)} models on one record" if several else f"Validation of a {found.models[0].title}",
         "lead": " · ".join(part for part in (found.data.name, f"{found.data.n_samples} samples") if part),
-        "fits": comparing.comparison_table(found),
-        "facts": comparing.facts_table(found),
+        "fits": checks.comparison_table(found),
+        "facts": checks.facts_table(found),
         "figures": figures,
         "validation": [
             {

@@ -51,7 +51,7 @@ def blocks_of(part: Stretch, layout: Layout, chunk: int) -> Iterator[Block]:
     """
     size = _block_size(layout, chunk)
     for i, (u, y, *weights) in enumerate(stretches([part.arrays], layout.first_row, size)):
-        _check_inside(u, layout, part.record, part.position + i * size)
+        check_inside(u, layout, part.record, part.position + i * size)
         yield make_block(u, y, weights[0] if weights else None, layout)
 
 
@@ -111,7 +111,12 @@ def check_channels(data: Any, layout: Layout) -> None:
                             f"({', '.join(wanted)}).")
 
 
-def _check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
+def check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
+    """Refuse samples (N, m) outside a basis with outside="error"; the first of them has number `position`.
+
+    Raises:
+        DataError: names the input and the sample.
+    """
     for c, basis in enumerate(layout.bases):
         if basis.outside == "error" and (out := basis.is_outside(u[:, c])).any():
             k = int(np.argmax(out))

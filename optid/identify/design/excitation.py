@@ -2,13 +2,14 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optid import signals
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.identify.design.expansion import Bases, FeedbackBases
@@ -17,23 +18,13 @@ from optid.identify.design.response import FrequencyResponse, frequency_response
 from optid.identify.design.rules import FEW_LEVELS
 
 KINDS = ("multisine", "chirp", "noise", "levels")
-REFUSED = {
-    "prbs": "two levels cannot identify a static nonlinearity: any function is a straight line there",
-    "binary": "two levels cannot identify a static nonlinearity: any function is a straight line there",
-    "sinusoid": "a sinusoid through a polynomial of degree p has p harmonics and excites 2 p + 1 regressors",
-}
-SWEEPS = 4
-"""Sweeps of a chirp."""
-
-FAINT = 0.05
-"""A frequency belongs to the band when its measured gain is above this share of the largest."""
-
-TRUSTED = 0.5
-"""Coherence below which the measured gain says more of the disturbance than of the plant."""
-
-WANTED, WIDER = 1e4, 1.3
-"""A band that was not asked for grows by this factor until the condition number is no larger."""
-
+TWO_LEVELS = "two levels cannot identify a static nonlinearity: any function is a straight line there"
+REFUSED = {"prbs": TWO_LEVELS, "binary": TWO_LEVELS,
+           "sinusoid": "a sinusoid through a polynomial of degree p has p harmonics and excites 2 p + 1 regressors"}
+SWEEPS = 4  # sweeps of a chirp
+FAINT = 0.05  # a frequency belongs to the band when its measured gain is above this share of the largest
+TRUSTED = 0.5  # coherence below which the measured gain says more of the disturbance than of the plant
+WANTED, WIDER = 1e4, 1.3  # a band that was not asked for grows by this factor until the condition number is no larger
 BOOST = 4.0
 """Shaping raises no frequency by more than this factor over another: what is left of a resonance would drown in dead
 zone and noise."""
@@ -109,7 +100,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     Warns:
         DataWarning: an excitation that weakens the answer.
     """
-    _check(kind, band, shaped, candidates, rows, levels)
+    _check(kind, band, shaped, candidates=candidates, rows=rows, levels=levels)
     n = max(e.n_samples for e in like.experiments) if n is None else n
     ranges = _ranges(like, amplitude)
     measured = frequency_response(like)
@@ -118,14 +109,21 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     few = FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
     top = 0.9 * float(measured.frequency[-1])
 
+    def weight(c: int, frequency: Array) -> Array:
+        gain = measured.gain(frequency, c)
+        return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
+
     def realised(draw: int) -> tuple[Array, Promise]:
         columns = []
-        for c, span in enumerate(ranges):
-            weight = (lambda f: _inverse_gain(measured, c, f)) if shaped else None  # noqa: B023 - used at once
-            x = _signal(kind, n, span, like.dt, limits, weight, hold, periods, seed + draw * like.m + c)
+        for c, (low, high) in enumerate(ranges):
+            x = _signal(kind, n, (low, high), like.dt, limits, partial(weight, c) if shaped else None, hold, periods,
+                        seed + draw * like.m + c)
             if kind == "chirp":
-                x = np.roll(x, c * n // (SWEEPS * like.m))  # inputs that sweep in step could not be told apart
-            columns.append(x if levels is None else _quantised(x, *span, levels))
+                x = np.roll(x, c * n // (SWEEPS * like.m))  # inputs that sweep in step could not be distinguished
+            if levels is not None:
+                step = (high - low) / (levels - 1)
+                x = low + step * np.round((x - low) / step)
+            columns.append(x)
         u = np.column_stack(columns)
         return u, promised(u, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
 
@@ -144,7 +142,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     return Excitation(u, like.dt, like.inputs, like.input_units, kind, promise)
 
 
-def _check(kind: str, band: Any, shaped: bool, candidates: int, rows: int, levels: int | None) -> None:
+def _check(kind: str, band: Any, shaped: bool, **counts: int | None) -> None:
     if kind in REFUSED:
         raise StructureError(f"kind {kind!r} is refused: {REFUSED[kind]}. Use one of {', '.join(KINDS)}.")
     if kind not in KINDS:
@@ -153,21 +151,19 @@ def _check(kind: str, band: Any, shaped: bool, candidates: int, rows: int, level
         raise StructureError("levels have the band that holding gives them; set hold, or use kind 'noise'.")
     if shaped and kind not in ("multisine", "chirp"):
         raise StructureError(f"shaping changes the spectrum of a multisine or the envelope of a chirp, not {kind!r}.")
-    for name, value, least in (("candidates", candidates, 1), ("rows", rows, 1), ("levels", levels, 2)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least):
-            raise StructureError(f"{name} = {value!r}: a whole number, at least {least}, is needed.")
+    for name, value in counts.items():
+        if value is not None:
+            check_integer(value, name, 2 if name == "levels" else 1)
 
 
 def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:
     """Return (low, high) of every input."""
-    if amplitude is None:
-        return [(float(low), float(high)) for low, high in zip(*like.ranges())]
     try:
-        pairs = np.broadcast_to(np.asarray(amplitude, dtype=float), (like.m, 2))
+        given = np.transpose(like.ranges()) if amplitude is None else np.asarray(amplitude, dtype=float)
+        return [(float(low), float(high)) for low, high in np.broadcast_to(given, (like.m, 2))]
     except (TypeError, ValueError):
         raise StructureError(f"amplitude = {amplitude!r}: (low, high), or one such pair for each of the {like.m} "
                              "inputs, is needed.") from None
-    return [(float(low), float(high)) for low, high in pairs]
 
 
 def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tuple[float, float]:
@@ -184,11 +180,6 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
     if len(band) != 2 or not 0 <= band[0] < band[1] <= top:
         raise StructureError(f"band = {band}: two rising frequencies from 0 to half the sampling rate, {top:g}.")
     return float(band[0]), float(band[1])
-
-
-def _inverse_gain(measured: FrequencyResponse, c: int, frequency: Array) -> Array:
-    gain = measured.gain(frequency, c)
-    return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
 
 
 def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple[float, float], weight: Any,
@@ -211,9 +202,3 @@ def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple
         x = x * weight(first + (high - first) * (np.arange(n) % sweep) / sweep)
         x = x / np.max(np.abs(x))
     return sum(span) / 2 + (span[1] - span[0]) / 2 * x
-
-
-def _quantised(x: Array, low: float, high: float, levels: int) -> Array:
-    """Round to equally spaced values from low to high."""
-    step = (high - low) / (levels - 1)
-    return low + step * np.round((x - low) / step)

@@ -7,26 +7,17 @@ more than 2 L + 1 dimensions, however long they are.
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.stretches import runs_of
+from optid.statistics.hankel import complete_runs
 
-LONGEST = 4096
-"""Samples looked at; more would tell nothing new about a few lines."""
-
-LOBE = 5
-"""Bins that hold a line: all but a thousandth of it, after a Hann window."""
-
-
+LONGEST = 4096  # samples looked at; more would tell nothing new about a few lines
+LOBE = 5  # bins that hold a line: all but a thousandth of it, after a Hann window
 JOINT, STEPS = 6, 3
 """The first few frequencies are refined together after each new one, so many times; later ones stay where they are."""
 
 
 def longest_run(signals: Array) -> Array:
     """Return the longest stretch of rows (N, s) without NaN, at most `LONGEST` rows of it."""
-    edges = runs_of(~np.isnan(signals).any(axis=1))
-    if not len(edges):
-        return signals[:0]
-    start, stop = edges[np.argmax(edges[:, 1] - edges[:, 0])]
-    return signals[start : min(stop, start + LONGEST)]
+    return max(complete_runs(signals, 1), key=len, default=signals[:0])[:LONGEST]
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:

@@ -10,6 +10,7 @@ from optid.data.record import Data
 from optid.identify.design.expansion import Bases, FeedbackBases, expanded_condition, expansion_of
 from optid.identify.design.response import FrequencyResponse
 from optid.identify.design.rules import Check, check_condition, check_feedback, check_levels, check_lines
+from optid.signals import crest_factor
 
 
 @dataclass(frozen=True)
@@ -41,17 +42,15 @@ class Promise:
     how: str
 
     def __str__(self) -> str:
-        lines = [
-            f"expected condition number  {self.condition:.3g}  of {self.functions} functions at {self.rows} lags",
-            f"levels                     {', '.join(map(str, self.levels))}",
-            f"band                       {self.band[0]:.4g} to {self.band[1]:.4g}",
-            f"amplitude                  {', '.join(f'{low:.4g} to {high:.4g}' for low, high in self.amplitude)}",
-            f"crest factor               {', '.join(f'{c:.3g}' for c in self.crest)}",
-            f"standard deviation of y    {', '.join(f'{s:.3g}' for s in self.outputs)} (expected)",
-            *(f"{check.rule:<26} {check}" for check in self.checks),
-            f"how                        {self.how}",
-        ]
-        return "\n".join(lines)
+        facts = {
+            "expected condition number": f"{self.condition:.3g}  of {self.functions} functions at {self.rows} lags",
+            "levels": ", ".join(map(str, self.levels)),
+            "band": f"{self.band[0]:.4g} to {self.band[1]:.4g}",
+            "amplitude": ", ".join(f"{low:.4g} to {high:.4g}" for low, high in self.amplitude),
+            "crest factor": ", ".join(f"{c:.3g}" for c in self.crest),
+            "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)"}
+        lines = [*facts.items(), *((check.rule, check) for check in self.checks), ("how", self.how)]
+        return "\n".join(f"{name:<26} {value}" for name, value in lines)
 
 
 def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
@@ -75,8 +74,6 @@ def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[floa
     Raises:
         RankError: an excitation shorter than a window.
     """
-    from optid.signals import crest_factor
-
     y = predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
     expansion = expansion_of(record, basis, feedback_basis)

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
-from optid.errors import DataError, StructureError
+from optid.errors import DataError
 
-SILENT = 1e-4
-"""Input power, relative to its largest over frequency, below which nothing is read off."""
+SILENT = 1e-4  # input power, relative to its largest over frequency, below which nothing is read off
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +66,7 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
         DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
     """
     longest = max(e.n_samples for e in data.experiments)
-    size = max(32, longest // max(4, data.m + 1)) if segment is None else segment
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 8:
-        raise StructureError(f"segment = {segment!r}: a whole number of samples, at least 8, is needed.")
+    size = max(32, longest // max(4, data.m + 1)) if segment is None else check_integer(segment, "segment", 8)
     window = np.hanning(size + 1)[:-1]
     m, l = data.m, data.l  # noqa: E741 - the field's letter
     sums, count = np.zeros((size // 2 + 1, m + l, m + l), dtype=complex), 0
@@ -90,24 +87,18 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     frequency = np.arange(1, size // 2 + 1) / (size * data.dt)
     uu, yu = spectra[:, :m, :m], spectra[:, m:, :m]
     yy = np.real(np.diagonal(spectra[:, m:, m:], axis1=1, axis2=2))
+    power = np.real(np.diagonal(uu, axis1=1, axis2=2))
+    heard = np.flatnonzero((power > SILENT * power.max(axis=0)).all(axis=1))
+    scale = np.sqrt(power[heard])
+    values = np.linalg.svd(uu[heard] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
+    k = heard[values[:, 0] < 1e6 * values[:, -1]]  # where every input has power of its own
+    if not k.size:
+        raise DataError("the inputs cannot be told apart at any frequency: they are collinear or hardly move.")
     response = np.full((frequency.size, l, m), np.nan, dtype=complex)
     coherence, disturbance = np.zeros((frequency.size, l)), yy.copy()
-    for k in np.flatnonzero(_excited(uu)):
-        response[k] = np.linalg.solve(uu[k].T, yu[k].T).T
-        explained = np.real(np.sum(response[k] * np.conj(yu[k]), axis=1))
-        coherence[k] = np.clip(explained / np.where(yy[k] > 0, yy[k], 1.0), 0.0, 1.0)
-        # The estimate takes m of the averaged segments' degrees of freedom.
-        disturbance[k] = yy[k] * (1 - coherence[k]) * count / (count - m)
-    if np.isnan(response).all():
-        raise DataError("the inputs cannot be told apart at any frequency: they are collinear or hardly move.")
+    response[k] = np.linalg.solve(uu[k].swapaxes(1, 2), yu[k].swapaxes(1, 2)).swapaxes(1, 2)
+    explained = np.real(np.sum(response[k] * np.conj(yu[k]), axis=2))
+    coherence[k] = np.clip(explained / np.where(yy[k] > 0, yy[k], 1.0), 0.0, 1.0)
+    # The estimate takes m of the averaged segments' degrees of freedom.
+    disturbance[k] = yy[k] * (1 - coherence[k]) * count / (count - m)
     return FrequencyResponse(frequency, response, coherence, disturbance, count, data.inputs, data.outputs)
-
-
-def _excited(uu: np.ndarray) -> np.ndarray:
-    """Mark the frequencies (F,) at which every input has power of its own; uu (F, m, m)."""
-    power = np.real(np.diagonal(uu, axis1=1, axis2=2))
-    heard = (power > SILENT * power.max(axis=0)).all(axis=1)
-    for k in np.flatnonzero(heard):
-        scale = np.sqrt(power[k])
-        heard[k] = np.linalg.cond(uu[k] / np.outer(scale, scale)) < 1e6
-    return heard

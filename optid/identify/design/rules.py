@@ -18,12 +18,10 @@ from optid.statistics.expansion import LINEAR, NEARLY_LINEAR
 
 Severity = Literal["fine", "warning", "error"]
 
-FEW_LEVELS = 20
-"""Below this many distinct values a curve between them is interpolation, not identification."""
+FEW_LEVELS = 20  # below this many distinct values a curve between them is interpolation, not identification
 HIDDEN, DOMINANT = 1e-3, 1e-2
 """Share of the variance beside a few sinusoids that is noise on a singular record, or a weak excitation."""
-WORST_CONDITION = 1e7
-"""Condition number beyond which the estimates keep less than half of their digits."""
+WORST_CONDITION = 1e7  # condition number beyond which the estimates keep less than half of their digits
 
 
 @dataclass(frozen=True)
@@ -62,22 +60,24 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
         few: number of values below which the curve between them counts as interpolation.
     """
     needed = basis.size + 1
-    if basis.size == 1 or count_levels(u[:4096]) > 4 * FEW_LEVELS:
-        return Check("levels", name, float(count_levels(u[:4096])), needed, "fine", f"input {name!r} takes many levels")
-    levels = count_levels(u)
-    if levels == 2:
-        sentence = (f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
-                    "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
-        return Check("levels", name, levels, needed, "error", sentence)
-    if levels < needed:
-        sentence = (f"input {name!r} takes {levels} levels, which determine at most {levels - 1} functions besides "
-                    f"the constant; the basis has {basis.size}. Use a smaller basis or excite more levels")
-        return Check("levels", name, levels, needed, "error", sentence)
-    if levels < few:
-        sentence = (f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis functions; "
-                    "the nonlinearity between them is interpolation")
-        return Check("levels", name, levels, few, "warning", sentence)
-    return Check("levels", name, levels, needed, "fine", f"input {name!r} takes {levels} levels")
+    limit, severity, sentence = needed, "fine", f"input {name!r} takes many levels"
+    levels = count_levels(u[:4096])
+    if basis.size > 1 and levels <= 4 * FEW_LEVELS:
+        levels = count_levels(u)
+        sentence = f"input {name!r} takes {levels} levels"
+        if levels == 2:
+            severity = "error"
+            sentence = (f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
+                        "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
+        elif levels < needed:
+            severity = "error"
+            sentence += (f", which determine at most {levels - 1} functions besides the constant; the basis has "
+                         f"{basis.size}. Use a smaller basis or excite more levels")
+        elif levels < few:
+            limit, severity = few, "warning"
+            sentence = (f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis "
+                        "functions; the nonlinearity between them is interpolation")
+    return Check("levels", name, float(levels), limit, severity, sentence)
 
 
 def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) -> Check:
@@ -117,8 +117,7 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     sentence = (
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
         f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
-        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions"
-    )
+        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions")
     return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
@@ -135,27 +134,24 @@ def check_feedback(name: str, share: float) -> Check:
     sentence = f"{100 * share:.2g} % of the spread of the functions of output {name!r} is not linear in the outputs"
     if share >= NEARLY_LINEAR:
         return Check("feedback", name, share, NEARLY_LINEAR, "fine", sentence)
-    if share < LINEAR:
-        more = ": no feedback can be told from the dynamics. Leave the feedback basis out, or excite larger amplitudes"
-        return Check("feedback", name, share, LINEAR, "error", sentence + more)
-    more = ": little beside the noise. Excite larger amplitudes, or leave the feedback basis out"
-    return Check("feedback", name, share, NEARLY_LINEAR, "warning", sentence + more)
+    if share >= LINEAR:
+        sentence += ": little beside the noise. Excite larger amplitudes, or leave the feedback basis out"
+        return Check("feedback", name, share, NEARLY_LINEAR, "warning", sentence)
+    sentence += ": no feedback can be told from the dynamics. Leave the feedback basis out, or excite larger amplitudes"
+    return Check("feedback", name, share, LINEAR, "error", sentence)
 
 
-def check_condition(number: float, what: str = "the expanded regressor") -> Check:
-    """Hold a condition number (columns scaled) against what leaves half of the digits.
+def check_condition(number: float) -> Check:
+    """Hold the condition number of the expanded regressor (columns scaled) against what leaves half of the digits.
 
     Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input.
 
     Args:
         number: condition number; inf when singular.
-        what: of what.
     """
-    if number > WORST_CONDITION:
-        sentence = (f"{what} is poorly excited: condition number {number:.1e}; "
-                    "use fewer functions or lags, or a richer input")
-        return Check("excitation", "", number, WORST_CONDITION, "warning", sentence)
-    return Check("excitation", "", number, WORST_CONDITION, "fine", f"condition number of {what}: {number:.2g}")
+    return _conditioning("excitation", number, f"condition number of the expanded regressor: {number:.2g}",
+                         f"the expanded regressor is poorly excited: condition number {number:.1e}; "
+                         "use fewer functions or lags, or a richer input")
 
 
 def check_instruments(number: float) -> Check:
@@ -163,8 +159,13 @@ def check_instruments(number: float) -> Check:
 
     With instruments that do not reach the regressors it grows with the root of the number of samples.
     """
+    return _conditioning("instruments", number, f"cond(R11) = {number:.2g}",
+                         f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented "
+                         "instruments (hammerstein_ss.asivid), fewer block rows or functions, or an input with more "
+                         "lines and levels")
+
+
+def _conditioning(rule: str, number: float, fine: str, poor: str) -> Check:
     if number > WORST_CONDITION:
-        sentence = (f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented instruments "
-                    "(hammerstein_ss.asivid), fewer block rows or functions, or an input with more lines and levels")
-        return Check("instruments", "", number, WORST_CONDITION, "warning", sentence)
-    return Check("instruments", "", number, WORST_CONDITION, "fine", f"cond(R11) = {number:.2g}")
+        return Check(rule, "", number, WORST_CONDITION, "warning", poor)
+    return Check(rule, "", number, WORST_CONDITION, "fine", fine)

@@ -25,25 +25,21 @@ def prior_factor(theta0: Any, P0: Any, layout: Layout) -> Array:
     n, l = layout.n_columns, layout.l  # noqa: E741
     theta, covariance = np.asarray(theta0, dtype=float), np.asarray(P0, dtype=float)
     if theta.shape not in ((), (n,), (n, l)) or not np.all(np.isfinite(theta)):
-        raise StructureError(f"theta0 has shape {theta.shape}: a number, ({n},) or ({n}, {l}), all finite, is needed.")
-    start = np.broadcast_to(theta[:, None] if theta.ndim == 1 else theta, (n, l))
+        raise StructureError(f"theta0 has shape {theta.shape}: it must be a number, ({n},) or ({n}, {l}), all finite.")
     if covariance.shape not in ((), (n,), (n, n)):
-        raise StructureError(f"P0 has shape {covariance.shape}: a number, ({n},) or ({n}, {n}) is needed.")
+        raise StructureError(f"P0 has shape {covariance.shape}: it must be a number, ({n},) or ({n}, {n}).")
     if covariance.ndim < 2:
         if not np.all(covariance > 0):
             raise StructureError("P0 must be positive: it is a covariance. Infinity means no prior.")
         factor = np.diag(np.broadcast_to(1 / np.sqrt(covariance), n))
     else:
-        try:
-            lower = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            lower = np.full((n, n), np.nan)
-        skew = np.abs(covariance - covariance.T).max() > 1e-10 * np.abs(covariance).max()
-        if skew or not np.all(np.isfinite(lower)):
+        symmetric = np.abs(covariance - covariance.T).max() <= 1e-10 * np.abs(covariance).max()
+        if not symmetric or not np.linalg.eigvalsh(covariance)[0] > 0:
             raise StructureError("P0 is not a symmetric positive definite matrix; give (n,) variances to use infinity.")
-        factor = add_to_root(np.zeros((n, n)), np.asarray(invert_triangular(lower), dtype=float))
+        factor = add_to_root(np.zeros((n, n)), invert_triangular(np.linalg.cholesky(covariance)))
     root = np.zeros((n + l, n + l))
-    root[:n, :n], root[:n, n:] = factor, factor @ start
+    root[:n, :n] = factor
+    root[:n, n:] = factor @ np.broadcast_to(theta[:, None] if theta.ndim == 1 else theta, (n, l))
     return root
 
 
@@ -65,10 +61,8 @@ def as_block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array
     elif samples.ndim == 1 and width == 1:
         samples = samples[:, None]
     if samples.ndim != 2 or samples.shape[1] != width:
-        raise DataError(
-            f"{what} has shape {np.shape(values)}: a block (N, {width}) or one sample of {width} "
-            f"channel{'s' if width > 1 else ''} ({', '.join(names)}) is needed."
-        )
+        raise DataError(f"{what} has shape {np.shape(values)}: it must be a block (N, {width}) or one sample of "
+                        f"{width} channel{'s' if width > 1 else ''} ({', '.join(names)}).")
     if samples.size:
         check_finite(samples, [f"{what}, channel {name!r}" for name in names], seen)
     return samples

@@ -16,11 +16,43 @@ FADED = 1e-120
 """Diagonal entry of R below which a row is not forgotten any further: a direction that is never excited again keeps
 its last estimate instead of ending as zero over zero."""
 
-NOTHING = 1e-250
-"""Entries of R below this are set to zero, before they slow the processor down as subnormal numbers."""
-
+NOTHING = 1e-250  # entries of R below this are set to zero, before they slow the processor down as subnormal numbers
 UNDETERMINED = 1e-12
 """Share of a column, or of a row, outside the span of what came before below which it counts as rounding."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float:
+    """Rotate a row into some rows of an upper triangular factor, which are multiplied by a factor before.
+
+    Args:
+        root: (s, s) upper triangular, diagonal >= 0; changed in place.
+        row: (s,) what remains of it is orthogonal to the columns from `first` to `last`; changed in place.
+        first: first of these columns.
+        last: one past the last of them.
+        fade: root of the forgetting factor.
+
+    Returns:
+        Product of the cosines: (1 + phi^T P phi)^(-1/2) for a regressor phi and P after forgetting.
+    """
+    kept, size = 1.0, row.size
+    for i in range(first, last):
+        factor = fade if root[i, i] > FADED else 1.0
+        old, new = factor * root[i, i], row[i]
+        if new == 0.0:
+            if factor != 1.0:
+                for j in range(i, size):
+                    root[i, j] *= factor
+            continue
+        diagonal = np.sqrt(old * old + new * new)
+        cosine, sine = old / diagonal, new / diagonal
+        root[i, i] = diagonal
+        kept *= cosine
+        for j in range(i + 1, size):
+            above = factor * root[i, j]
+            root[i, j] = cosine * above + sine * row[j]
+            row[j] = cosine * row[j] - sine * above
+    return kept
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -59,26 +91,10 @@ def absorb(
             row[n - 1] = scale
             for o in range(l):
                 row[n + o] = scale * y[now, o]
-            kept = 1.0  # product of the cosines: (1 + a phi^T P phi)^(-1/2)
-            for i in range(size):
-                if i == n:
-                    for o in range(l):
-                        innovations[t, o] = row[n + o] / (kept * scale) if kept > UNDETERMINED else np.nan
-                factor = fade if root[i, i] > FADED else 1.0
-                old, new = factor * root[i, i], row[i]
-                if new == 0.0:
-                    if factor != 1.0:
-                        for j in range(i, size):
-                            root[i, j] *= factor
-                    continue
-                diagonal = np.sqrt(old * old + new * new)
-                cosine, sine = old / diagonal, new / diagonal
-                root[i, i] = diagonal
-                kept *= cosine
-                for j in range(i + 1, size):
-                    above = factor * root[i, j]
-                    root[i, j] = cosine * above + sine * row[j]
-                    row[j] = cosine * row[j] - sine * above
+            kept = rotate(root, row, 0, n, fade)
+            for o in range(l):
+                innovations[t, o] = row[n + o] / (kept * scale) if kept > UNDETERMINED else np.nan
+            rotate(root, row, n, size, fade)
             rows += 1
             if forgetting < 1.0 and rows % 256 == 0:
                 for i in range(size):

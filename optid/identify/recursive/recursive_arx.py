@@ -11,37 +11,38 @@ arithmetic and does not lose symmetry or definiteness in long runs.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
-from optid.bases import parse
+from optid.arrays import Array, check_integer
+from optid.bases import from_dict, parse
 from optid.bases.basis import Basis
 from optid.data.channels import channel_units, check_distinct, listed, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, past_coefficients, theta_matrices
 from optid.identify.recursive.intake import as_block, prior_factor, row_weights
-from optid.identify.recursive.splitting import block_grams, leading_pair, theta_matrices
-from optid.identify.recursive.trace import Trace
+from optid.identify.recursive.saved_state import SavedState
 from optid.models import HammersteinARX
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
+from optid.statistics.blocks import check_inside
 from optid.statistics.factors import dependent_column
 from optid.statistics.sums import rows_present
 from optid.structures.whitening import invert_triangular
 
-CHUNK = 4096
-"""Samples whose basis functions are evaluated at a time."""
-
+CHUNK = 4096  # samples whose basis functions are evaluated at a time
 SPLITS = ("whitened", "plain")
 
+SETTINGS = ("input_units", "output_units", "dt", "forgetting")
+COUNTS = ("samples", "candidates", "rows", "since_restart")
 
-class RecursiveARX:
+
+class RecursiveARX(SavedState):
     """A Hammerstein-ARX model that is updated as samples arrive.
 
     It is a state: `update` changes it. The estimate is over-parametrised, one matrix Theta_c per input; `model` splits
@@ -61,21 +62,13 @@ class RecursiveARX:
         since_restart: samples since `restart`.
     """
 
+    kind, arrays = "recursion", ("root", "past_u", "past_y")
+
     def __init__(
-        self,
-        *,
-        na: int,
-        nb: int | Sequence[int],
-        basis: Basis | str | Sequence[Basis | str],
-        nk: int | Sequence[int] = 0,
-        inputs: str | Sequence[str] = "u",
-        outputs: str | Sequence[str] = "y",
-        dt: float = 1.0,
-        forgetting: float = 1.0,
-        theta0: ArrayLike = 0.0,
-        P0: ArrayLike = np.inf,
-        input_units: str | Sequence[str] | None = None,
-        output_units: str | Sequence[str] | None = None,
+        self, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+        nk: int | Sequence[int] = 0, inputs: str | Sequence[str] = "u", outputs: str | Sequence[str] = "y",
+        dt: float = 1.0, forgetting: float = 1.0, theta0: ArrayLike = 0.0, P0: ArrayLike = np.inf,
+        input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
     ) -> None:
         """Start from what is known before the first sample.
 
@@ -107,8 +100,7 @@ class RecursiveARX:
             if one.interval is None and type(one).__name__ != "Linear":
                 raise StructureError(
                     f"The basis of input {channel!r} has no interval: a recursion does not know the range of the input "
-                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper))."
-                )
+                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper)).")
         if not 0 < forgetting <= 1:
             raise StructureError(f"forgetting={forgetting!r}: a factor above 0 and at most 1, such as 0.995.")
         self.forgetting = float(forgetting)
@@ -131,12 +123,10 @@ class RecursiveARX:
             DataError: detrended or scaled data.
         """
         _check_raw(data)
-        lo, hi = data.ranges() if isinstance(data, Stream) else _ranges(data)
         bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
         return cls(
-            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, lo, hi)], inputs=data.inputs,
-            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings,
-        )
+            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, *data.ranges())], inputs=data.inputs,
+            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     # -- samples ---------------------------------------------------------------------------------------------------
 
@@ -167,10 +157,8 @@ class RecursiveARX:
             every: the estimate is recorded after every so many samples, counted from the first one seen.
             weights: as in `update`.
         """
-        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-            raise StructureError(f"every={every!r}: record after every so many samples, a whole number from 1.")
-        first = self.samples
-        innovations, theta = self._absorb(u, y, weights, int(every))
+        first, every = self.samples, check_integer(every, "every")
+        innovations, theta = self._absorb(u, y, weights, every)
         after = np.arange(first + 1, self.samples + 1)
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
@@ -182,13 +170,10 @@ class RecursiveARX:
         """
         _check_raw(data)
         if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
-            raise DataError(
-                f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
-                f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select."
-            )
-        experiments = [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]
+            raise DataError(f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
+                            f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select.")
         innovations = []
-        for chunks in experiments:
+        for chunks in [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]:
             self.restart()
             innovations.append(np.concatenate([self.update(u, y) for u, y in chunks]))
         return innovations
@@ -206,13 +191,12 @@ class RecursiveARX:
         u, y = as_block(u, layout.inputs, "u", self.samples), as_block(y, layout.outputs, "y", self.samples)
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
-        self._check_inside(u)
+        check_inside(u, layout, "", self.samples)
         weights = row_weights(weights, len(u))
         source, lag = _columns(layout)
         innovations = np.full(y.shape, np.nan)
-        marks = np.zeros(len(u), bool)
-        if every:
-            marks[(np.arange(self.samples, self.samples + len(u)) + 1) % every == 0] = True
+        after = np.arange(self.samples + 1, self.samples + len(u) + 1)
+        marks = after % every == 0 if every else np.zeros(len(u), bool)
         traced, recorded = np.empty((int(marks.sum()), layout.n_columns, layout.l)), 0
         for start in range(0, len(u), CHUNK):
             part = slice(start, start + CHUNK)
@@ -222,8 +206,7 @@ class RecursiveARX:
             signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
             self.rows = recursion_kernel.absorb(
                 self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
-                innovations[part], marks[part], traced[recorded : recorded + marked],
-            )
+                innovations[part], marks[part], traced[recorded : recorded + marked])
             recorded += marked
             complete = np.arange(self.since_restart, self.since_restart + count) >= reach
             self.candidates += int(np.count_nonzero(complete & (weights[part] > 0)))
@@ -231,15 +214,6 @@ class RecursiveARX:
             self.since_restart += count
             self.past_u, self.past_y = past_u[count:], past_y[count:]
         return innovations, traced
-
-    def _check_inside(self, u: Array) -> None:
-        for channel, basis, x in zip(self.layout.inputs, self.layout.bases, u.T):
-            if basis.outside == "error" and basis.n_outside(x):
-                k = next(k for k in range(len(x)) if basis.n_outside(x[k : k + 1]))
-                raise DataError(
-                    f"input {channel!r}, sample {self.samples + k}: {x[k]:g} is outside the interval {basis.interval} "
-                    "of the basis. Use data inside it, or outside='clamp' or 'extrapolate'."
-                )
 
     # -- what is known now -------------------------------------------------------------------------------------------
 
@@ -277,8 +251,7 @@ class RecursiveARX:
         if column is not None:
             raise RankError(
                 f"The {self.rows} rows so far do not determine the coefficient of {self.layout.names()[column]}. Wait "
-                "for samples that excite it, use fewer lags or basis functions, or give a finite P0."
-            )
+                "for samples that excite it, use fewer lags or basis functions, or give a finite P0.")
         return self.root[:n, :n]
 
     @property
@@ -309,9 +282,8 @@ class RecursiveARX:
         layout, theta = self.layout, self.theta
         grams = block_grams(self.root, layout) if split == "whitened" else [None] * layout.m
         pairs = [leading_pair(matrix, gram, b, layout.l) for matrix, gram, b in zip(self.matrices, grams, layout.nb)]
-        a = theta[: layout.na * layout.l].reshape(layout.na, layout.l, layout.l).transpose(0, 2, 1)
         return HammersteinARX(
-            a=a[:, 0, 0] if layout.l == 1 else a,
+            a=past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
             nk=layout.nk, offset=theta[layout.offset], dt=self.dt, inputs=layout.inputs, outputs=layout.outputs,
@@ -319,37 +291,26 @@ class RecursiveARX:
         ).regauge(gauge)
 
     def __repr__(self) -> str:
-        return (
-            f"RecursiveARX: {', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}, na {self.layout.na}, "
-            f"nb {self.layout.nb}, nk {self.layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
-            f"{self.samples} samples"
-        )
+        layout = self.layout
+        return (f"RecursiveARX: {', '.join(layout.inputs)} -> {', '.join(layout.outputs)}, na {layout.na}, "
+                f"nb {layout.nb}, nk {layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
+                f"{self.samples} samples")
 
     # -- files -------------------------------------------------------------------------------------------------------
 
-    def save(self, path: str | Path) -> Path:
-        """Write the whole state to an npz file, from which `load` continues bit for bit.
-
-        The file appears complete or not at all.
-        """
-        from optid.identify.recursive.file import save
-
-        return save(self, path)
+    def _head(self) -> dict[str, Any]:
+        layout = self.layout
+        settings = {"na": int(layout.na), "nb": [int(b) for b in layout.nb], "nk": [int(k) for k in layout.nk],
+                    "inputs": layout.inputs, "outputs": layout.outputs, **{key: getattr(self, key) for key in SETTINGS}}
+        return {"settings": settings, "bases": [basis.to_dict() for basis in layout.bases],
+                "counts": {name: getattr(self, name) for name in COUNTS}}
 
     @classmethod
-    def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "RecursiveARX":
-        """Restore a state.
-
-        Args:
-            path: file written by `save`.
-            functions: the functions of UserFunctions bases by name, which a file does not hold.
-
-        Raises:
-            ModelFileError: truncated, of another version, or not a state of a recursion.
-        """
-        from optid.identify.recursive.file import load
-
-        return load(path, functions)
+    def _of_head(cls, head: dict[str, Any], functions: dict[str, Any] | None) -> "RecursiveARX":
+        state = cls(basis=[from_dict(basis, functions) for basis in head["bases"]], **head["settings"])
+        for name in COUNTS:
+            setattr(state, name, int(head["counts"][name]))
+        return state
 
 
 def _each(value: Any, m: int) -> tuple[Any, ...]:
@@ -360,10 +321,6 @@ def _each(value: Any, m: int) -> tuple[Any, ...]:
 def _check_raw(data: Data | Stream) -> None:
     if not data.transform.is_identity:
         raise DataError("The data were detrended or scaled; a recursion works in raw units: use data.raw().")
-
-
-def _ranges(data: Data) -> tuple[list[float], list[float]]:
-    return [c.low for c in data.channels[: data.m]], [c.high for c in data.channels[: data.m]]
 
 
 def _columns(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

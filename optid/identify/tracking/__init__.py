@@ -4,15 +4,14 @@ from optid.lazy import on_first_use
 
 _HOME = {
     "SubspaceTracker": "tracker",
-    "load_tracker": "file",
     "principal_angles": "geometry",
     "projection_loss": "geometry",
     "loss_gradient": "geometry",
     "loss_hessian": "geometry",
     "stationary_point": "geometry",
     "stationary_points": "geometry",
-    "fantope_certificate": "fantope",
-    "FantopeCertificate": "fantope",
+    "fantope_certificate": "reconstruction",
+    "FantopeCertificate": "reconstruction",
     "Reconstruction": "reconstruction",
     "optimal_reconstruction": "reconstruction",
     "suboptimal_reconstruction": "reconstruction",

@@ -13,17 +13,15 @@ from math import comb
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.linalg import subspace_angles
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
 
 SYMMETRIC = 1e-8
-FLAT = 1e-8
-"""Curvature, or gradient, relative to the largest eigenvalue of C that is zero up to rounding."""
-
-MANY = 10_000
-"""Invariant subspaces listed at most."""
+FLAT = 1e-8  # curvature, or gradient, relative to the largest eigenvalue of C that is zero up to rounding
+MANY = 10_000  # invariant subspaces listed at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +82,14 @@ def as_basis(basis: ArrayLike, n: int, what: str = "basis") -> Array:
     return w
 
 
-def orthonormal(basis: ArrayLike, what: str = "basis") -> Array:
-    """Return an orthonormal basis (n, r) of the columns.
+def orthonormal(basis: ArrayLike, what: str = "basis", n: int | None = None) -> Array:
+    """Return an orthonormal basis (n, r) of the columns; any n where none is given.
 
     Raises:
+        DataError: another shape, or an entry that is not finite.
         RankError: columns that depend on one another.
     """
-    w = np.asarray(basis, dtype=float)
-    w = as_basis(w, len(w), what)
+    w = as_basis(basis, len(np.asarray(basis)) if n is None else n, what)
     length = np.linalg.norm(w, axis=0)
     if not length.all():
         raise RankError(f"{what}: column {int(np.argmin(length)) + 1} is zero.")
@@ -119,11 +117,7 @@ def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
     a, b = orthonormal(first, "first subspace"), orthonormal(second, "second subspace")
     if len(a) != len(b):
         raise DataError(f"the subspaces live in {len(a)} and {len(b)} dimensions.")
-    if a.shape[1] < b.shape[1]:
-        a, b = b, a
-    left, cosines, right = np.linalg.svd(a.T @ b, full_matrices=False)
-    sines = np.linalg.svd(b - a @ (a.T @ b), compute_uv=False)[::-1]
-    return np.where(cosines**2 < 0.5, np.arccos(np.clip(cosines, 0, 1)), np.arcsin(np.clip(sines, 0, 1)))
+    return subspace_angles(a, b)[::-1]
 
 
 def projection_loss(covariance: ArrayLike, basis: ArrayLike) -> float:
@@ -149,11 +143,9 @@ def loss_hessian(covariance: ArrayLike, basis: ArrayLike) -> Array:
     cw, gram, inner = c @ w, w.T @ w, w.T @ c @ w
     hessian = np.kron(gram - 2 * np.eye(r), 2 * c) + np.kron(inner, 2 * np.eye(n))
     hessian += np.kron(np.eye(r), 2 * (cw @ w.T + w @ cw.T))
-    for a in range(r):  # terms in D^T: vec(X D^T Y) has the block (b, a) equal to X[:, a] Y[:, b]^T
-        for b in range(r):
-            hessian[b * n : (b + 1) * n, a * n : (a + 1) * n] += 2 * (
-                np.outer(cw[:, a], w[:, b]) + np.outer(w[:, a], cw[:, b])
-            )
+    # terms in D^T: vec(X D^T Y) has the block (b, a) equal to X[:, a] Y[:, b]^T
+    turned = np.einsum("ia,jb->biaj", cw, w) + np.einsum("ia,jb->biaj", w, cw)
+    hessian += 2 * turned.reshape(n * r, n * r)
     return (hessian + hessian.T) / 2
 
 
@@ -164,7 +156,6 @@ def stationary_point(covariance: ArrayLike, basis: ArrayLike, indices: Sequence[
     scale = float(np.linalg.norm(c, 2)) * max(1.0, float(np.linalg.norm(w, 2)) ** 3)
     gradient = float(np.linalg.norm(loss_gradient(c, w)))
     curvatures = np.asarray(np.linalg.eigvalsh(loss_hessian(c, w)), dtype=float)
-    kind: Literal["minimum", "saddle", "maximum", "not stationary"]
     if gradient > FLAT * scale:
         kind = "not stationary"
     elif curvatures[0] >= -FLAT * scale:
@@ -175,9 +166,7 @@ def stationary_point(covariance: ArrayLike, basis: ArrayLike, indices: Sequence[
     return StationaryPoint(tuple(indices), projection_loss(c, w), gradient, rank, curvatures, kind)
 
 
-def stationary_points(
-    covariance: ArrayLike, r: int, among: Sequence[int] | NDArray[np.intp] | None = None
-) -> list[StationaryPoint]:
+def stationary_points(covariance: ArrayLike, r: int, among: Sequence[int] | None = None) -> list[StationaryPoint]:
     """Judge all invariant subspaces of r eigenvectors, by ascending loss.
 
     Args:
@@ -190,17 +179,21 @@ def stationary_points(
     """
     c = as_covariance(covariance)
     vectors = np.linalg.eigh(c)[1][:, ::-1]
-    pool = list(range(len(c)) if among is None else among)
-    if not all(0 <= i < len(c) for i in pool) or len(set(pool)) != len(pool):
-        raise StructureError(f"among={pool}: distinct eigenvectors from 0 to {len(c) - 1} are needed.")
-    check_dimension(r, len(pool))
+    pool = check_indices(range(len(c)) if among is None else among, len(c), "among")
+    check_integer(r, "r", high=len(pool))
     if comb(len(pool), r) > MANY:
         raise StructureError(f"{comb(len(pool), r)} invariant subspaces: give fewer eigenvectors in `among`.")
     found = [stationary_point(c, vectors[:, list(chosen)], chosen) for chosen in combinations(pool, r)]
     return sorted(found, key=lambda point: point.loss)
 
 
-def check_dimension(r: int, n: int) -> None:
-    """Refuse a dimension that is not a whole number from 1 to n."""
-    if isinstance(r, bool) or not isinstance(r, int | np.integer) or not 1 <= r <= n:
-        raise StructureError(f"r={r!r}: a whole number from 1 to {n} is needed.")
+def check_indices(indices: Sequence[int], n: int, what: str) -> list[int]:
+    """Return indices of eigenvectors as a list.
+
+    Raises:
+        StructureError: none, one below 0 or not below n, or one that is named twice.
+    """
+    chosen = [int(i) for i in indices]
+    if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < n for i in chosen):
+        raise StructureError(f"{what}={chosen}: distinct eigenvectors from 0 to {n - 1} are needed.")
+    return chosen

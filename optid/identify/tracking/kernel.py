@@ -11,9 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-
-FADED = 1e-120
-"""Diagonal entry of R below which nothing is forgotten any further, so that silence does not end as zero over zero."""
+from optid.identify.recursive.kernel import rotate
 
 WEAK = 1e-8
 """Pivot of the Gram matrix of the rows of W that are present, relative to its diagonal, below which they do not
@@ -26,7 +24,7 @@ RENEWED = 1024
 @njit(cache=True, nogil=True, error_model="numpy")
 def track(
     basis: Array, root: Array, sums: Array, counts: NDArray[np.int64], x: Array, forgetting: float, orthonormal: bool,
-    residuals: Array, coordinates: Array,
+    residuals: Array,
 ) -> None:
     """Follow the subspace through one stretch of samples; state arrays change in place.
 
@@ -39,17 +37,14 @@ def track(
         forgetting: in (0, 1].
         orthonormal: whether W is kept orthonormal (OPAST).
         residuals: (T,) out: |x - W y| over the entries present, before the update; NaN where not used.
-        coordinates: (T, r) out: y; NaN where not used.
     """
     n, r = basis.shape
     fade = np.sqrt(forgetting)
     y, row, g, e = np.empty(r), np.empty(r), np.empty(r), np.empty(n)
-    gram = np.empty((r, r))
+    factor = np.empty((r, r))
     for t in range(len(x)):
         counts[0] += 1
         residuals[t] = np.nan
-        for j in range(r):
-            coordinates[t, j] = np.nan
         present = 0
         for i in range(n):
             if not np.isnan(x[t, i]):
@@ -63,7 +58,7 @@ def track(
                 if not np.isnan(x[t, i]):
                     y[j] += basis[i, j] * x[t, i]
         if present < n:
-            if present < r or not _solved(basis, x[t], gram, y):
+            if present < r or not _solved(basis, x[t], factor, y):
                 counts[2] += 1
                 continue
         energy = 0.0
@@ -76,24 +71,12 @@ def track(
                 energy += e[i] * e[i]
         residuals[t] = np.sqrt(energy)
         for j in range(r):
-            coordinates[t, j] = y[j]
             row[j] = y[j]
         counts[1] += 1
         sums[0] = forgetting * sums[0] + 1.0
         share = (present - r) / (n - r) if n > r else 1.0
         sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else sums[1] / max(sums[0] - 1.0, 1.0))
-        for i in range(r):
-            old = (fade if root[i, i] > FADED else 1.0) * root[i, i]
-            diagonal = np.sqrt(old * old + row[i] * row[i])
-            factor = old / root[i, i] if root[i, i] > 0.0 else 1.0
-            if diagonal == 0.0:
-                continue
-            cosine, sine = old / diagonal, row[i] / diagonal
-            root[i, i] = diagonal
-            for j in range(i + 1, r):
-                above = factor * root[i, j]
-                root[i, j] = cosine * above + sine * row[j]
-                row[j] = cosine * row[j] - sine * above
+        rotate(root, row, 0, r, fade)
         _gain(root, y, g)
         size = 0.0
         for j in range(r):
@@ -119,7 +102,7 @@ def track(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gain(root: Array, y: Array, g: Array) -> None:
-    """Solve R^T R g = y."""
+    """Solve R^T R g = y; g may be y."""
     r = len(y)
     for i in range(r):
         total = y[i]
@@ -134,36 +117,25 @@ def _gain(root: Array, y: Array, g: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solved(basis: Array, x: Array, gram: Array, y: Array) -> bool:
+def _solved(basis: Array, x: Array, factor: Array, y: Array) -> bool:
     """Replace y = W_p^T x_p by the least-squares coordinates (W_p^T W_p)^-1 y of the rows p present, if they exist."""
     n, r = basis.shape
-    for a in range(r):
-        for b in range(a + 1):
+    for a in range(r):  # Cholesky, upper
+        for b in range(a, r):
             total = 0.0
             for i in range(n):
                 if not np.isnan(x[i]):
                     total += basis[i, a] * basis[i, b]
-            gram[a, b] = total
-    for a in range(r):  # Cholesky, lower
-        whole = gram[a, a]
-        for b in range(a + 1):
-            total = gram[a, b]
-            for c in range(b):
-                total -= gram[a, c] * gram[b, c]
-            if a == b:
-                if not total > WEAK * max(whole, WEAK):
-                    return False
-                gram[a, a] = np.sqrt(total)
+            least = WEAK * max(total, WEAK)
+            for c in range(a):
+                total -= factor[c, a] * factor[c, b]
+            if b > a:
+                factor[a, b] = total / factor[a, a]
+            elif total > least:
+                factor[a, a] = np.sqrt(total)
             else:
-                gram[a, b] = total / gram[b, b]
-    for a in range(r):
-        for c in range(a):
-            y[a] -= gram[a, c] * y[c]
-        y[a] /= gram[a, a]
-    for a in range(r - 1, -1, -1):
-        for c in range(a + 1, r):
-            y[a] -= gram[c, a] * y[c]
-        y[a] /= gram[a, a]
+                return False
+    _gain(factor, y, y)
     return True
 
 

@@ -1,20 +1,24 @@
-"""Projectors that reconstruct a signal: the best one, one that keeps chosen directions, one that avoids lost sensors.
+"""Projectors that reconstruct a signal, what they lose, and a certificate of how far they are from the best.
 
 At a stationary point of the loss W W^T is an orthogonal projector P that commutes with C and J = tr((I - P) C), the
 energy lost by projecting. The minimum is the nearest r-dimensional subspace (Eckart and Young 1936); every other
 invariant subspace loses what its eigenvalues lack; subspaces within surviving directions N lose what the dominant
 eigenvectors of N^T C N leave, bounded by the interlacing of eigenvalues (Cauchy).
+
+The certificate is the dual of max tr(C P) over 0 <= P <= I, tr P = r. The set is the convex hull of the projectors of
+rank r (Fan 1949; Overton and Womersley 1992), so that the maximum over projectors has no gap: for every t,
+tr(C P) <= r t + sum max(c_i - t, 0), equal at any t between c_(r+1) and c_r.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.tracking.geometry import as_basis, as_covariance, check_dimension, orthonormal
+from optid.identify.tracking.geometry import as_basis, as_covariance, check_indices, orthonormal
 
 INSIDE = 1e-8
 
@@ -58,11 +62,9 @@ class Reconstruction:
 
 def optimal_reconstruction(covariance: ArrayLike, r: int) -> Reconstruction:
     """Project on the r dominant eigenvectors of a covariance (n, n): P = U_1 U_1^T."""
-    c = as_covariance(covariance)
-    check_dimension(r, len(c))
-    values, vectors = _descending(c)
-    loss = float(np.sum(values[r:]))
-    return Reconstruction(vectors[:, :r], loss, loss, loss, "optimal")
+    check_integer(r, "r", high=len(np.asarray(covariance)))
+    found = suboptimal_reconstruction(covariance, range(r))
+    return replace(found, worst_loss=found.loss, kind="optimal")
 
 
 def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> Reconstruction:
@@ -72,19 +74,15 @@ def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> 
         StructureError: eigenvectors that do not exist or are named twice.
     """
     c = as_covariance(covariance)
-    chosen = [int(i) for i in indices]
-    if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < len(c) for i in chosen):
-        raise StructureError(f"indices={chosen}: distinct eigenvectors from 0 to {len(c) - 1} are needed.")
+    chosen = check_indices(indices, len(c), "indices")
     values, vectors = _descending(c)
-    r = len(chosen)
-    loss = float(np.sum(np.delete(values, chosen)))
-    worst = float(np.sum(values[: len(c) - r]))
-    return Reconstruction(vectors[:, chosen], loss, float(np.sum(values[r:])), worst, "sub-optimal")
+    return Reconstruction(vectors[:, chosen], float(np.sum(np.delete(values, chosen))),
+                          float(np.sum(values[len(chosen) :])), float(np.sum(values[: len(c) - len(chosen)])),
+                          "sub-optimal")
 
 
-def constrained_reconstruction(
-    covariance: ArrayLike, r: int, *, within: ArrayLike | None = None, containing: ArrayLike | None = None
-) -> Reconstruction:
+def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLike | None = None,
+                               containing: ArrayLike | None = None) -> Reconstruction:
     """Find the best projector of rank r whose range lies within a subspace and contains another.
 
     Args:
@@ -99,28 +97,23 @@ def constrained_reconstruction(
         RankError: dependent columns.
     """
     c = as_covariance(covariance)
-    check_dimension(r, len(c))
-    space = np.eye(len(c)) if within is None else orthonormal(as_basis(within, len(c), "within"), "within")
+    check_integer(r, "r", high=len(c))
+    space = np.eye(len(c)) if within is None else orthonormal(within, "within", len(c))
     if space.shape[1] < r:
         raise StructureError(f"r={r}: the surviving directions have dimension {space.shape[1]} only.")
     kept = np.zeros((len(c), 0))
     if containing is not None:
-        kept = orthonormal(as_basis(containing, len(c), "containing"), "containing")
+        kept = orthonormal(containing, "containing", len(c))
         if kept.shape[1] > r:
             raise StructureError(f"r={r}: {kept.shape[1]} directions are to be kept.")
         if np.linalg.norm(kept - space @ (space.T @ kept)) > INSIDE:
             raise StructureError("containing: a direction that must be kept is not among the surviving ones.")
-    rest = space
-    if kept.shape[1]:
-        inner = np.linalg.svd(space.T @ kept, full_matrices=True)[0][:, kept.shape[1] :]
-        rest = space @ inner
-    _, vectors = _descending(rest.T @ c @ rest) if rest.shape[1] else (None, np.zeros((0, 0)))
-    basis = np.hstack([kept, rest @ vectors[:, : r - kept.shape[1]]])
+    rest = space @ np.linalg.svd(space.T @ kept, full_matrices=True)[0][:, kept.shape[1] :]
+    basis = np.hstack([kept, rest @ _descending(rest.T @ c @ rest)[1][:, : r - kept.shape[1]]])
     values = _descending(c)[0]
-    lost, free = len(c) - space.shape[1], r - kept.shape[1]
     # interlacing: the i-th eigenvalue in a subspace of codimension d is at least the (i + d)-th of C
-    first = lost + kept.shape[1]
-    held = float(np.sum(values[first : first + free])) + float(np.sum(values[len(c) - kept.shape[1] :]))
+    lost, free = len(c) - space.shape[1] + kept.shape[1], r - kept.shape[1]
+    held = float(np.sum(values[lost : lost + free])) + float(np.sum(values[len(c) - kept.shape[1] :]))
     loss = float(np.trace(c) - np.trace(basis.T @ c @ basis))
     return Reconstruction(basis, loss, float(np.sum(values[r:])), float(np.sum(values)) - held, "constrained")
 
@@ -131,10 +124,74 @@ def surviving(n: int, lost: Sequence[int]) -> Array:
     Raises:
         StructureError: coordinates that do not exist, or none left.
     """
-    gone = {int(i) for i in lost}
+    gone = sorted({int(i) for i in lost})
     if not all(0 <= i < n for i in gone) or len(gone) >= n:
-        raise StructureError(f"lost={sorted(gone)}: coordinates from 0 to {n - 1}, not all of them, are needed.")
-    return np.delete(np.eye(n), sorted(gone), axis=1)
+        raise StructureError(f"lost={gone}: coordinates from 0 to {n - 1}, not all of them, are needed.")
+    return np.delete(np.eye(n), gone, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class FantopeCertificate:
+    """Energy that a subspace holds and a proven bound on the energy of any subspace of its dimension.
+
+    Attributes:
+        energy: tr(P C) of the projector on the subspace.
+        bound: r t + sum max(c_i - t, 0).
+        t: the multiplier of tr P = r.
+        total: tr C.
+        lost: coordinates that every admissible subspace must leave at zero.
+    """
+
+    energy: float
+    bound: float
+    t: float
+    total: float
+    lost: tuple[int, ...] = ()
+
+    @property
+    def gap(self) -> float:
+        """Energy that a better subspace could hold in addition, at most."""
+        return self.bound - self.energy
+
+    @property
+    def relative_gap(self) -> float:
+        """The gap as a share of the bound."""
+        return self.gap / self.bound if self.bound > 0 else 0.0
+
+    def __str__(self) -> str:
+        within = f" ({len(self.lost)} coordinates lost)" if self.lost else ""
+        return (f"energy {self.energy:.6g} of {self.total:.6g}; no subspace holds more than {self.bound:.6g}{within}\n"
+                f"gap {self.gap:.2g} ({100 * self.relative_gap:.2g} %), multiplier t = {self.t:.6g}")
+
+
+def fantope_certificate(covariance: ArrayLike, basis: ArrayLike, t: float | None = None, lost: Sequence[int] = ()
+                        ) -> FantopeCertificate:
+    """Certify a subspace, tracked or computed.
+
+    Args:
+        covariance: (n, n) C.
+        basis: (n, r) its columns span the subspace; orthonormalised first.
+        t: any number gives a valid bound; the best one when not given.
+        lost: coordinates that must stay zero (P F = 0 with unit vectors F): the bound is then over the rest.
+
+    Raises:
+        DataError: a basis that uses a lost coordinate, or shapes that do not agree.
+        StructureError: lost coordinates that do not exist or leave fewer than r, a t that is not finite.
+    """
+    c = as_covariance(covariance)
+    w = orthonormal(basis, n=len(c))
+    gone, space = sorted({int(i) for i in lost}), surviving(len(c), lost)
+    check_integer(w.shape[1], "r", high=space.shape[1])
+    if gone and float(np.abs(w[gone]).max()) > 1e-8:
+        raise DataError(f"the basis uses the lost coordinates {gone}: restrict it to the surviving ones first.")
+    r, values = w.shape[1], _descending(space.T @ c @ space)[0]
+    if t is None:
+        t = float(values[r - 1] + (values[r] if r < len(values) else values[r - 1])) / 2
+    elif not np.isfinite(t):
+        raise StructureError(f"t={t!r}: a finite number is needed.")
+    energy = float(np.trace(w.T @ c @ w))
+    bound = float(r * t + np.sum(np.maximum(values - t, 0)))
+    return FantopeCertificate(energy, bound, float(t), float(np.trace(c)), tuple(gone))
 
 
 def oblique_projector(onto: ArrayLike, along: ArrayLike | None = None, *, noise: ArrayLike | None = None) -> Array:
@@ -150,17 +207,14 @@ def oblique_projector(onto: ArrayLike, along: ArrayLike | None = None, *, noise:
         StructureError: both `along` and `noise`, or S and G of different shape.
         RankError: a singular G^T S, S meets the null space of G^T, or a singular covariance.
     """
-    s = np.asarray(onto, dtype=float)
-    s = as_basis(s, len(s), "onto")
+    s = as_basis(onto, len(np.asarray(onto)), "onto")
     orthonormal(s, "onto")
     if along is not None and noise is not None:
         raise StructureError("along and noise both choose the direction of the projection: give one of them.")
-    g = s
-    if along is not None:
-        g = as_basis(along, len(s), "along")
-        if g.shape != s.shape:
-            raise StructureError(f"onto has shape {s.shape} and along {g.shape}: they must agree.")
-    elif noise is not None:
+    g = s if along is None else as_basis(along, len(s), "along")
+    if g.shape != s.shape:
+        raise StructureError(f"onto has shape {s.shape} and along {g.shape}: they must agree.")
+    if noise is not None:
         c = as_covariance(noise)
         if len(c) != len(s):
             raise StructureError(f"onto has {len(s)} rows and the covariance {len(c)}: they must agree.")
@@ -207,15 +261,14 @@ def filled(x: ArrayLike, basis: ArrayLike | None = None, *, covariance: ArrayLik
     return rows.reshape(samples.shape)
 
 
-def _from_present(
-    pattern: NDArray[np.bool_], basis: ArrayLike | None, covariance: ArrayLike | None, sample: int
-) -> Array:
+def _from_present(pattern: NDArray[np.bool_], basis: ArrayLike | None, covariance: ArrayLike | None, sample: int
+                  ) -> Array:
     """Weights (present, missing) for one pattern of missing entries."""
     present = ~pattern
     if covariance is not None:
         c = as_covariance(covariance)
         return np.linalg.pinv(c[np.ix_(present, present)], hermitian=True, rcond=1e-12) @ c[np.ix_(present, pattern)]
-    w = orthonormal(as_basis(basis, len(pattern)))  # type: ignore[arg-type]
+    w = orthonormal(basis, n=len(pattern))  # type: ignore[arg-type]
     values = np.linalg.svd(w[present], compute_uv=False)
     if present.sum() < w.shape[1] or values[-1] < 1e-6:
         raise RankError(f"sample {sample}: its {int(present.sum())} entries do not determine {w.shape[1]} coordinates; "

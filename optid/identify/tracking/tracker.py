@@ -5,21 +5,23 @@ A. Chkeif and Y. Hua, Fast orthonormal PAST algorithm, IEEE Signal Processing Le
 """
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
-from optid.identify.tracking.geometry import as_basis, check_dimension, orthonormal, principal_angles
+from optid.identify.recursive.intake import as_block
+from optid.identify.recursive.saved_state import SavedState
+from optid.identify.tracking.geometry import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
+SETTINGS = ("n", "r", "method", "forgetting", "missing", "names")
 
 
-class SubspaceTracker:
+class SubspaceTracker(SavedState):
     """The dominant r-dimensional subspace of a stream of zero-mean vectors; `update` changes it.
 
     A sample with missing entries is used through its least-squares coordinates on the rows of W that are present: the
@@ -38,6 +40,8 @@ class SubspaceTracker:
         sums: (2,) weighted count of samples and weighted sum of residual energy.
         counts: (3,) samples seen, used, passed over.
     """
+
+    kind, arrays = "tracker", ("W", "root", "sums", "counts")
 
     def __init__(
         self, n: int, r: int, *, method: Literal["past", "opast"] = "opast", forgetting: float = 0.995,
@@ -60,9 +64,8 @@ class SubspaceTracker:
             StructureError: arguments out of range.
             RankError: a guess with dependent columns.
         """
-        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 2:
-            raise StructureError(f"n={n!r}: a whole number from 2 is needed.")
-        check_dimension(r, int(n) - 1)
+        self.n = check_integer(n, "n", 2)
+        self.r = check_integer(r, "r", high=self.n - 1)
         if method not in METHODS or missing not in MISSING:
             raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
                                  f"{', '.join(MISSING)}.")
@@ -70,11 +73,11 @@ class SubspaceTracker:
             raise StructureError(f"forgetting={forgetting!r}: a number above 0, at most 1, is needed.")
         if not (np.isfinite(information) and information > 0):
             raise StructureError(f"information={information!r}: a positive number is needed.")
-        self.n, self.r, self.method, self.forgetting, self.missing = int(n), int(r), method, float(forgetting), missing
+        self.method, self.forgetting, self.missing = method, float(forgetting), missing
         self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
         if len(self.names) != self.n:
             raise StructureError(f"{len(self.names)} names for {self.n} coordinates.")
-        guess = np.eye(self.n)[:, : self.r] if start is None else orthonormal(as_basis(start, self.n, "start"), "start")
+        guess = np.eye(self.n)[:, : self.r] if start is None else orthonormal(start, "start", self.n)
         if guess.shape[1] != self.r:
             raise StructureError(f"start has {guess.shape[1]} columns for a subspace of dimension {self.r}.")
         self.W = np.ascontiguousarray(guess)
@@ -90,30 +93,20 @@ class SubspaceTracker:
         Raises:
             DataError: another shape, an infinite entry, or a missing one where missing="refuse", by name and sample.
         """
-        from optid.identify.tracking.kernel import track
+        from optid.identify.tracking.kernel import track  # compiled code is loaded with the first sample
 
-        block = np.asarray(x, dtype=float)
-        block = block[None] if block.ndim == 1 else block
-        if block.ndim != 2 or block.shape[1] != self.n:
-            raise DataError(f"x has shape {np.shape(x)}: a block (N, {self.n}) or a sample ({self.n},) is needed.")
-        if not np.isfinite(block.sum()):
-            block = self._screened(block)
-        residuals, coordinates = np.empty(len(block)), np.empty((len(block), self.r))
-        track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block), self.forgetting,
-              self.method == "opast", residuals, coordinates)
-        return residuals
-
-    def _screened(self, block: Array) -> Array:
-        """Refuse what is infinite, or missing where that is not allowed."""
-        bad = np.isinf(block) | (np.isnan(block) if self.missing == "refuse" else False)
-        if bad.any():
-            k, i = (int(v[0]) for v in np.nonzero(bad))
-            word = "missing" if np.isnan(block[k, i]) else "infinite"
-            raise DataError(f"{self.names[i]} is {word} at sample {int(self.counts[0]) + k}: "
-                            + ("use missing='fill' or 'skip'." if word == "missing" else "NaN marks a missing entry."))
+        block = as_block(x, self.names, "x", int(self.counts[0]))
+        lost = np.isnan(block)
+        if self.missing == "refuse" and lost.any():
+            k, i = (int(v[0]) for v in np.nonzero(lost))
+            raise DataError(f"{self.names[i]} is missing at sample {int(self.counts[0]) + k}: use missing='fill' or "
+                            "'skip'.")
         if self.missing == "skip":
-            block = np.where(np.isnan(block).any(axis=1, keepdims=True), np.nan, block)
-        return block
+            block = np.where(lost.any(axis=1, keepdims=True), np.nan, block)
+        residuals = np.empty(len(block))
+        track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block), self.forgetting,
+              self.method == "opast", residuals)
+        return residuals
 
     @property
     def basis(self) -> Array:
@@ -123,8 +116,7 @@ class SubspaceTracker:
     @property
     def projector(self) -> Array:
         """Orthogonal projector (n, n) on the tracked subspace."""
-        basis = self.basis
-        return basis @ basis.T
+        return self.basis @ self.basis.T
 
     @property
     def energies(self) -> Array:
@@ -159,19 +151,18 @@ class SubspaceTracker:
         """Return the principal angles to a nominal subspace (n, s), ascending, in radians."""
         return principal_angles(self.W, as_basis(nominal, self.n, "nominal"))
 
-    def save(self, path: str | Path) -> Path:
-        """Write the state; `load_tracker` restores it bit for bit."""
-        from optid.identify.tracking.file import save
+    def _head(self) -> dict[str, Any]:
+        return {"settings": {name: getattr(self, name) for name in SETTINGS}}
 
-        return save(self, path)
+    @classmethod
+    def _of_head(cls, head: dict[str, Any], functions: dict[str, Any] | None) -> "SubspaceTracker":
+        return cls(**head["settings"])
 
     def __str__(self) -> str:
-        seen, used, passed = (int(c) for c in self.counts)
-        head = (f"{self.method.upper()}, {self.r} of {self.n} dimensions ({', '.join(self.names)}), forgetting "
-                f"{self.forgetting:g}")
-        if len(head) > 80:
-            head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
+        seen, used, passed = self.counts.tolist()
+        head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
+        named = head.replace(" dimensions", f" dimensions ({', '.join(self.names)})")
         lost = f", {passed} passed over" if passed else ""
         energies = " ".join(f"{v:.4g}" for v in self.energies[:8])
-        return f"{head}\n{seen} samples, {used} used{lost}\nenergies {energies}; noise {self.floor:.4g}; " \
-               f"directions with signal {self.rank}"
+        return (f"{named if len(named) <= 80 else head}\n{seen} samples, {used} used{lost}\n"
+                f"energies {energies}; noise {self.floor:.4g}; directions with signal {self.rank}")

@@ -2,8 +2,7 @@
 
 from optid.identify.validation.checks import Validation, validate
 from optid.identify.validation.comparison import Comparison, compare_models
-from optid.identify.validation.horizons import HorizonCurve, fit_by_horizon
-from optid.identify.validation.measures import Measures, fit_percent
+from optid.identify.validation.predictions import HorizonCurve, Measures, fit_by_horizon, fit_percent
 
 __all__ = [
     "Comparison",

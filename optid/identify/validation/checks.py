@@ -17,16 +17,23 @@ from optid.identify.validation.correlations import (
     between_outputs,
     cross_correlation,
 )
-from optid.identify.validation.measures import Measures, measured, measured_each
-from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, predictors, simulated
+from optid.identify.validation.predictions import (
+    MEASURED,
+    ONE_STEP,
+    SIMULATION,
+    Measures,
+    one_step,
+    predictors,
+    simulated,
+)
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.experiments import checked_horizon
 from optid.models.functions import has_feedback, static_functions
+from optid.registry import render
 
 LAGS = 25
 
-ROUNDING = 1e-12
-"""An error below this share of the largest output is rounding."""
+ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +42,10 @@ class Validation:
 
     Attributes:
         data: name of the record.
-        one_step: errors of one-step prediction by output.
-        simulation: errors of simulation by output; their SNR is that of the output noise. Empty when `notes` says why.
-        measured_feedback: errors, by output, of the simulation that takes the outputs in the feedback from the record;
-            empty for models without nonlinear feedback.
-        ahead: errors of the prediction `horizon` samples ahead, by output; empty with a horizon of 1.
-        horizon: the horizon of `ahead`.
+        horizon: samples ahead of the prediction besides one.
+        predictors: errors, by output, of every predictor: "one step", "5 steps", "measured feedback" (the simulation
+            that takes the outputs in the feedback from the record; only of models with nonlinear feedback),
+            "simulation" (its SNR is that of the output noise). `notes` says why a simulation is missing.
         experiments: {predictor: {output: errors of each experiment}}; empty with one experiment.
         autocorrelations: whiteness test of the residuals by output.
         cross_correlations: independence of residuals and inputs by (output, input).
@@ -48,16 +53,13 @@ class Validation:
         structure: structure test of the record, or None when `notes` says why, or the model feeds outputs back.
         outside: share of samples outside the interval of the basis, by channel.
         notes: what weakens the result; each was also given as a DataWarning.
+        predicted: predicted outputs (N, l) per experiment of every predictor, NaN where there is none.
         residuals: one-step residuals (N, l) per experiment, NaN = missing.
-        simulated: simulated outputs (N, l) per experiment; empty when there is no simulation.
     """
 
     data: str
-    one_step: dict[str, Measures]
-    simulation: dict[str, Measures]
-    measured_feedback: dict[str, Measures]
-    ahead: dict[str, Measures]
     horizon: int
+    predictors: dict[str, dict[str, Measures]]
     experiments: dict[str, dict[str, tuple[Measures, ...]]]
     autocorrelations: dict[str, Correlation]
     cross_correlations: dict[tuple[str, str], Correlation]
@@ -65,14 +67,33 @@ class Validation:
     structure: Structure | None
     outside: dict[str, float]
     notes: tuple[str, ...]
+    predicted: dict[str, tuple[Array, ...]]
     residuals: tuple[Array, ...]
-    simulated: tuple[Array, ...]
 
     @property
-    def passed(self) -> bool:
-        """Whether the structure test passes and the residual tests do, together at the 1 % level (Bonferroni)."""
-        white = not any(test.p_value < LEVEL / len(self.tests) for test in self.tests)
-        return white and (self.structure is None or self.structure.passed)
+    def one_step(self) -> dict[str, Measures]:
+        """Errors of one-step prediction by output."""
+        return self.predictors[ONE_STEP]
+
+    @property
+    def ahead(self) -> dict[str, Measures]:
+        """Errors of the prediction `horizon` samples ahead, by output; empty with a horizon of 1."""
+        return self.predictors.get(f"{self.horizon} steps", {})
+
+    @property
+    def measured_feedback(self) -> dict[str, Measures]:
+        """Errors of the simulation with measured feedback, by output; empty where there is none."""
+        return self.predictors.get(MEASURED, {})
+
+    @property
+    def simulation(self) -> dict[str, Measures]:
+        """Errors of simulation by output; empty where there is none."""
+        return self.predictors.get(SIMULATION, {})
+
+    @property
+    def simulated(self) -> tuple[Array, ...]:
+        """Simulated outputs (N, l) per experiment; empty when there is no simulation."""
+        return self.predicted.get(SIMULATION, ())
 
     @property
     def tests(self) -> tuple[Correlation, ...]:
@@ -80,21 +101,13 @@ class Validation:
         return (*self.autocorrelations.values(), *self.cross_correlations.values(), *self.between.values())
 
     @property
-    def predictors(self) -> dict[str, dict[str, Measures]]:
-        """Errors by predictor ("one step", "5 steps", "measured feedback", "simulation"), those that there are."""
-        named = {
-            ONE_STEP: self.one_step,
-            f"{self.horizon} steps": self.ahead,
-            MEASURED: self.measured_feedback,
-            SIMULATION: self.simulation,
-        }
-        return {word: table for word, table in named.items() if table}
+    def passed(self) -> bool:
+        """Whether the structure test passes and the residual tests do, together at the 1 % level (Bonferroni)."""
+        white = not any(test.p_value < LEVEL / len(self.tests) for test in self.tests)
+        return white and (self.structure is None or self.structure.passed)
 
     def __str__(self) -> str:
-        """Return the tables of errors and tests, 80 columns wide."""
-        from optid.show.printing import describe_checks
-
-        return describe_checks(self)
+        return render(self)
 
 
 def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon: int = 1) -> Validation:
@@ -109,89 +122,69 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
 
     Raises:
         DataError: other channels or another sampling time than the model's, or no sample that can be predicted.
-        StructureError: an x0 that cannot be read, or a horizon that is not a whole number from 1.
+        StructureError: an x0 that cannot be read, or a horizon that is not a positive integer.
 
     Warns:
         DataWarning: the record does not look Hammerstein or does not determine a free model, the model is unstable, no
             simulation is possible, or inputs lie outside the interval of their basis; also in `Validation.notes`.
     """
     horizon, raw = checked_horizon(horizon), data.raw()
-    predicted = one_step(model, raw)
-    residuals = tuple(e.y - p for e, p in zip(raw.experiments, predicted))
+    predicted = {ONE_STEP: tuple(one_step(model, raw))}
+    residuals = tuple(e.y - p for e, p in zip(raw.experiments, predicted[ONE_STEP]))
     present = np.sum([np.sum(~np.isnan(r), axis=0) for r in residuals], axis=0)
     if not present.all():
         name = model.outputs[int(np.argmin(present))]
         raise DataError(
             f"No sample of output {name!r} can be predicted: the model looks back {model.memory} samples, the longest "
-            f"experiment has {max(e.n_samples for e in raw.experiments)}. Use a longer record, or one with fewer gaps."
-        )
+            f"experiment has {max(e.n_samples for e in raw.experiments)}. Use a longer record, or one with fewer gaps.")
     notes: list[str] = []
-    outputs = {ONE_STEP: predicted}
     if horizon > 1:
-        outputs[f"{horizon} steps"] = one_step(model, raw, horizon)
+        predicted[f"{horizon} steps"] = tuple(one_step(model, raw, horizon))
     for word in predictors(model)[1:]:
         if found := _simulated(model, raw, word, x0, notes):
-            outputs[word] = found
+            predicted[word] = found
     outside = _outside(model, raw, notes)
     structure = _structure(model, raw, notes)
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
-    errors = {word: measured(raw, arrays) for word, arrays in outputs.items()}
-    several = raw.n_experiments > 1
-    return Validation(
-        data=raw.name,
-        one_step=errors[ONE_STEP],
-        simulation=errors.get(SIMULATION, {}),
-        measured_feedback=errors.get(MEASURED, {}),
-        ahead=errors.get(f"{horizon} steps", {}),
-        horizon=horizon,
-        experiments={word: measured_each(raw, arrays) for word, arrays in outputs.items()} if several else {},
-        **_residual_tests(raw, residuals, errors[ONE_STEP], max(1, min(lags, int(present.min()) // 4))),
-        structure=structure,
-        outside=outside,
-        notes=tuple(notes),
-        residuals=residuals,
-        simulated=tuple(outputs.get(SIMULATION, ())),
-    )
-
-
-def _residual_tests(
-    data: Data, residuals: Sequence[Array], errors: dict[str, Measures], lags: int
-) -> dict[str, dict[Any, Correlation]]:
-    """Test the residuals (N, l) of every experiment: each with its past, with every input and with the others' past."""
-    rounding = [_negligible(errors[name], data, o) for o, name in enumerate(data.outputs)]
+    y = np.vstack([e.y for e in raw.experiments])
+    pairs = {word: [(y, np.vstack(arrays)), *zip((e.y for e in raw.experiments), arrays)]
+             for word, arrays in predicted.items()}
+    errors = {word: {name: [Measures.of(y[:, o], p[:, o]) for y, p in several] for o, name in enumerate(raw.outputs)}
+              for word, several in pairs.items()}  # over all experiments, then over each
+    # a residual that is nothing but rounding is neither white nor independent of anything
+    rounding = [errors[ONE_STEP][name][0].rmse <= ROUNDING * float(np.nanmax(np.abs(y[:, o])))
+                for o, name in enumerate(raw.outputs)]
     tested = [np.where(rounding, 0.0, r) for r in residuals]
-    columns = {name: [r[:, o] for r in tested] for o, name in enumerate(data.outputs)}
+    return Validation(
+        data=raw.name, horizon=horizon,
+        predictors={word: {name: found[0] for name, found in table.items()} for word, table in errors.items()},
+        experiments={word: {name: tuple(found[1:]) for name, found in table.items()}
+                     for word, table in errors.items() if raw.n_experiments > 1},
+        **_residual_tests(raw, tested, max(1, min(lags, int(present.min()) // 4))),
+        structure=structure, outside=outside, notes=tuple(notes), predicted=predicted, residuals=residuals)
+
+
+def _residual_tests(data: Data, residuals: Sequence[Array], lags: int) -> dict[str, dict[Any, Correlation]]:
+    """Test the residuals (N, l) of every experiment: each with its past, with every input and with the others' past."""
+    columns = {name: [r[:, o] for r in residuals] for o, name in enumerate(data.outputs)}
     inputs = {name: [e.u[:, c] for e in data.experiments] for c, name in enumerate(data.inputs)}
     return {
-        "autocorrelations": {name: autocorrelation(columns[name], name, lags) for name in columns},
-        "cross_correlations": {
-            (name, channel): cross_correlation(columns[name], inputs[channel], name, channel, lags)
-            for name in columns
-            for channel in inputs
-        },
-        "between": {
-            (name, other): between_outputs(columns[name], columns[other], name, other, lags)
-            for name in columns
-            for other in columns
-            if other != name
-        },
-    }
+        "autocorrelations": {name: autocorrelation(r, name, lags) for name, r in columns.items()},
+        "cross_correlations": {(name, channel): cross_correlation(r, u, name, channel, lags)
+                               for name, r in columns.items() for channel, u in inputs.items()},
+        "between": {(name, other): between_outputs(r, columns[other], name, other, lags)
+                    for name, r in columns.items() for other in columns if other != name}}
 
 
-def _negligible(measures: Measures, data: Data, o: int) -> bool:
-    """Whether the residual of output o is nothing but rounding, which is neither white nor independent of anything."""
-    return measures.rmse <= ROUNDING * float(np.nanmax(np.abs(np.vstack([e.y[:, [o]] for e in data.experiments]))))
-
-
-def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> list[Array]:
+def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> tuple[Array, ...]:
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DataWarning)
-            outputs = simulated(model, data, word, x0)
+            outputs = tuple(simulated(model, data, word, x0))
     except DataError as error:
         notes.append(f"No simulation. {error}" if word == SIMULATION else f"No simulation with {word}. {error}")
-        return []
+        return ()
     notes.extend(sentence for w in caught if (sentence := str(w.message)) not in notes)
     return outputs
 
@@ -207,10 +200,8 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
         if shares[name] and basis.interval is not None:
             lo, hi = basis.interval
             channel = "output" if function.fed_back else "input"
-            notes.append(
-                f"{100 * shares[name]:.2g} % of {channel} {name!r} lies outside [{lo:g}, {hi:g}], where "
-                f"{function.word} was identified; there it is set to {basis.outside!r}."
-            )
+            notes.append(f"{100 * shares[name]:.2g} % of {channel} {name!r} lies outside [{lo:g}, {hi:g}], where "
+                         f"{function.word} was identified; there it is set to {basis.outside!r}.")
     return shares
 
 
@@ -227,6 +218,5 @@ def _structure(model: Any, data: Data, notes: list[str]) -> Structure | None:
     if not found.passed:
         notes.append(
             f"The record does not look Hammerstein: another structure saves {100 * found.saving:.2g} % of the residual "
-            f"variance (p = {found.p_value:.1g}). Consider a Wiener or Volterra model, or nonlinear feedback."
-        )
+            f"variance (p = {found.p_value:.1g}). Consider a Wiener or Volterra model, or nonlinear feedback.")
     return found

@@ -11,9 +11,15 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataWarning, StructureError
 from optid.identify.validation.checks import Validation, validate
-from optid.identify.validation.horizons import HorizonCurve, fit_by_horizon
-from optid.identify.validation.measures import fit_percent
-from optid.identify.validation.predictions import MEASURED, ONE_STEP, SIMULATION, one_step, simulated
+from optid.identify.validation.predictions import (
+    MEASURED,
+    ONE_STEP,
+    SIMULATION,
+    HorizonCurve,
+    common_fits,
+    fit_by_horizon,
+)
+from optid.registry import render
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +35,6 @@ class Comparison:
             such prediction.
         validations: one per model, each over the samples it predicts itself.
         curves: fit against the horizon, one per model.
-        simulated: simulated outputs (N, l) per experiment, one tuple per model, empty where there is no simulation.
     """
 
     names: tuple[str, ...]
@@ -39,7 +44,11 @@ class Comparison:
     fits: dict[str, Array]
     validations: tuple[Validation, ...] = field(repr=False)
     curves: tuple[HorizonCurve, ...] = field(repr=False)
-    simulated: tuple[tuple[Array, ...], ...] = field(repr=False)
+
+    @property
+    def simulated(self) -> tuple[tuple[Array, ...], ...]:
+        """Simulated outputs (N, l) per experiment, one tuple per model, empty where there is no simulation."""
+        return tuple(checked.simulated for checked in self.validations)
 
     def best(self, predictor: str = SIMULATION) -> str:
         """Return the name of the model with the largest mean fit over the outputs.
@@ -56,10 +65,7 @@ class Comparison:
         return self.names[int(np.nanargmax(means))]
 
     def __str__(self) -> str:
-        """Return the table, 80 columns wide."""
-        from optid.show.comparing import describe_comparison
-
-        return describe_comparison(self)
+        return render(self)
 
 
 def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizon: int = 1, x0: Any = "fit"
@@ -73,7 +79,7 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
         x0: initial state of the simulations, as the models take it.
 
     Raises:
-        StructureError: no model, or a horizon that is not a whole number from 1.
+        StructureError: no model, or a horizon that is not a positive integer.
         DataError: the record has other channels or another sampling time than a model.
     """
     named = dict(models) if isinstance(models, Mapping) else _named(models)
@@ -84,22 +90,16 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
         warnings.simplefilter("ignore", DataWarning)  # they stand in the notes of the validations
         validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
         curves = tuple(fit_by_horizon(model, raw) for model in named.values())
-        outputs = {
-            ONE_STEP: [[e.y - r for e, r in zip(raw.experiments, checked.residuals)] for checked in validations]
-        }
-        if horizon > 1:
-            outputs[f"{horizon} steps"] = [one_step(model, raw, horizon) for model in named.values()]
-        free = [list(checked.simulated) or [np.full(e.y.shape, np.nan) for e in raw.experiments]
-                for checked in validations]
-        if any(checked.measured_feedback for checked in validations):
-            outputs[MEASURED] = [
-                simulated(model, raw, MEASURED, x0) if checked.measured_feedback else arrays
-                for model, checked, arrays in zip(named.values(), validations, free)
-            ]
-        outputs[SIMULATION] = free
-    fits = {word: found for word, several in outputs.items() if not np.isnan(found := _fits(raw, several)).all()}
-    return Comparison(tuple(named), tuple(named.values()), raw, horizon, fits, validations, curves,
-                      tuple(checked.simulated for checked in validations))
+    nothing = tuple(np.full(e.y.shape, np.nan) for e in raw.experiments)
+    fits = {}
+    for word in (ONE_STEP, f"{horizon} steps", MEASURED, SIMULATION):
+        if any(word in checked.predicted for checked in validations):
+            # a model without feedback simulates alike, measured or not
+            other = SIMULATION if word == MEASURED else word
+            found = common_fits(raw, [checked.predicted.get(word, checked.predicted.get(other, nothing))
+                                      for checked in validations])
+            fits |= {} if np.isnan(found).all() else {word: found}
+    return Comparison(tuple(named), tuple(named.values()), raw, horizon, fits, validations, curves)
 
 
 def _named(models: Sequence[Any]) -> dict[str, Any]:
@@ -108,16 +108,5 @@ def _named(models: Sequence[Any]) -> dict[str, Any]:
     for model in models:
         orders = ", ".join(f"{key} {' '.join(map(str, np.ravel(value)))}" for key, value in model.orders.items())
         words.append(f"{model.title} ({orders})" if orders else model.title)
-    return {
-        word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
-        for i, (word, model) in enumerate(zip(words, models))
-    }
-
-
-def _fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
-    """Fits (models, l) over the samples that all models with any prediction predict."""
-    y = np.vstack([e.y for e in data.experiments])
-    stacked = [np.vstack(list(arrays)) for arrays in several]
-    lost = [np.isnan(yhat) for yhat in stacked if not np.isnan(yhat).all()]
-    y = np.where(np.any(lost, axis=0), np.nan, y) if lost else y
-    return np.array([fit_percent(y, yhat) for yhat in stacked])
+    return {word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
+            for i, (word, model) in enumerate(zip(words, models))}

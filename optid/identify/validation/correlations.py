@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import toeplitz
+from scipy.special import chdtrc
 
 from optid.arrays import Array
 
@@ -48,17 +50,26 @@ class Correlation:
 
 def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25) -> Correlation:
     """Test the residuals (N,) of each experiment for whiteness by Ljung and Box's statistic; NaN = missing."""
-    from scipy.special import chdtrc
-
     parts = _standardised(residuals)
     values, counts = _products(parts, parts, range(lags + 1))
-    statistic = float(np.sum(counts[1:] * values[1:] ** 2) * (1 + 2 / max(counts[0], 1)))
-    return Correlation(output, None, np.arange(lags + 1), values, _band(counts), float(chdtrc(lags, statistic)))
+    inflation = 1 + 2 / max(counts[0], 1)
+    return Correlation(output, None, np.arange(lags + 1), values, _band(counts),
+                       _portmanteau(values[1:], counts[1:], inflation))
 
 
-def cross_correlation(
-    residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
-) -> Correlation:
+def between_outputs(residuals: Sequence[Array], others: Sequence[Array], output: str, other: str, lags: int = 25
+                    ) -> Correlation:
+    """Test whether the residual of an output depends on the past of the residual of another one, at lags 1 .. lags.
+
+    Samples of the same instant may be correlated: the noises of two outputs often are. Both residuals are taken to be
+    white, which their own tests decide. Arguments as in `cross_correlation`, with another output for the input.
+    """
+    values, counts = _products(_standardised(residuals), _standardised(others), range(1, lags + 1))
+    return Correlation(output, other, np.arange(1, lags + 1), values, _band(counts), _portmanteau(values, counts))
+
+
+def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
+                      ) -> Correlation:
     """Test whether the residuals depend on the input at lags 0 .. lags; negative lags show feedback.
 
     The statistic takes the autocorrelation of the input into account.
@@ -70,44 +81,23 @@ def cross_correlation(
         channel: name of the input.
         lags: largest lag.
     """
-    from scipy.linalg import toeplitz
-    from scipy.special import chdtrc
-
     e, u = _standardised(residuals), _standardised(inputs)
     around = np.arange(-lags, lags + 1)
     values, counts = _products(e, u, around)
     own, _ = _products(u, u, range(lags + 1))
-    causal = around >= 0
     p_value = float("nan")
     if np.isfinite(values).all() and np.isfinite(own).all():
         scale, axes = np.linalg.eigh(toeplitz(own))
         # a slowly varying input excites few directions only: the others carry no evidence
         informed = scale > 1e-3 * scale[-1]
-        score = axes.T[informed] @ (np.sqrt(counts[causal]) * values[causal])
-        p_value = float(chdtrc(int(informed.sum()), float(np.sum(score**2 / scale[informed]))))
+        score = axes.T[informed] @ (np.sqrt(counts[lags:]) * values[lags:])
+        p_value = _portmanteau(score, 1 / scale[informed])
     return Correlation(output, channel, around, values, _band(counts), p_value)
 
 
-def between_outputs(
-    residuals: Sequence[Array], others: Sequence[Array], output: str, other: str, lags: int = 25
-) -> Correlation:
-    """Test whether the residual of an output depends on the past of the residual of another one, at lags 1 .. lags.
-
-    Samples of the same instant may be correlated: the noises of two outputs often are. Both residuals are taken to be
-    white, which their own tests decide.
-
-    Args:
-        residuals: (N,) per experiment, NaN = missing.
-        others: (N,) per experiment, of the other output.
-        output: name of the output.
-        other: name of the other output.
-        lags: largest lag.
-    """
-    from scipy.special import chdtrc
-
-    values, counts = _products(_standardised(residuals), _standardised(others), range(1, lags + 1))
-    statistic = float(np.sum(counts * values**2))
-    return Correlation(output, other, np.arange(1, lags + 1), values, _band(counts), float(chdtrc(lags, statistic)))
+def _portmanteau(values: Array, weights: Array, inflation: float = 1.0) -> float:
+    """Probability that a chi-square variable exceeds the weighted sum of squares of so many values."""
+    return float(chdtrc(values.size, float(np.sum(weights * values**2) * inflation)))
 
 
 def _band(counts: Array) -> Array:

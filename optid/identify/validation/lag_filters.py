@@ -1,36 +1,83 @@
-"""What carries an input to the outputs, whatever the noise: the delay, the poles, a few orthonormal filters."""
+"""Functions of an input, and filters that carry them to the outputs, whatever the static nonlinearity and the noise."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import interpolated
+from optid.errors import RankError
 from optid.identify.order.ranks import rank_test
-from optid.identify.validation.families import Family
 from optid.models.recursions import lfilter
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3
-LATEST = 30
-"""Longest delay looked for, in samples."""
-
+LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1
-"""Poles more than the order that the data show: what is too weak for that may still matter to a sharp test."""
-
-FEW = 3
-"""Functions per input with which the dynamics are looked for."""
-
+SPARE = 1  # poles more than the order that the data show: what is too weak for that may still matter to a sharp test
+FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
 
-SETTLED = 1e-3
-"""Share of its largest value below which an impulse response has ended."""
+SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Functions of one input: powers, which follow its tails, and hats between quantiles, which follow its kinks.
+
+    Attributes:
+        centre, spread: mean and standard deviation of the samples.
+        degree: largest power.
+        nodes: (k + 2,) increasing; k hats, one for each inner node.
+    """
+
+    centre: float
+    spread: float
+    degree: int
+    nodes: Array
+
+    @classmethod
+    def of(cls, data: Data, c: int, degree: int, hats: int) -> "Family":
+        """Place the functions for input c; no more than it has levels less one.
+
+        Raises:
+            RankError: a constant input.
+        """
+        samples = np.concatenate([e.u[:, c] for e in data.experiments])
+        samples = samples[~np.isnan(samples)]
+        levels = np.unique(samples).size
+        if levels < 2:
+            raise RankError(f"Input {data.inputs[c]!r} is constant: nothing depends on it.")
+        degree = min(degree, levels - 1)
+        room = max(0, min(hats, levels - 1 - degree))
+        nodes = np.unique(np.quantile(samples, np.linspace(0, 1, room + 2))) if room else np.zeros(0)
+        return cls(float(samples.mean()), float(samples.std()), degree, nodes)
+
+    @property
+    def size(self) -> int:
+        """Number of functions."""
+        return self.degree + max(self.nodes.size - 2, 0)
+
+    def values(self, u: Array) -> Array:
+        """Evaluate the functions of complete samples, (N, size)."""
+        x = (u - self.centre) / self.spread
+        powers = np.asarray(np.polynomial.hermite_e.hermevander(x, self.degree)[:, 1:], dtype=float)
+        if self.nodes.size < 3:
+            return powers
+        inside = np.clip(u, self.nodes[0], self.nodes[-1])
+        cell = np.clip(np.searchsorted(self.nodes, inside, side="right") - 1, 0, self.nodes.size - 2)
+        share = (inside - self.nodes[cell]) / (self.nodes[cell + 1] - self.nodes[cell])
+        hats = np.zeros((len(u), self.nodes.size))
+        rows = np.arange(len(u))
+        hats[rows, cell], hats[rows, cell + 1] = 1 - share, share
+        return np.hstack([powers, hats[:, 1:-1]])
 
 
 def delay_of(data: Data, latest: int = LATEST) -> int:
@@ -44,8 +91,6 @@ def delay_of(data: Data, latest: int = LATEST) -> int:
         data: the record.
         latest: longest delay looked for.
     """
-    from scipy.special import fdtrc
-
     families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
     p = sum(family.size for family in families)
     shortest = min(e.n_samples for e in data.experiments)

@@ -1,17 +1,26 @@
-"""What a model says about a record, by the three predictors: one step, measured feedback, simulation.
+"""What a model says about a record, and how far from the record it is.
 
 One step ahead uses the outputs up to the sample before; the simulation uses none. Between them stands, for models that
 feed outputs back through static functions, the simulation that takes these outputs from the record (theory of
 subspace identification with nonlinear feedback: P1, P2 and P3).
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
+from optid.errors import DataError
 from optid.models.functions import has_feedback
+from optid.registry import render
 
 ONE_STEP, MEASURED, SIMULATION = "one step", "measured feedback", "simulation"
+
+HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
+"""Samples ahead at which the fit is evaluated, as far as the record reaches."""
 
 
 def predictors(model: Any) -> tuple[str, ...]:
@@ -20,8 +29,12 @@ def predictors(model: Any) -> tuple[str, ...]:
 
 
 def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
-    """Return the predictions (N, l) of every experiment, so many steps ahead; NaN where there is none."""
-    return listed(model.predict(data, horizon))
+    """Return the predictions (N, l) of every experiment, so many steps ahead; NaN where there is none.
+
+    Raises:
+        StructureError: a horizon that is not a positive integer.
+    """
+    return _as_list(model.predict(data, horizon))
 
 
 def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
@@ -36,9 +49,123 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
     Raises:
         DataError: a missing input, or a simulation that leaves the range of the data.
     """
-    return listed((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
+    return _as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
 
 
-def listed(arrays: Any) -> list[Array]:
-    """Return one array per experiment, as a list."""
+@dataclass(frozen=True)
+class Measures:
+    """Errors of one output over the samples that are present and predicted.
+
+    Attributes:
+        fit: 100 (1 - |y - yhat| / |y - mean y|), in %; 100 is perfect, the mean scores 0.
+        vaf: variance accounted for, 100 (1 - var(y - yhat) / var y), in %.
+        rmse: root of the mean squared error, in output units.
+        e_n: mean squared error (1/N) sum (y - yhat)^2, as the source prints it; perhaps its root was lost: rmse.
+        snr: sum y^2 / sum (y - yhat)^2 as the source prints it, a ratio of energies.
+        snr_amplitude: the root of that, a ratio of amplitudes.
+        samples: number of samples N.
+    """
+
+    fit: float
+    vaf: float
+    rmse: float
+    e_n: float
+    snr: float
+    snr_amplitude: float
+    samples: int
+
+    @classmethod
+    def of(cls, y: Array, predicted: Array) -> "Measures":
+        """Compare y (N,) with predicted (N,); NaN in either leaves the sample out."""
+        here = ~(np.isnan(y) | np.isnan(predicted))
+        if not here.any():
+            nan = float("nan")
+            return cls(nan, nan, nan, nan, nan, nan, 0)
+        y, error = y[here], (y - predicted)[here]
+        e_n = float(np.mean(error**2))
+        snr = float(np.mean(y**2)) / e_n if e_n > 0 else float("inf")
+        vaf = 100 * (1 - float(np.var(error) / np.var(y))) if np.ptp(y) > 0 else float("nan")
+        fit = float(fit_percent(y[:, None], (y - error)[:, None])[0])
+        return cls(fit, vaf, float(np.sqrt(e_n)), e_n, snr, float(np.sqrt(snr)), int(here.sum()))
+
+
+def fit_percent(y: Array, predicted: Array) -> Array:
+    """Return 100 (1 - |y - yhat| / |y - mean y|) of every output, (l,), over the samples present in both.
+
+    Args:
+        y: (N, l) measured.
+        predicted: (N, l) predicted or simulated.
+    """
+    fits = np.full(y.shape[1], np.nan)
+    for o in range(y.shape[1]):
+        here = ~(np.isnan(y[:, o]) | np.isnan(predicted[:, o]))
+        if here.any() and np.ptp(y[here, o]) > 0:
+            spread = np.linalg.norm(y[here, o] - y[here, o].mean())
+            fits[o] = 100 * (1 - np.linalg.norm(y[here, o] - predicted[here, o]) / spread)
+    return fits
+
+
+def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
+    """Return the fits in % of several predictions of a record, (k, l), over the samples that all of them predict.
+
+    Args:
+        data: the record.
+        several: predicted outputs, one (N, l) per experiment each. One that predicts nothing does not count for the
+            others; its fit is NaN.
+    """
+    y = np.vstack([e.y for e in data.experiments])
+    stacked = [np.vstack(list(arrays)) for arrays in several]
+    lost = [np.isnan(predicted) for predicted in stacked if not np.isnan(predicted).all()]
+    y = np.where(np.any(lost, axis=0), np.nan, y) if lost else y
+    return np.array([fit_percent(y, predicted) for predicted in stacked])
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonCurve:
+    """Fits of the predictions so many samples ahead; `print` it.
+
+    Attributes:
+        outputs: names of the outputs.
+        horizons: (h,) samples ahead.
+        fits: (h, l) in %, all over the same samples: those that the longest horizon predicts.
+        simulation: (l,) fit of the simulation over these samples, the limit of the curve; NaN where there is none.
+    """
+
+    outputs: tuple[str, ...]
+    horizons: tuple[int, ...]
+    fits: Array
+    simulation: Array
+
+    def __str__(self) -> str:
+        return render(self)
+
+
+def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None) -> HorizonCurve:
+    """Predict 1, 2, ... samples ahead and compare each with the record.
+
+    Args:
+        model: the model.
+        data: the record.
+        horizons: samples ahead; by default up to 100, a quarter of the longest experiment at most.
+
+    Raises:
+        DataError: other channels or another sampling time than the model's, or nothing that can be predicted.
+        StructureError: a horizon that is not a positive integer.
+    """
+    raw = data.raw()
+    longest = max(e.n_samples for e in raw.experiments)
+    chosen = [h for h in HORIZONS if h <= max(1, longest // 4)] if horizons is None else list(horizons)
+    ahead = [one_step(model, raw, h) for h in chosen]
+    for h, arrays in zip(chosen, ahead):
+        if np.isnan(np.vstack(arrays)).all():
+            raise DataError(f"no sample can be predicted {h} samples ahead; use shorter horizons")
+    try:
+        free = simulated(model, raw)
+    except DataError:
+        free = [np.full(e.y.shape, np.nan) for e in raw.experiments]
+    fits = common_fits(raw, [*ahead, free])
+    return HorizonCurve(raw.outputs, tuple(chosen), fits[:-1], fits[-1])
+
+
+def _as_list(arrays: Any) -> list[Array]:
     return list(arrays) if isinstance(arrays, list | tuple) else [arrays]

@@ -17,17 +17,17 @@ Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation.structure_design import Design
-
-if TYPE_CHECKING:
-    from optid.structures.rank_one import RankOne
+from optid.statistics.factors import dependent_column, root_of_gram
+from optid.structures.bilinear import minimise
+from optid.structures.rank_one import RankOne, matrices
 
 SIGNIFICANT = 1e-3
 NOTICEABLE = 0.015
@@ -36,14 +36,11 @@ NOTICEABLE = 0.015
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
 
-DISTINCT = 1e-4
-"""Smallest eigenvalue of the correlations of alternatives that counts as a direction of its own."""
-
+DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
 
-DIGITS = 1e-8
-"""A residual below this share of the standard deviation of the output is rounding."""
+DIGITS = 1e-8  # a residual below this share of the standard deviation of the output is rounding
 
 
 @dataclass(frozen=True)
@@ -95,8 +92,6 @@ class FTest:
     @classmethod
     def of(cls, more: float, extra: int, rest: float, spare: int) -> "FTest":
         """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom."""
-        from scipy.special import fdtrc
-
         if extra <= 0 or rest <= 0:
             return cls()
         free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
@@ -119,76 +114,70 @@ def structure_test(data: Data) -> Structure:
     if data.n_samples > 1.1 * SAMPLES:
         data = data.split(SAMPLES / data.n_samples)[0]
     design = Design.of(data)
-    tests: list[FTest] = []
-    ratios = dict.fromkeys(data.inputs, 0.0)
-    products, rank = {}, {}
-    for o, name in enumerate(data.outputs):
-        of_products, of_rank, found = _test_output(design, o)
-        tests += [of_products, of_rank]
-        products[name], rank[name] = of_products.p_value, of_rank.p_value
-        ratios = {channel: max(ratio, one) for (channel, ratio), one in zip(ratios.items(), found)}
+    found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
+    tests = [test for products, rank, _ in found.values() for test in (products, rank)]
     # what is significant but too small to notice must not hide what is both
     telling = min(tests, key=lambda test: (test.p_value if test.saving > NOTICEABLE else 1.0, test.p_value))
-    return Structure(ratios, min(1.0, len(tests) * telling.p_value), telling.saving, products, rank)
+    ratios = np.max([each for _, _, each in found.values()], axis=0)
+    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * telling.p_value), telling.saving,
+                     {name: products.p_value for name, (products, _, _) in found.items()},
+                     {name: rank.p_value for name, (_, rank, _) in found.items()})
 
 
 def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
     """Test products and rank on one output; also second over first singular value by input."""
-    from optid.structures.bilinear import minimise
-    from optid.structures.rank_one import matrices
-
-    additive, linear = _least_squares(design, o)
+    additive = _additive_gram(design, o)
     problem = _rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
     # the residuals of the hypothesis: the free model would explain part of a slow noise and hide its colour
     hypothesis = minimise(problem, count=3).point
-    responses = _responses(design, [np.asarray(np.linalg.svd(theta)[2][:2], dtype=float) for theta in free], linear)
+    leading = [np.asarray(np.linalg.svd(theta)[2][:2], dtype=float) for theta in free]
+    responses = _responses(design, leading, _linear_coefficients(additive, design.blocks))
     bs = [np.asarray(b, dtype=float) for b in hypothesis.bs]
     lines = [design.filters @ b for b in bs]
     residuals, mean, spread = _residuals(design, o, np.asarray(hypothesis.lift(), dtype=float), responses)
-    pooled = np.concatenate(residuals)
     y = np.concatenate([e.y[:, o] for e in design.data.experiments])
-    if np.nanstd(pooled) <= DIGITS * np.nanstd(y):
+    if np.nanstd(np.concatenate(residuals)) <= DIGITS * np.nanstd(y):
         return FTest(), FTest(), [0.0] * design.data.m
     noise = _autoregression(residuals)
     past = noise.size - 1
-    gram, sizes, rows = np.zeros((0, 0)), [0], 0
+    gram, sizes, rows = np.zeros((1, 1)), [0], 0
     for u, output, valid in design.stretches(o, past):
         carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
         blocks = [design.additive(u), design.finer(u, lines), _alternatives(carriers), output[:, None]]
-        sizes = [block.shape[1] for block in blocks]
-        columns = np.hstack(blocks)
+        sizes, columns = [block.shape[1] for block in blocks], np.hstack(blocks)
         complete = np.convolve(~valid, np.ones(past + 1))[past : valid.size] < 0.5
         white = np.sum([a * columns[past - i : len(columns) - i] for i, a in enumerate(noise)], axis=0)[complete]
-        gram = white.T @ white + (gram if rows else 0.0)
+        gram = gram + white.T @ white
         rows += len(white)
     edges = np.cumsum([0, *sizes])
     if rows < 1.5 * edges[-1]:
         raise RankError(f"{rows} complete rows for {edges[-1]} columns of the structure test: use a longer record.")
-    of_products = _products_test(gram, int(edges[2]), rows)
-    keep = np.concatenate([np.arange(edges[2]), [edges[-1] - 1]])
-    of_rank, ratios = _rank_test(gram[np.ix_(keep, keep)], bs, design.blocks, rows)
-    return of_products, of_rank, ratios
+    keep = np.r_[: edges[2], edges[-1] - 1]
+    return (_products_test(gram, int(edges[2]), rows),
+            *_rank_test(gram[np.ix_(keep, keep)], bs, design.blocks, rows))
 
 
-def _least_squares(design: Design, o: int) -> tuple[Array, Array]:
-    """Gram matrix of the additive regression, and coefficients of the linear one."""
+def _additive_gram(design: Design, o: int) -> Array:
+    """Gram matrix [1 | filters of functions by input | y] of the additive regression."""
     size = 2 + sum(p * j for p, j in design.blocks)
-    additive, linear = np.zeros((size, size)), np.zeros((2 + design.data.m * design.filters.shape[1],) * 2)
-    rows = 0
+    gram, rows = np.zeros((size, size)), 0
     for u, output, valid in design.stretches(o):
-        for gram, columns in ((additive, design.additive(u)), (linear, design.linear(u))):
-            used = np.column_stack([columns, output])[valid]
-            gram += used.T @ used
-        rows += int(valid.sum())
+        used = np.column_stack([design.additive(u), output])[valid]
+        gram += used.T @ used
+        rows += len(used)
     if rows < 2 * size:
         raise RankError(f"{rows} complete rows for {size} columns of the structure test: use a longer record.")
-    return additive, _solved(linear)
+    return gram
 
 
-def _solved(gram: Array) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-300))
-    return np.linalg.lstsq(gram[:-1, :-1] / np.outer(scale, scale), gram[:-1, -1] / scale, rcond=1e-12)[0] / scale
+def _linear_coefficients(gram: Array, blocks: tuple[tuple[int, int], ...]) -> Array:
+    """Coefficients of the filters of every input itself, its first function, in a regression on these alone."""
+    starts = 1 + np.cumsum([0, *(p * j for p, j in blocks)])
+    chosen = np.concatenate([[0], *(start + p * np.arange(j) for start, (p, j) in zip(starts, blocks))])
+    scale = np.sqrt(np.maximum(np.diag(gram)[chosen], 1e-300))
+    inner, outer = gram[np.ix_(chosen, chosen)] / np.outer(scale, scale), gram[chosen, -1] / scale
+    return (np.linalg.lstsq(inner, outer, rcond=1e-12)[0] / scale)[1:]
 
 
 def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
@@ -199,15 +188,14 @@ def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
     inputs make products enough.
     """
     m, size = design.data.m, len(design.filters)
-    responses = [design.filters @ linear[1:].reshape(m, -1).T]
+    responses = [design.filters @ linear.reshape(m, -1).T]
     for c, coefficients in enumerate(leading):
         lines = design.filters @ coefficients.T
         strongest = int(np.argmax(np.abs(lines[:, 0])))
-        pulses = np.eye(size)[:, [lag for lag in (strongest, strongest + 1) if lag < size]]
+        pulses = np.eye(size)[:, strongest : strongest + 2]
         each = 2 if m == 1 else 1
         for line in np.hstack([lines[:, :each], pulses[:, :each]]).T:
-            responses.append(np.zeros((size, m)))
-            responses[-1][:, c] = line
+            responses.append(np.outer(line, np.arange(m) == c))
     return np.stack(responses, axis=1)
 
 
@@ -262,84 +250,69 @@ def _autoregression(residuals: list[Array]) -> Array:
     return best
 
 
+def _distinct(gram: Array, least: float) -> Array:
+    """Combinations (n, k) of columns in which their Gram matrix is the identity; small eigenvalues are left out."""
+    values, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    return vectors[:, values > least] / np.sqrt(values[values > least])
+
+
 def _products_test(gram: Array, n: int, rows: int) -> FTest:
     """Test whether columns n ... of the Gram matrix [additive | alternatives | y] save anything."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled[:n, :n])
-    sound = values > 1e-10
-    half = (vectors[:, sound] / np.sqrt(values[sound])).T @ scaled[:n, n:]
+    sound = _distinct(scaled[:n, :n], 1e-10)
+    half = sound.T @ scaled[:n, n:]
     left = scaled[n:, n:] - half.T @ half
     size = np.sqrt(np.maximum(np.diag(left)[:-1], 1e-300))
-    new = size > 1e-3  # what is left of an alternative of norm one
-    correlations = (left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)]
-    values, vectors = np.linalg.eigh(correlations)
-    distinct = values > DISTINCT
-    along = (vectors[:, distinct] / np.sqrt(values[distinct])).T @ (left[:-1, -1] / size)[new]
-    more = float(along @ along)
-    extra = int(distinct.sum())
-    return FTest.of(more, extra, float(left[-1, -1]) - more, rows - int(sound.sum()) - extra)
+    new = np.flatnonzero(size > 1e-3)  # what is left of an alternative of norm one
+    distinct = _distinct((left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)], DISTINCT)
+    more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
+    extra = distinct.shape[1]
+    return FTest.of(more, extra, float(left[-1, -1]) - more, rows - sound.shape[1] - extra)
 
 
-def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> "RankOne":
+def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
     """Write least squares with the Gram matrix [linear | blocks | y] as a rank-one problem."""
-    from optid.statistics.factors import dependent_column, root_of_gram
-    from optid.structures.rank_one import RankOne
-
     n = len(gram) - 1
     root = root_of_gram(gram, n)
     if dependent_column(root, n, "gram") is not None:
         raise RankError(
-            "Filters of functions of the inputs depend on each other: the inputs have too few levels or frequencies."
-        )
+            "Filters of functions of the inputs depend on each other: the inputs have too few levels or frequencies.")
     return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
 
 
-def _rank_test(
-    gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
-) -> tuple[FTest, list[float]]:
+def _rank_test(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
+               ) -> tuple[FTest, list[float]]:
     """Test rank one of every block of the Gram matrix [1 | blocks | fine | y]; also second over first singular values.
 
     The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
     for a second nonlinearity.
     """
-    from optid.structures.bilinear import minimise
-    from optid.structures.rank_one import matrices
-
     size = 1 + sum(p * j for p, j in blocks)
     finer = _finer_directions(gram, leading, blocks)
-    change = np.zeros((len(gram), finer.shape[1] + size + 1))
     linear = 1 + finer.shape[1]
-    change[0, 0] = change[-1, -1] = 1.0
-    change[:, 1:linear] = finer
-    change[1:size, linear:-1] = np.eye(size - 1)
-    gram = change.T @ gram @ change
-    problem = _rank_one(gram, blocks, linear)
-    rest = problem.remainder
+    unit = np.eye(len(gram))
+    change = np.hstack([unit[:, :1], finer, unit[:, 1:size], unit[:, -1:]])
+    problem = _rank_one(change.T @ gram @ change, blocks, linear)
     free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
     singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
-    extra = sum((p - 1) * (j - 1) for p, j in blocks)
-    if not extra:
-        return FTest(), ratios
-    return FTest.of(minimise(problem, count=3).value - rest, extra, rest, rows - len(problem.target)), ratios
+    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), problem.remainder
+    more = minimise(problem, count=3).value - rest if extra else 0.0
+    return FTest.of(more, extra, rest, rows - len(problem.target)), ratios
 
 
 def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:
     """Combinations (columns of `gram`) of the fine functions that the blocks' functions, so filtered, do not give."""
     size = 1 + sum(p * j for p, j in blocks)
-    fine = np.zeros((len(gram), len(gram) - 1 - size))
-    fine[size:-1] = np.eye(fine.shape[1])
-    coarse, start = np.zeros((len(gram), 1 + sum(p for p, _ in blocks))), 1
-    coarse[0, 0] = 1.0
-    column = 1
+    fine = np.eye(len(gram))[:, size:-1]
+    coarse, start = [np.eye(len(gram))[:, :1]], 1
     for (p, j), coefficients in zip(blocks, leading):
-        coarse[start : start + p * j, column : column + p] = np.kron(coefficients[:, None], np.eye(p))
-        start, column = start + p * j, column + p
-    norm = np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
-    fine = fine / norm
-    inner = coarse.T @ gram @ coarse
-    fine = fine - coarse @ (np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ (coarse.T @ gram @ fine))
-    left = fine.T @ gram @ fine
-    values, vectors = np.linalg.eigh((left + left.T) / 2)
-    return fine @ vectors[:, values > DISTINCT]
+        coarse.append(np.zeros((len(gram), p)))
+        coarse[-1][start : start + p * j] = np.kron(coefficients[:, None], np.eye(p))
+        start += p * j
+    coarse = np.hstack(coarse)
+    fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
+    inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
+    fine = fine - coarse @ (inner @ (coarse.T @ gram @ fine))
+    return fine @ _distinct(fine.T @ gram @ fine, DISTINCT)

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import interpolated
-from optid.identify.validation.families import Family
-from optid.identify.validation.lag_filters import convolved, delay_of, orthonormal_filters, poles_of
+from optid.identify.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
 
 DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
@@ -18,12 +17,8 @@ DEGREE, HATS, SAMPLES = 3, 5, 250
 FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
 """The same for the leading filter: there f is known to a few tenths of a percent."""
 
-EXTRA = 3
-"""Pulses beyond the order of the filters."""
-
-LONGEST = 600
-"""Samples after which the filters are cut, at most."""
-
+EXTRA = 3  # pulses beyond the order of the filters
+LONGEST = 600  # samples after which the filters are cut, at most
 CHUNK = 16384
 PRESENT = 0.9
 """Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
@@ -40,7 +35,6 @@ class Design:
         fine: more functions of each input.
         filters: (L, J) orthonormal impulse responses.
         heavy: samples after a missing input until most of its effect has passed.
-        centre, spread: (m,) mean and standard deviation of the inputs.
     """
 
     data: Data
@@ -49,8 +43,6 @@ class Design:
     fine: tuple[Family, ...]
     filters: Array
     heavy: int
-    centre: Array
-    spread: Array
 
     @classmethod
     def of(cls, data: Data) -> "Design":
@@ -59,29 +51,21 @@ class Design:
         longest = int(np.clip(data.n_samples // 5, 20, LONGEST))
         filters = orthonormal_filters(poles_of(data, delay), EXTRA, delay, longest)
         energy = np.cumsum(np.sum(filters**2, axis=1))
-        u = tuple(interpolated(e.u) for e in data.experiments)
-        stacked = np.concatenate(u)
         each = data.n_samples // data.m
         hats, fine = int(np.clip(each // SAMPLES, 0, HATS)), int(np.clip(each // FINE_SAMPLES, 2, FINE_HATS))
         return cls(
-            data=data,
-            u=u,
+            data, tuple(interpolated(e.u) for e in data.experiments),
             families=tuple(Family.of(data, c, DEGREE, hats) for c in range(data.m)),
             fine=tuple(Family.of(data, c, FINE_DEGREE, fine) for c in range(data.m)),
-            filters=filters,
-            heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1,
-            centre=stacked.mean(axis=0),
-            spread=stacked.std(axis=0),
-        )
+            filters=filters, heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1)
 
     @property
     def blocks(self) -> tuple[tuple[int, int], ...]:
         """Functions and filters by input."""
         return tuple((family.size, self.filters.shape[1]) for family in self.families)
 
-    def stretches(
-        self, o: int, before: int = 0, among: Sequence[int] | None = None
-    ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
+    def stretches(self, o: int, before: int = 0, among: Sequence[int] | None = None
+                  ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
         """Yield inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
 
         Args:
@@ -104,17 +88,11 @@ class Design:
         parts = [convolved(f.values(u[:, c]), self.filters).reshape(rows, -1) for c, f in enumerate(self.families)]
         return np.hstack([np.ones((rows, 1)), *parts])
 
-    def linear(self, u: Array) -> Array:
-        """Return [1, filters of the standardised inputs], (T, 1 + m J)."""
-        rows = len(u) - len(self.filters) + 1
-        lines = convolved((u - self.centre) / self.spread, self.filters).transpose(0, 2, 1)
-        return np.hstack([np.ones((rows, 1)), lines.reshape(rows, -1)])
-
     def finer(self, u: Array, lines: list[Array]) -> Array:
         """Return the fine functions of every input c through its response lines[c] (L,), (T, sum P_c)."""
         return np.hstack([convolved(f.values(u[:, c]), lines[c][:, None])[:, 0] for c, f in enumerate(self.fine)])
 
     def filtered(self, u: Array, responses: Array) -> Array:
         """Filter the standardised inputs (T + L - 1, m) with responses (L, q, m) and add them up, (T, q)."""
-        scaled = (u - self.centre) / self.spread
-        return np.sum([convolved(scaled[:, [c]], responses[:, :, c])[:, :, 0] for c in range(u.shape[1])], axis=0)
+        return np.sum([convolved((u[:, [c]] - f.centre) / f.spread, responses[:, :, c])[:, :, 0]
+                       for c, f in enumerate(self.families)], axis=0)
