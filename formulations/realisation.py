@@ -71,7 +71,7 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
         name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
         {**variables, "residual": residual}, realisation.start(), realisation.factors,
         _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
-        scale=problem.scale, compressed=realisation.step, unit=1.0 if relative else energy_unit(units),
+        scale=problem.scale, unit=1.0 if relative else energy_unit(units),
         structure=structure, certify=certify).subject_to(*constraints)
 
 

@@ -152,7 +152,7 @@ def test_refusals():
         quiet(data, shooting.exact, gauge="none", **ORDERS)
     with pytest.raises(StructureError, match="one output"):
         quiet(Data(data.u, np.hstack([data.y, data.y**2])), shooting.exact, **ORDERS)
-    with pytest.raises(StructureError, match="na is the number"):
+    with pytest.raises(StructureError, match="na .the number of poles."):
         quiet(data, shooting.exact, **(ORDERS | {"na": -1}))
     with pytest.raises(RankError, match="samples for"):
         quiet(Data(data.u[:10], data.y[:10]), shooting.exact, **ORDERS)

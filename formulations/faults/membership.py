@@ -194,7 +194,7 @@ def membership_programme(window: BoundedWindow, signature: Signature | None = No
     return Program(
         "fault.membership", cp.Minimize(t), constraints, variables,
         {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions),
-        structural=frozenset(constraints), scale=1.0, compressed=window,
+        structural=frozenset(constraints), scale=1.0,
         certify=partial(_certified, window, signature, bounded, exact, bounds))
 
 

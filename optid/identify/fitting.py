@@ -98,7 +98,7 @@ class Fit:
         """
         from optid.identify.validation.predictions import common_fits, one_step
 
-        if hasattr(self.program.compressed, "one_step_fit"):
+        if self.program.compressed is not None:
             return self.program.compressed.one_step_fit(self.solution.values)
         if isinstance(self.data, Stream):
             return np.full(len(self.data.outputs), np.nan)
@@ -232,9 +232,9 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
         _raise_failure(outcome)
     model = outcome.model
     findings = findings + _disobeyed(model, arguments.get("constraints", ()))
-    statistics, figures = getattr(outcome.program.compressed, "statistics", None), dict(outcome.figures)
-    if statistics is not None:
-        figures |= {key: getattr(statistics, key) for key in ("rows", "candidates", "condition", "method")}
+    compressed, figures = outcome.program.compressed, dict(outcome.figures)
+    if compressed is not None:
+        figures |= {key: getattr(compressed.statistics, key) for key in ("rows", "candidates", "condition", "method")}
     findings = findings + examine_figures(figures)
     return Fit(identified=_in_raw_units(model, data), solved=outcome.solution, formulation=name, arguments=arguments,
                program=outcome.program, data=data,

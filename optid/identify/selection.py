@@ -8,6 +8,7 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.equation_error import EquationError
 from optid.identify.fitting import Fit, fit, resolve
 from optid.identify.validation.predictions import common_fits, one_step
 
@@ -120,5 +121,7 @@ def _score(one: Fit, test: Data | None) -> float:
 
 def _ratio(one: Fit) -> float:
     """Largest ratio of the second to the first singular value over the channels."""
-    values = [np.linalg.svd(theta, compute_uv=False) for theta in one.program.compressed.matrices(one.solution.values)]
+    compressed = one.program.compressed
+    thetas = compressed.matrices(one.solution.values) if isinstance(compressed, EquationError) else ()
+    values = [np.linalg.svd(theta, compute_uv=False) for theta in thetas]
     return max([0.0, *(float(v[1] / v[0]) for v in values if v.size > 1 and v[0] > 0)])

@@ -164,7 +164,7 @@ def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:
 def _refuse(fit: Any) -> None:
     if not fit.solution.has_point:
         raise StructureError("the fit has no point, so there is nothing to put intervals around")
-    if not hasattr(fit.program.compressed, "lifted"):
+    if fit.program.compressed is None:
         advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
         raise StructureError("they follow from compressed least squares, which "
                              f"{fit.formulation!r} does not keep{advice}")

@@ -67,7 +67,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
         return ()
     program.assign(solution.values)
     unit = program.unit
-    energy = unit * float(np.sum(getattr(program.compressed, "energy", solution.scale / unit)))
+    energy = solution.scale if program.compressed is None else unit * float(np.sum(program.compressed.energy))
     worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
     found, usual = [], program.usual_sizes()
     for name, group in program.user_constraints.items():

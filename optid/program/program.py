@@ -10,6 +10,7 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.errors import StructureError, nearest
+from optid.program.compressed import Compressed
 from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
 from optid.program.solution import Bound
 from optid.program.structure import Structure
@@ -64,8 +65,7 @@ class Program:
         certify: (program, values, duals) -> (Bound, better start or None), or None where no certificate exists.
         scale: objective of the zero model, the yardstick of gaps.
         note: why there can be no proof, where that is known beforehand.
-        compressed: the compressed data the programme was built from, for uncertainty and figures; its class belongs
-            to the formulation.
+        compressed: the compressed data the programme was built from, for prices, intervals and figures.
         unit: what one unit of the objective is in units of the record; solutions report their values in the latter.
         limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
     """
@@ -84,7 +84,7 @@ class Program:
     certify: Callable[["Program", Values, Values], tuple[Bound, Values | None]] | None = None
     scale: float = 1.0
     note: str = ""
-    compressed: Any = field(default=None, repr=False)
+    compressed: Compressed | None = field(default=None, repr=False)
     unit: float = 1.0
     limits: Mapping[str, tuple[Limit, ...]] = field(default_factory=dict, repr=False)
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
+from optid.identify.equation_error import EquationError
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
 from optid.models.functions import has_feedback, response_pairs, static_functions, step_length
@@ -198,7 +199,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, Array]:
     """
     compressed, found = fit.program.compressed, {}
     heights = fit.program.view.units
-    if fit.model.structure != "arx" or compressed is None or not fit.solution.has_point:
+    if not isinstance(compressed, EquationError) or not fit.solution.has_point:
         return found
     if rank_one_of(fit.program) is not None:
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear

@@ -1,32 +1,12 @@
 """Least squares behind a programme, with and without products of its variables."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.program.structure import Structure, relative_gradient, variable_size
 from optid.structures.rank_one import RankOne
-
-
-class SumOfSquares(Protocol):
-    """The numbers of ``‖root z - target‖² + remainder``."""
-
-    @property
-    def root(self) -> Array:
-        """(k, n)."""
-        ...
-
-    @property
-    def target(self) -> Array:
-        """(k,)."""
-        ...
-
-    @property
-    def remainder(self) -> float:
-        """What no variable changes."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +16,14 @@ class LeastSquaresStructure(Structure):
     The structural constraints of its programme only fix directions that do not change F.
 
     Attributes:
-        problem: the numbers.
+        problem: the numbers, see `optid.program.compressed.Compressed`.
         linear: names of the linear variables in the order of z (each flattened column by column).
         blocks: (mu name, b name) of every rank-one block; none without products.
     """
 
     word: ClassVar[str] = "least-squares"
     constrained: ClassVar[bool] = True
-    problem: SumOfSquares
+    problem: Any
     linear: tuple[str, ...]
     blocks: tuple[tuple[str, str], ...] = ()
 
