@@ -7,6 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from optid.cli.app import app
+from optid.conformance.checks import check_formulation
+from optid.examples import example
 
 README = Path(__file__).parent.parent / "README.md"
 MEASURED = re.compile(r"(?<![\w.])[\d.]+(e[-+]\d+)? (ms|s|µs)\b|(?<=gap )\d\.\de-\d+")
@@ -54,3 +56,10 @@ def test_the_diagnosis_is_that_of_the_readme(model, tmp_path):
     shown = output("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out",
                    tmp_path / "d.json")
     assert figures(shown) == figures(printed("faulty: actuator:current loss"))
+
+
+def test_the_formulation_of_the_contributing_guide_is_conformant():
+    text = (Path(__file__).parent.parent / "CONTRIBUTING.md").read_text()
+    names: dict = {}
+    exec(next(block for block in text.split("```python\n")[1:] if "def fir" in block).split("```")[0], names)
+    check_formulation(names["fir"], example("dead_zone").data, nb=20)
