@@ -13,7 +13,8 @@ def main() -> dict[str, float]:
     structure = {"na": 2, "nb": 2, "basis": "triangular:6"}
     print(f"{'formulation':<34}{'solver':<14}{'objective':>14}  {'status':<18}{'ms':>8}  stationarity")
     for name, kinds in KINDS.items():
-        for word in ["auto", *(end.name for end in back_ends().values() if end.installed and end.classes & kinds)]:
+        able = [end.name for end in back_ends().values() if end.installed and kinds.intersection(end.accepted)]
+        for word in ["auto", *able]:
             solution = optid.fit(data, name, solver=word, **structure).solution
             found[f"{name} {word}"] = solution.objective
             disagreement = max(disagreement, abs(solution.objective / found[f"{name} auto"] - 1))

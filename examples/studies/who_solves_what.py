@@ -43,7 +43,7 @@ def solvers(rows: pd.DataFrame) -> list[str]:
     """Write one line per back end."""
     lines = ["| back end | classes | takes | solves | proved | false claims |", "|---|---|---:|---:|---:|---:|"]
     for name, group in rows.groupby("solver"):
-        classes = " ".join(sorted(back_ends()[name].classes)) if name in back_ends() else "chooses one of them"
+        classes = " ".join(back_ends()[name].accepted) if name in back_ends() else "chooses one of them"
         taken = group[group["outcome"] != "refused"]
         lines.append(f"| {name} | {classes} | {len(taken)} | {taken['reached'].sum()} | {taken['proved'].sum()} | "
                      f"{taken['false_claim'].sum()} |")

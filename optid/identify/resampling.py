@@ -151,10 +151,10 @@ def _residuals(model: HammersteinARX, data: Data) -> Array:
 
 def _simulated(model: HammersteinARX, u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
-    n = model.memory
+    n = model.largest_lag
     u, start = interpolated(u), interpolated(y)[:n]
     right = model.driven(u[n:]) + errors[n:]
-    state = model.state(u[:n], start)
+    state = model.following(u[:n], start)
     count = min(n, len(right))
     right[:count] += state[:count]
     outputs = np.vstack([start, autoregression(model.matrices, right)])

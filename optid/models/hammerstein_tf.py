@@ -151,6 +151,11 @@ class HammersteinTF(TransferFunction):
             raise DataError(
                 f"Output {self.outputs[o]!r} is missing {n - k} samples before the end: the state needs it."
             )
+        return self.following(u, y)
+
+    def following(self, u: Array, y: Array) -> Array:
+        """Return the state (n, l) after n complete samples u (n, m) and y (n, l), see `state`, without checks."""
+        n = self.largest_lag
         state = np.zeros((n, self.l))
         for i, matrix in enumerate(self.matrices, start=1):
             state[:i] -= y[n - i :] @ matrix.T
