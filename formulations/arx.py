@@ -58,5 +58,4 @@ def _programme(problem: EquationError) -> Program:
         "arx", objective, constraints, {**linear, **b, "residual": r}, {}, recover,
         problem.view({**linear, **b}), structural=frozenset(constraints), derived={"residual": residual},
         structure=LeastSquaresStructure(problem.problem, (*linear, *b)), scale=problem.problem.scale,
-        unit=problem.unit,
-        compressed=problem)
+        unit=problem.unit, compressed=problem)

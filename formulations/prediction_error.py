@@ -144,20 +144,19 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
     count = whole_number("starts", starts, 1, "the number of starts")
-    errors = "simulation errors" if "oe" in name else "prediction errors"
-    criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset, errors)
+    criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
     return _run(name, criterion, constraints, count, seed)
 
 
 def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
-                    gauge: str | None, offset: bool, errors: str) -> TransferErrors:
+                    gauge: str | None, offset: bool) -> TransferErrors:
     """Return the criterion on the record in its own units, its arguments checked as in `hammerstein_bj`.
 
-    Where D is A, nd is None; of a linear model the gauge. ``errors`` is what messages call them.
+    Where D is A, nd is None; of a linear model the gauge.
     """
     if gauge is not None:
         check_gauge(gauge)
-    data = one_output(data, errors)
+    data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
     orders = (whole_number("na", na, 0, "the number of poles"), per_channel("nb", nb, data.inputs, low=1),
               per_channel("nk", nk, data.inputs, low=0))
     record, layout, units = plant_record(data, *orders, basis, offset, states=nd is not None)

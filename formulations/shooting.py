@@ -59,7 +59,7 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
     Arguments as in `formulations.prediction_error.hammerstein_bj`, as are the errors raised; constraints may be any
     smooth ones in the named variables. A record that is too long is refused (`StructureError`).
     """
-    criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset, "simulation errors")
+    criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset)
     if criterion.data.n_samples > LIMIT:
         raise StructureError(
             f"{criterion.data.n_samples} samples: with the outputs of every sample as variables this formulation takes "

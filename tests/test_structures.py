@@ -1,6 +1,7 @@
 """Structures: one of a third party, with its solver and its certificate, is chosen, judged, proved and constrained."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from scipy.optimize import nnls
 
 import optid
-from optid.backends import back_ends
+from optid.backends import Answer, back_ends
 from optid.errors import SolverRefused
 from optid.program.solution import Status
 
@@ -46,11 +47,7 @@ def test_auto_takes_the_method_of_a_structure_and_the_point_is_proved(positive):
     assert fit.solution.bound.value == pytest.approx(rest**2, rel=1e-9)
 
 
-def test_a_claim_of_the_method_is_judged(positive, monkeypatch):
-    from dataclasses import replace
-
-    from optid.backends import Answer
-
+def test_a_claim_of_the_method_is_judged(positive):
     lying = replace(positive.back_end, run=lambda program, settings: Answer(
         Status.OPTIMAL, "optimal", {"b": np.full(5, 0.3), "offset": np.zeros(1)}, {"positive": np.zeros(5)}))
     solution = optid.solve(positive.positive(record(), length=5), lying)

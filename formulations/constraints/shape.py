@@ -214,7 +214,7 @@ def fixed(name: str, value: Any) -> Rule:
     def build(view: View) -> Any:
         word, _, channel = name.partition("[")
         product = "Theta[" + channel if channel else "Theta"
-        scaled = product in view or name.replace("b", "mu", 1) in view  # f and b are known up to a factor then
+        scaled = product in view or "mu" + name[len(word):] in view  # f and b are known up to a factor then
         if word not in ("mu", "b") or not scaled:
             _check_shape(name, known, view[name].shape)
             return view[name] == known

@@ -73,8 +73,8 @@ def choose(program: "Program") -> tuple[BackEnd, str]:
         StructureError: when no installed back end accepts the programme.
     """
     if program.structure is not None:
-        first = back_ends().get(AUTO.get(program.structure.word, ("",))[0])
-        for back_end in (*((first,) if first else ()), *back_ends().values()):
+        preferred = AUTO.get(program.structure.word, ())
+        for back_end in sorted(back_ends().values(), key=lambda one: one.name not in preferred):
             if back_end.installed and back_end.exploits(program):
                 return back_end, f"{back_end.name}: {program.structure.about}"
     kind = program.kind

@@ -366,8 +366,7 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
 class NuclearNormStructure(Structure):
     """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
 
-    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix of the
-    nuclear norm to them.
+    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them.
 
     Attributes:
         problem: the numbers.

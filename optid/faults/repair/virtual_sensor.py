@@ -127,7 +127,7 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
     if model.noise is None:
         raise StructureError(
             "The model has no noise covariances, and the best filter depends on them: estimate them with "
-            "optid.identify.noise.with_noise(model, data)."
+            "optid.noise.with_noise(model, data)."
         )
     gone = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
     left = [o for o in range(model.l) if o not in gone]

@@ -187,12 +187,12 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit
-    columns = _positions(layout)
-    problem = _lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
+    columns = positions(layout)
+    problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
 
 
-def _positions(layout: Layout) -> np.ndarray:
+def positions(layout: Layout) -> np.ndarray:
     """Return the position (n_columns, l) in z of the coefficient of every column of the regressor in every output."""
     ny, past = layout.l, layout.na * layout.l
     found = np.empty((layout.n_columns, ny), dtype=int)
@@ -205,8 +205,8 @@ def _positions(layout: Layout) -> np.ndarray:
     return found
 
 
-def _lifted_problem(statistics: Statistics, columns: np.ndarray, ridge: float, curvature: float,
-                    scales: Sequence[float]) -> RankOne:
+def lifted_problem(statistics: Statistics, columns: np.ndarray, ridge: float = 0.0, curvature: float = 0.0,
+                   scales: Sequence[float] = ()) -> RankOne:
     """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
 
     Args:

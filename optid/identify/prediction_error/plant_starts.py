@@ -13,6 +13,7 @@ from optid.arrays import Array
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
+from optid.identify.equation_error.compression import lifted_problem, positions
 from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
@@ -23,7 +24,6 @@ from optid.statistics.regression import collect
 from optid.statistics.sensitivities import instruments
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
-from optid.structures.rank_one import RankOne
 
 PASSES = 8
 """Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""
@@ -84,13 +84,7 @@ def equation_error(data: Data, unknowns: TransferUnknowns, noise: int = 0) -> Tr
     if noise:
         layout = Layout(layout.na, (*layout.nb, noise), (*layout.nk, 1), fitted_bases(data, (*layout.bases, Linear())),
                         layout.outputs, tuple(data.inputs))
-    root, n, na = collect(data, layout).root, layout.n_columns, layout.na
-    order = [*range(na), n - 1, *range(na, n - 1), n]  # vec Theta last
-    triangle = np.triu(np.linalg.qr(root[:, order], mode="r"))
-    triangle = triangle * np.where(np.diag(triangle) < 0, -1.0, 1.0)[:, None]
-    blocks = tuple((basis.size, nb) for basis, nb in zip(layout.bases, layout.nb))
-    point = minimise(RankOne(triangle[:n, :n], triangle[:n, n], float(triangle[n, n] ** 2), blocks, na + 1,
-                             float(np.sum(root[:, n] ** 2))), count=4).point
+    na, point = layout.na, minimise(lifted_problem(collect(data, layout), positions(layout)), count=4).point
     pairs = [(np.array(mu, dtype=float), np.ravel(np.array(b, dtype=float))) for mu, b in zip(point.mus, point.bs)]
     c = pairs.pop() if noise else (np.ones(1), np.zeros(unknowns.nc))
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]

@@ -81,7 +81,7 @@ class TransferErrors(Criterion):
         """Return the innovations (N,) of every experiment, NaN where there is none."""
         point = self.unknowns.unpack(x)
         simulated = simulate(self.data, self.unknowns, point)
-        found = [predict(self.data, self.unknowns, point, i, x) for i, x in enumerate(simulated)]
+        found = [predict(self.data, self.unknowns, point, i, y) for i, y in enumerate(simulated)]
         return [np.where(one.state == noise_filter.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
