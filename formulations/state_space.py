@@ -46,11 +46,11 @@ from optid.program.units import energy_unit, inverse, outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
-from optid.statistics.state_sensitivities import StateUnknowns
+from optid.statistics.state_unknowns import StateUnknowns
 
 Array = np.ndarray
 
-WORDS = {"criterion": ("simulation", "prediction"), "stability": ("stable", "free"),
+WORDS = {"criterion": ("simulation", "measured feedback", "prediction"), "stability": ("stable", "free"),
          "weighting": ("auto", "scale", "variance", "determinant")}
 
 
@@ -165,8 +165,7 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
     expansion, data = plan.expansion(), with_whole_inputs(plan.data, 2 * nx + 1)
-    unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), words["criterion"] == "prediction",
-                             plan.offset)
+    unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), words["criterion"], plan.offset)
     # similarity takes away the freedom of as many unknowns as A has entries
     enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
     variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)

@@ -15,7 +15,7 @@ from formulations.constraints.rule import Rule
 from formulations.constraints.stability import stable
 from formulations.state_space import hammerstein_ss as exact
 from formulations.state_space import ss as linear
-from optid.bases import Linear, Polynomial, Triangular, UserFunctions
+from optid.bases import BSpline, Linear, Polynomial, Triangular, UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.prediction_error.state_errors import StateErrors
@@ -23,10 +23,11 @@ from optid.identify.prediction_error.state_search import entered
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
 from optid.statistics.expansion import expand
-from optid.statistics.state_sensitivities import StateUnknowns, linearise_states
+from optid.statistics.state_sensitivities import linearise_states
+from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 
-def problem(innovations, missing, fed, experiments=2, n=3, seed=0, basis=None):
+def problem(criterion, missing, fed, experiments=2, n=3, seed=0, basis=None, latent=(), linear_output=True):
     """A criterion on noise and a random point: nothing about it is special."""
     rng = np.random.default_rng(seed)
     us = [rng.normal(size=(60 - 7 * i, 2)) for i in range(experiments)]
@@ -38,7 +39,7 @@ def problem(innovations, missing, fed, experiments=2, n=3, seed=0, basis=None):
     feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else []
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     expansion = expand(records, bases, feedback, data.inputs, data.outputs)
-    unknowns = StateUnknowns(n, expansion, experiments, (True, False), innovations)
+    unknowns = StateUnknowns(n, expansion, experiments, (True, False), criterion, True, latent, linear_output)
     criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
     return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
 
@@ -53,12 +54,23 @@ def weighted_square(criterion, x):
     return total
 
 
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize("innovations", [False, True])
-@pytest.mark.parametrize("missing", [0.0, 0.2])
+def latent_functions():
+    smooth, cells = Polynomial(4).fitted(-2, 2), BSpline(5, interval=(-1.0, 1.0), outside="extrapolate")
+    return (Latent(smooth, beyond_affine(smooth), direct=True), Latent(cells, np.eye(cells.size), feeds=False, output=1,
+                                                                 moved=False))
+
+
+RUNS = {"simulation": "simulate", "measured feedback": "simulate_measured_feedback", "prediction": "predict"}
+
+
+@pytest.mark.sampled(9)
+@pytest.mark.parametrize("latent", [(), latent_functions()])
+@pytest.mark.parametrize("criterion", RUNS)
 @pytest.mark.parametrize("basis", [None, Polynomial(3), UserFunctions((np.sin, np.tanh), interval=(-3.0, 3.0))])
-def test_sensitivities_equal_finite_differences(innovations, missing, basis):
-    criterion, x = problem(innovations, missing, basis is not None, basis=basis)
+@pytest.mark.parametrize("missing", [0.2, 0.0])
+def test_sensitivities_equal_finite_differences(criterion, missing, basis, latent):
+    word = criterion
+    criterion, x = problem(criterion, missing, basis is not None, basis=basis, latent=latent)
     at = criterion.linearise(x)
     assert at.value == pytest.approx(weighted_square(criterion, x), rel=1e-12)
     matrix, errors = at.whole
@@ -67,31 +79,32 @@ def test_sensitivities_equal_finite_differences(innovations, missing, basis):
     assert 2 * matrix.T @ errors == pytest.approx(differences, abs=1e-6 * np.abs(differences).max())
     point = criterion.unknowns.unpack(x)
     model = criterion.at(point)
-    run = model.predict if innovations else model.simulate_measured_feedback
+    run = getattr(model, RUNS[word])
     for y, e, errors in zip(run(criterion.data, x0=list(point.x0)), criterion.data.experiments, criterion.residuals(x)):
         assert y - e.y == pytest.approx(errors, abs=1e-10, nan_ok=True)
 
 
 def test_chunks_and_methods_agree():
-    criterion, x = problem(True, 0.1, True)
+    criterion, x = problem("prediction", 0.1, True)
     found = [linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at,
                               criterion.gauge_rows(x), chunk) for chunk in (0, 7)]
     grams = [one.whole[0].T @ one.whole[0] for one in found]
     assert grams[0] == pytest.approx(grams[1], rel=1e-9, abs=1e-9 * np.abs(grams[0]).max())
 
 
-@pytest.mark.parametrize("innovations", [False, True])
-def test_directions_of_the_gauge_change_nothing(innovations):
-    criterion, x = problem(innovations, 0.0, True)
+@pytest.mark.parametrize("latent", [(), latent_functions()])
+@pytest.mark.parametrize("word", RUNS)
+def test_directions_of_the_gauge_change_nothing(word, latent):
+    criterion, x = problem(word, 0.0, True, latent=latent)
     rows = criterion.gauge_rows(x)
-    assert len(rows) == 9 + 2  # n^2 changes of states, the scales of one input and of one output
+    assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, the scales of functions of inputs, outputs, states
     assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
     plain = linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at)
     assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()
 
 
 def test_vector_of_a_model_and_back():
-    criterion, x = problem(True, 0.0, True)
+    criterion, x = problem("prediction", 0.0, True)
     unknowns = criterion.unknowns
     model = criterion.at(unknowns.unpack(x))
     again = criterion.normalised(unknowns.pack(criterion.point_of(model)))
@@ -121,7 +134,7 @@ def system(seed=0, n=2, noise=0.05, samples=400, kind="output", experiments=1):
 def test_scipy_finds_no_better_point(criterion):
     _, data = system(seed=3, kind="innovation" if criterion == "prediction" else "output", samples=300, noise=0.2)
     fit = optid.fit(data, linear, nx=2, criterion=criterion, weighting="scale")
-    unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion == "prediction")
+    unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion)
     error = StateErrors(data, unknowns, np.diag(1 / data.y.var(axis=0)))
     x = entered(error, fit.model)
     assert error.linearise(x).value == pytest.approx(fit.solution.objective, rel=1e-8)

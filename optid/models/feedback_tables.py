@@ -46,18 +46,6 @@ class Tables(NamedTuple):
         return bool(np.all(self.kind != USER))
 
 
-class Parts(NamedTuple):
-    """Matrices of x+ = A x + ... + E g(y) + L y + K e, y = C x + ... as the kernels read them."""
-
-    A: Array
-    C: Array
-    E: Array
-    L: Array
-    K: Array
-    output_of: np.ndarray
-    tables: Tables
-
-
 def tabulated(functions: Sequence[Nonlinearity]) -> Tables:
     """Write nonlinearities as tables; their values and slopes are those of `Nonlinearity` to rounding."""
     rows = [_row(f) for f in functions]

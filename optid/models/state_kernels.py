@@ -7,8 +7,8 @@ model's own output where it is NaN; the state is corrected by K times the innova
     P2, measured feedback:   outputs given, K = 0
     P3, free run:            no outputs given
 
-The arguments are the named tuples `Parts` and `Tables` of `optid.models.feedback_tables` and `Stretch` of
-`optid.models.state_simulation`. Compiled at the first call and cached on disk.
+A second one carries the derivatives of a run with respect to every unknown along it. The arguments are the named tuples
+of `optid.models.state_signals` and `optid.models.feedback_tables`. Compiled at the first call and cached on disk.
 """
 
 import numpy as np
@@ -63,72 +63,166 @@ def value_and_slope(tables, j, v):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def march(parts, stretch, x, turn, outputs, jacobian, states):
+def march(parts, stretch, x, outputs, states):
     """Run over a stretch and leave the state behind.
 
     Args:
-        parts: matrices and tables.
-        stretch: what drives them, T samples.
+        parts: the model, a `Parts`.
+        stretch: what drives it over T samples, a `Stretch`.
         x: (n,) state, changed in place.
-        turn: (n, q) derivative of the state with respect to q numbers, changed in place; q = 0 for none.
         outputs: (T, l) written.
-        jacobian: (T, l, q) derivative of the outputs, written.
         states: (T, n) state before every sample, written; (0, n) for none.
 
     Returns:
         how the run ended and the sample at which it did.
     """
     A, C, E, L, K = parts.A, parts.C, parts.E, parts.L, parts.K
-    n, l, s, q = A.shape[0], C.shape[0], E.shape[1], turn.shape[1]  # noqa: E741
-    later, turned = np.empty(n), np.empty((n, q))
+    Ez, Fz, Cz = parts.Ez, parts.Fz, parts.Cz
+    n, l, s, latent = A.shape[0], C.shape[0], E.shape[1], Ez.shape[1]  # noqa: E741
+    later, w = np.empty(n), np.empty(latent)
     for k in range(stretch.y.shape[0]):
+        for j in range(latent):
+            z = stretch.z[k, j]
+            for i in range(n):
+                z += Cz[j, i] * x[i]
+            w[j], _, refused = value_and_slope(parts.tables, s + j, z)
+            if refused:
+                return REFUSED, k
         for i in range(n):
             if states.shape[0] > 0:
                 states[k, i] = x[i]
             later[i] = stretch.drive[k, i]
             for j in range(n):
                 later[i] += A[i, j] * x[j]
-        for i in range(n):
-            for p in range(q):
-                turned[i, p] = 0.0
-                for j in range(n):
-                    turned[i, p] += A[i, j] * turn[j, p]
+            for j in range(latent):
+                later[i] += Ez[i, j] * w[j]
         for o in range(l):
             now = stretch.direct[k, o]
             for i in range(n):
                 now += C[o, i] * x[i]
+            for j in range(latent):
+                now += Fz[o, j] * w[j]
             if not (stretch.low[o] <= now <= stretch.high[o]):
                 return LEFT, k
             outputs[k, o] = now
-            for p in range(q):
-                jacobian[k, o, p] = 0.0
-                for i in range(n):
-                    jacobian[k, o, p] += C[o, i] * turn[i, p]
             given = stretch.y[k, o]
-            if np.isnan(given):
-                for i in range(n):
-                    later[i] += L[i, o] * now
-                    for p in range(q):
-                        turned[i, p] += L[i, o] * jacobian[k, o, p]
-            else:
-                for i in range(n):
-                    later[i] += L[i, o] * given + K[i, o] * (given - now)
-                    for p in range(q):
-                        turned[i, p] -= K[i, o] * jacobian[k, o, p]
+            for i in range(n):
+                later[i] += L[i, o] * now if np.isnan(given) else L[i, o] * given + K[i, o] * (given - now)
         for j in range(s):
             fed = stretch.feedback[k, j]
             if np.isnan(fed):
-                o = parts.output_of[j]
-                fed, slope, refused = value_and_slope(parts.tables, j, outputs[k, o])
+                fed, _, refused = value_and_slope(parts.tables, j, outputs[k, parts.output_of[j]])
                 if refused:
                     return REFUSED, k
-                for i in range(n):
-                    for p in range(q):
-                        turned[i, p] += E[i, j] * slope * jacobian[k, o, p]
             for i in range(n):
                 later[i] += E[i, j] * fed
         for i in range(n):
             x[i] = later[i]
+    return INSIDE, stretch.y.shape[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sensitivities(parts, places, signals, turn, jacobian):
+    """Carry the derivative S of the state along a run of T samples and leave it behind.
+
+    With H(k) = dh(z)/dtheta = h' (Cz S + (what theta changes in z)) + (what it changes in h), and
+    J(k) = dy/dtheta = C S + Fz H + (what theta changes in y directly),
+
+        S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
+
+    Args:
+        parts: the model, a `Parts`.
+        places: first column of every part in theta, a `Places`; the initial state has the first n columns.
+        signals: the run, a `Signals`.
+        turn: (n, q) derivative S of the state, changed in place.
+        jacobian: (T, l, q) written.
+    """
+    A, B, C, D, E = parts.A, parts.B, parts.C, parts.D, parts.E
+    Ez, Fz, Cz = parts.Ez, parts.Fz, parts.Cz
+    n, l, q = A.shape[0], C.shape[0], turn.shape[1]  # noqa: E741
+    r, s, latent = B.shape[1], E.shape[1], Ez.shape[1]
+    turned, inner = np.empty((n, q)), np.empty((latent, q))
+    for k in range(jacobian.shape[0]):
+        for c in range(latent):
+            slope = signals.slopes[k, c]
+            for p in range(q):
+                inner[c, p] = 0.0
+            for j in range(n):
+                a = slope * Cz[c, j]
+                if a != 0.0:
+                    for p in range(q):
+                        inner[c, p] += a * turn[j, p]
+                if places.cz[c] >= 0:
+                    inner[c, places.cz[c] + j] += slope * signals.states[k, j]
+            if places.dz[c] >= 0:
+                for j in range(signals.u.shape[1]):
+                    inner[c, places.dz[c] + j] += slope * signals.u[k, j]
+            if places.oz[c] >= 0:
+                inner[c, places.oz[c]] += slope
+            if places.c[c] >= 0:
+                for j in range(places.members[c], places.members[c + 1]):
+                    inner[c, places.c[c] + j - places.members[c]] += signals.phi[k, j]
+        for o in range(l):
+            row = jacobian[k, o]
+            for p in range(q):
+                row[p] = 0.0
+            for j in range(n):
+                a = C[o, j]
+                if a != 0.0:
+                    for p in range(q):
+                        row[p] += a * turn[j, p]
+                if places.C >= 0:
+                    row[places.C + o * n + j] += signals.states[k, j]
+            if places.offset >= 0:
+                row[places.offset + o] += 1.0
+            for c in range(r):
+                if places.d[c] >= 0:
+                    row[places.d[c] + o] += signals.f[k, c]
+                if places.mu[c] >= 0 and D[o, c] != 0.0:
+                    for j in range(places.functions[c], places.functions[c + 1]):
+                        row[places.mu[c] + j - places.functions[c]] += D[o, c] * signals.eta[k, j]
+            for c in range(latent):
+                if places.fz[c] >= 0:
+                    row[places.fz[c] + o] += signals.w[k, c]
+                if Fz[o, c] != 0.0:
+                    for p in range(q):
+                        row[p] += Fz[o, c] * inner[c, p]
+        for i in range(n):
+            into = turned[i]
+            for p in range(q):
+                into[p] = 0.0
+            for j in range(n):
+                a = A[i, j]
+                if a != 0.0:
+                    for p in range(q):
+                        into[p] += a * turn[j, p]
+                if places.A >= 0:
+                    into[places.A + i * n + j] += signals.states[k, j]
+            for o in range(l):
+                if places.K >= 0:
+                    into[places.K + i * l + o] += signals.innovation[k, o]
+                if signals.returned.shape[0] > 0 and signals.returned[k, i, o] != 0.0:
+                    a = signals.returned[k, i, o]
+                    for p in range(q):
+                        into[p] += a * jacobian[k, o, p]
+            for c in range(r):
+                if places.b[c] >= 0:
+                    into[places.b[c] + i] += signals.f[k, c]
+                if places.mu[c] >= 0:
+                    for j in range(places.functions[c], places.functions[c + 1]):
+                        into[places.mu[c] + j - places.functions[c]] += B[i, c] * signals.eta[k, j]
+            for c in range(s):
+                if places.e[c] >= 0:
+                    into[places.e[c] + i] += signals.g[k, c]
+                if places.nu[c] >= 0:
+                    for j in range(places.coordinates[c], places.coordinates[c + 1]):
+                        into[places.nu[c] + j - places.coordinates[c]] += E[i, c] * signals.zeta[k, j]
+            for c in range(latent):
+                if places.ez[c] >= 0:
+                    into[places.ez[c] + i] += signals.w[k, c]
+                if Ez[i, c] != 0.0:
+                    for p in range(q):
+                        into[p] += Ez[i, c] * inner[c, p]
+        for i in range(n):
             for p in range(q):
                 turn[i, p] = turned[i, p]
-    return INSIDE, stretch.y.shape[0]

@@ -12,7 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
-from optid.models.feedback_tables import Parts
+from optid.models.state_signals import Parts, Places, Signals, Stretch
 from optid.models.state_space import StateSpace
 
 STRETCH = 16384
@@ -30,30 +30,6 @@ SETTLED = 1e-20
 
 ROUNDING = 1e-14
 SIMULATORS = ("predict", "measured_feedback", "free")
-
-
-class Stretch(NamedTuple):
-    """A stretch of samples as the kernels read it.
-
-    Attributes:
-        drive: (T, n) what the inputs and the constant add to the next state.
-        direct: (T, l) what they add to the output.
-        feedback: (T, s) g of the measured outputs, NaN where the model's output is to be fed back.
-        y: (T, l) measured outputs, NaN where there is none.
-        low: (l,) lower end of the range that the outputs must not leave.
-        high: (l,) upper end.
-    """
-
-    drive: Array
-    direct: Array
-    feedback: Array
-    y: Array
-    low: Array
-    high: Array
-
-    def part(self, samples: slice) -> "Stretch":
-        """Return the stretch cut to some samples."""
-        return Stretch._make([*(signal[samples] for signal in self[:4]), *self[4:]])
 
 
 class Run(NamedTuple):
@@ -120,24 +96,31 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
     """
     model, outputs = job.model, np.full((len(job.u), job.model.l), np.nan)
     x = np.array(x0, dtype=float)
-    none = np.zeros((x.size, 0)), np.zeros((STRETCH, model.l, 0))
     for first, last, stretch in _stretches(job, overlap=horizon - 1):
         starts = min(STRETCH, last - first)
         states = np.empty((starts if horizon > 1 else 0, x.size))
         y = np.empty((starts, model.l))
-        _march(job, first, stretch.part(slice(starts)), x, none[0], y, none[1], states)
+        march(job, first, stretch.part(slice(starts)), x, y, states)
         for i in range(1, horizon):
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
+            now, then = (slice(j, j + len(states)) for j in (i - 1, i))
             with np.errstate(all="ignore"):
-                states = states @ model.A.T + stretch.drive[i - 1 : i - 1 + len(states)] + y @ model.L.T
+                h = _latent(model, states, stretch.z[now])
+                states = states @ model.A.T + stretch.drive[now] + y @ model.L.T + h @ model.Ez.T
                 for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
                     states += g(y[:, o])[:, None] * model.E[:, j]
-                y = states @ model.C.T + stretch.direct[i : i + len(states)]
+                y = states @ model.C.T + stretch.direct[then] + _latent(model, states, stretch.z[then]) @ model.Fz.T
             wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
             if wild.any():
                 raise _left(job, first + i + int(np.argmax(wild)))
         outputs[first + horizon - 1 : first + horizon - 1 + len(y)] = y
     return outputs
+
+
+def _latent(model: StateSpace, states: Array, z: Array) -> Array:
+    """Values (T, k) of the latent functions at states (T, n), z (T, k) being what the inputs add."""
+    values = [h(one) for h, one in zip(model.latent, (z + states @ model.Cz.T).T)]
+    return np.column_stack(values) if values else z
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
@@ -160,7 +143,8 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     if n == 0 or not np.isfinite(y).any():
         return x
     unit = signal_units(y)
-    affine = not job.model.feedback or (job.known is not None and not np.isnan(job.known).any())
+    affine = not job.model.latent and (
+        not job.model.feedback or (job.known is not None and not np.isnan(job.known).any()))
     root, cost = _linearised(job, y, unit, x, whole=not affine)
     for _ in range(STEPS):
         step = scaled_least_squares(root[:, :n], root[:, n])
@@ -196,18 +180,18 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn = np.array(x0, dtype=float), np.eye(n)
+    parts, places = job.model.parts, Places.none(job.model.parts)
     for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
-        simulated = np.empty((last - first, outputs))
         if not (informs or whole):
             break
-        if not informs:
-            turn = np.zeros((n, 0))
-        jacobian = np.empty((last - first, outputs, turn.shape[1]))
-        _march(job, first, stretch, x, turn, simulated, jacobian, np.zeros((0, n)))
+        simulated, states = np.empty((last - first, outputs)), np.empty((last - first, n))
+        march(job, first, stretch, x, simulated, states)
         error = (y[first:last] - simulated) / unit
         present = ~np.isnan(error)
         cost += float(np.sum(error[present] ** 2))
         if informs:
+            jacobian = np.empty((last - first, outputs, n))
+            sensitivities(parts, places, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not np.all(np.isfinite(rows)):
                 raise DataError(
@@ -238,38 +222,77 @@ def allowed_range(data: Any) -> Any:
 
 
 def _stretches(job: Run, length: int = 0, overlap: int = 0) -> Iterator[tuple[int, int, Stretch]]:
-    model, length = job.model, length or STRETCH
+    length = length or STRETCH
     for first in range(0, len(job.u), length):
         last = min(first + length + overlap, len(job.u))
-        f = model.expanded(job.u[first:last])
-        y = np.full((last - first, model.l), np.nan) if job.known is None else job.known[first:last]
-        g = np.empty((last - first, len(model.feedback)))
-        for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
-            g[:, j] = np.nan if job.known is None else function(y[:, o])
-        yield first, last, Stretch(
-            np.ascontiguousarray(f @ model.B.T + model.offset_x), np.ascontiguousarray(f @ model.D.T + model.offset_y),
-            g, np.ascontiguousarray(y), job.low, job.high,
-        )
+        yield first, last, stretch_of(job, slice(first, last))
 
 
-def _march(job: Run, first: int, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array,
-           states: Array) -> None:
+def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
+    """Return what drives some samples of a run; ``f`` (T, r) are the values of the nonlinearities where known."""
+    model, u = job.model, job.u[samples]
+    f = model.expanded(u) if f is None else f
+    y = np.full((len(u), model.l), np.nan) if job.known is None else job.known[samples]
+    g = np.empty((len(u), len(model.feedback)))
+    for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
+        g[:, j] = np.nan if job.known is None else function(y[:, o])
+    driven = (f @ model.B.T + model.offset_x, f @ model.D.T + model.offset_y, g, y, u @ model.Dz.T + model.offset_z)
+    return Stretch(*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high)
+
+
+def signals(job: Run, stretch: Stretch, states: Array, outputs: Array, **known: Array) -> Signals:
+    """Describe a run over a stretch, so that `sensitivities` can be carried along it.
+
+    Args:
+        job: the run.
+        stretch: what drove it.
+        states: (T, n) its states.
+        outputs: (T, l) its outputs.
+        known: values of functions of the inputs and of measured outputs, where their coefficients are unknown.
+    """
+    model, missing = job.model, np.isnan(stretch.y)
+    count, slopes = len(states), np.zeros((len(states), len(model.latent)))
+    z = stretch.z + states @ model.Cz.T
+    for j, h in enumerate(model.latent):
+        slopes[:, j] = h.slope(z[:, j])
+    returned = np.zeros((0, model.nx, model.l))
+    if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
+        own = model.returned(outputs) if missing.any() else 0.0
+        returned = np.where(missing[:, None, :], own, -job.gain)
+    parts = {
+        "states": states, "innovation": np.where(missing, 0.0, stretch.y - outputs), "returned": returned,
+        "u": np.zeros((0, 0)), "f": np.zeros((count, len(model.nonlinearities))), "eta": np.zeros((0, 0)),
+        "g": np.zeros((count, len(model.feedback))), "zeta": np.zeros((0, 0)), "w": np.zeros((0, 0)), "slopes": slopes,
+        "phi": np.zeros((0, 0)), **known}
+    return Signals(**{name: np.ascontiguousarray(value) for name, value in parts.items()})
+
+
+def sensitivities(parts: Parts, places: Places, run: Signals, turn: Array, jacobian: Array) -> None:
+    """Carry derivatives along a run; see `optid.models.state_kernels.sensitivities`."""
+    from optid.models.state_kernels import sensitivities as carry
+
+    carry(parts, places, run, turn, jacobian)
+
+
+def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:
     """Run over a stretch that begins at sample `first`; see `optid.models.state_kernels.march`.
 
     Raises:
         DataError: an output that leaves the range allowed, or the interval of a basis that refuses.
     """
-    from optid.models.state_kernels import LEFT, REFUSED, march
+    from optid.models.state_kernels import LEFT, REFUSED
+    from optid.models.state_kernels import march as run_over
 
     parts = job.model.parts._replace(K=job.gain)
-    if not parts.tables.compiled and np.isnan(stretch.feedback).any():
-        ended, at = _march_by_steps(job.model, parts, stretch, x, turn, outputs, jacobian, states)
+    if not parts.tables.compiled and (job.model.latent or np.isnan(stretch.feedback).any()):
+        ended, at = _march_by_steps(job.model, parts, stretch, x, outputs, states)
     else:
-        ended, at = march(parts, stretch, x, turn, outputs, jacobian, states)
+        ended, at = run_over(parts, stretch, x, outputs, states)
     if ended == REFUSED:
+        what = "argument of a latent function" if job.model.latent else "simulated output"
         raise DataError(
-            f"{job.label}At sample {first + at} the simulated output leaves the interval of a feedback basis with "
-            "outside='error'. Use outside='clamp' or 'extrapolate', or a longer interval."
+            f"{job.label}At sample {first + at} the {what} leaves the interval of a basis with outside='error'. Use "
+            "outside='clamp' or 'extrapolate', or a longer interval."
         )
     if ended == LEFT:
         raise _left(job, first + at)
@@ -286,24 +309,23 @@ def _left(job: Run, sample: int) -> DataError:
     )
 
 
-def _march_by_steps(
-    model: StateSpace, parts: Parts, stretch: Stretch, x: Array, turn: Array, outputs: Array, jacobian: Array,
-    states: Array,
-) -> tuple[int, int]:
-    """Run the kernel sample by sample, with the tangents of functions that it cannot evaluate as feedback."""
-    from optid.models.state_kernels import INSIDE, march
+def _march_by_steps(model: StateSpace, parts: Parts, stretch: Stretch, x: Array, outputs: Array, states: Array
+                    ) -> tuple[int, int]:
+    """Run the kernel sample by sample, with the values of functions that it cannot evaluate."""
+    from optid.models.state_kernels import INSIDE
+    from optid.models.state_kernels import march as run_over
 
-    where = np.array(model.output_of, dtype=int)
+    plain = parts._replace(Ez=np.zeros((x.size, 0)), Fz=np.zeros((model.l, 0)), Cz=np.zeros((0, x.size)))
     for k in range(len(stretch.y)):
-        y = stretch.direct[k] + parts.C @ x
-        g, slopes = stretch.feedback[k].copy(), np.zeros(where.size)
-        for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():
-            slopes[j] = model.feedback[j].slope(y[where[j]])
-            g[j] = model.feedback[j](y[where[j]]) - slopes[j] * y[where[j]]
-        tangents = parts.L + (parts.E * slopes) @ np.eye(model.l)[where]
         here = slice(k, k + 1)
-        one = stretch.part(here)._replace(feedback=g[None])
-        ended, _ = march(parts._replace(L=tangents), one, x, turn, outputs[here], jacobian[here], states[here])
+        h = _latent(model, x[None], stretch.z[here])[0]
+        direct = stretch.direct[k] + parts.Fz @ h
+        y, g = direct + parts.C @ x, stretch.feedback[k].copy()
+        for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():
+            g[j] = model.feedback[j](y[model.output_of[j]])
+        one = stretch.part(here)._replace(feedback=g[None], direct=direct[None],
+                                          drive=(stretch.drive[k] + parts.Ez @ h)[None])
+        ended, _ = run_over(plain, one, x, outputs[here], states[here])
         if ended != INSIDE:
             return ended, k
     return INSIDE, len(stretch.y)

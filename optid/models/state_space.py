@@ -14,16 +14,18 @@ from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
 from optid.models.balancing import balancing
-from optid.models.feedback_tables import Parts, tabulated
+from optid.models.feedback_tables import tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
 from optid.models.model import Model, finite
 from optid.models.nonlinearity import Nonlinearity
+from optid.models.state_signals import Parts
 
 SHAPES = {
     "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
+    "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k",
 }
-"""Shapes of the matrices: n states, l outputs, r functions of the inputs and s of the outputs."""
+"""Shapes of the matrices: n states, m inputs, l outputs, r functions of the inputs, s of the outputs, k latent ones."""
 
 NEWTON_STEPS = 100
 RESTS = 1e-12
@@ -32,10 +34,13 @@ RESTS = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class StateSpace(Model):
-    """x(k+1) = A x + B f(u) + E g(y) + L y + offset_x + K e, y(k) = C x + D f(u) + offset_y + e, in raw units.
+    """State equations with static functions of the inputs, of the outputs and of latent signals, in raw units.
 
-    With the basis `Linear` and no feedback this is a linear state-space model. The feedback never reaches the output
-    of the same sample: there is no algebraic loop.
+        x(k+1) = A x + B f(u) + E g(y) + L y + Ez h(z) + offset_x + K e
+        y(k) = C x + D f(u) + Fz h(z) + offset_y + e,    z = Cz x + Dz u + offset_z
+
+    With the basis `Linear`, no feedback and no latent signal this is a linear state-space model. The feedback never
+    reaches the output of the same sample: there is no algebraic loop.
 
     Attributes:
         A: (n, n).
@@ -58,6 +63,12 @@ class StateSpace(Model):
         input_units: one per input, "" where unknown.
         output_units: one per output, "" where unknown.
         gauge: how the scale between f and B is fixed: "norm", "gain" or "none"; see `regauge`.
+        latent: k nonlinearities h of the latent signals.
+        Ez: (n, k), one column per latent signal; zero by default, like the four below.
+        Fz: (l, k).
+        Cz: (k, n).
+        Dz: (k, m).
+        offset_z: (k,).
 
     Raises:
         StructureError: shapes that do not agree, coefficients that are not finite, an unknown gauge, a direct
@@ -84,29 +95,39 @@ class StateSpace(Model):
     input_units: tuple[str, ...] = ()
     output_units: tuple[str, ...] = ()
     gauge: str = field(default="none", kw_only=True)
+    latent: tuple[Nonlinearity, ...] = field(default=(), kw_only=True)
+    Ez: Any = field(default=None, kw_only=True)
+    Fz: Any = field(default=None, kw_only=True)
+    Cz: Any = field(default=None, kw_only=True)
+    Dz: Any = field(default=None, kw_only=True)
+    offset_z: Any = field(default=None, kw_only=True)
     GAUGES = ("norm", "gain", "none")
 
     def __post_init__(self) -> None:
         fixed: dict[str, Any] = {name: finite(np.atleast_2d(getattr(self, name)), name) for name in ("A", "B", "C")}
         functions = tuple(self.nonlinearities) or (Nonlinearity(Linear(), np.ones(1)),) * fixed["B"].shape[1]
-        fixed |= {"nonlinearities": functions, "feedback": tuple(self.feedback)}
-        shapes = self._shapes(len(fixed["A"]), len(fixed["C"]), len(functions), len(fixed["feedback"]))
-        for name in ("D", "E", "L", "K", "offset_x", "offset_y"):
-            given = getattr(self, name)
-            fixed[name] = finite(np.zeros(shapes[name]) if given is None else given, name)
+        fixed |= {"nonlinearities": functions, "feedback": tuple(self.feedback), "latent": tuple(self.latent)}
         fixed["input_of"] = tuple(int(c) for c in self.input_of) or tuple(range(len(functions)))
         fixed["output_of"] = tuple(int(o) for o in self.output_of) or tuple(range(len(fixed["feedback"])))
-        self._fix(fixed, 1 + max(fixed["input_of"], default=-1), len(fixed["C"]))
+        m = 1 + max(fixed["input_of"], default=-1)
+        shapes = self._shapes(len(fixed["A"]), m, len(fixed["C"]), len(functions), len(fixed["feedback"]),
+                              len(fixed["latent"]))
+        for name in SHAPES:
+            given = getattr(self, name)
+            fixed.setdefault(name, finite(np.zeros(shapes[name]) if given is None else given, name))
+        self._fix(fixed, m, len(fixed["C"]))
         self._check(shapes)
 
     @staticmethod
-    def _shapes(n: int, l: int, r: int, s: int) -> dict[str, tuple[int, ...]]:  # noqa: E741 - the field's letters
-        sizes = {"n": n, "l": l, "r": r, "s": s}
-        return {name: tuple(sizes[letter] for letter in letters) for name, letters in SHAPES.items()}
+    def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of the matrices for n, m, l, r, s and k."""
+        size = dict(zip("nmlrsk", sizes))
+        return {name: tuple(size[letter] for letter in letters) for name, letters in SHAPES.items()}
 
     def _check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Refuse parts that do not agree, naming the part and the shape that is needed."""
-        n, outputs, (r, s) = self.nx, len(self.C), (len(self.nonlinearities), len(self.feedback))
+        n, outputs = self.nx, len(self.C)
+        r, s, k = len(self.nonlinearities), len(self.feedback), len(self.latent)
         if self.E.shape == (n + outputs, s) and s and outputs:
             raise StructureError(
                 f"E has {n + outputs} rows for {n} states: its last {outputs} would carry g(y) to the output y of the "
@@ -116,8 +137,8 @@ class StateSpace(Model):
             found = getattr(self, name).shape
             if found != shape:
                 raise StructureError(
-                    f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs and "
-                    f"{outputs} outputs need {shape}."
+                    f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs"
+                    f"{f', {k} of latent signals' * bool(k)} and {outputs} outputs need {shape}."
                 )
         for kind, where, count in (("nonlinearities", "input_of", self.m), ("feedback", "output_of", outputs)):
             functions, channels = getattr(self, kind), getattr(self, where)
@@ -125,7 +146,8 @@ class StateSpace(Model):
                 raise StructureError(
                     f"{where} = {channels}: one channel from 0 to {count - 1} for each of the {len(functions)} {kind}."
                 )
-            for j, f in enumerate(functions):
+        for kind in ("nonlinearities", "feedback", "latent"):
+            for j, f in enumerate(getattr(self, kind)):
                 if f.offset:
                     raise StructureError(f"{kind}[{j}] has an offset: the constants belong to offset_x and offset_y.")
         for kind, count in (("inputs", self.m), ("outputs", outputs)):
@@ -148,7 +170,9 @@ class StateSpace(Model):
     @property
     def title(self) -> str:
         """What kind of model this is, in words."""
-        return f"{self._family} state-space model" + (" with nonlinear feedback" if self.feedback else "")
+        more = [word for word, functions in (("nonlinear feedback", self.feedback), ("latent functions", self.latent))
+                if functions]
+        return f"{self._family} state-space model" + (f" with {' and '.join(more)}" if more else "")
 
     @property
     def orders(self) -> dict[str, Any]:
@@ -163,8 +187,9 @@ class StateSpace(Model):
     @cached_property
     def parts(self) -> Parts:
         """Matrices and tables as the compiled recursions read them."""
-        matrices = [np.array(part, order="C") for part in (self.A, self.C, self.E, self.L, self.K)]
-        return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), tabulated(self.feedback)])
+        matrices = [np.array(getattr(self, name), order="C") for name in Parts._fields[:-2]]
+        functions = tabulated([*self.feedback, *self.latent])
+        return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), functions])
 
     @property
     def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
@@ -220,17 +245,18 @@ class StateSpace(Model):
         points = self._operating_point(u0)
         f, x = self.expanded(points[None])[0], np.zeros(self.nx)
         for _ in range(NEWTON_STEPS):
-            y = self.C @ x + self.D @ f + self.offset_y
+            h = self.latent_values(x[None], points[None])[0]
+            y = self.C @ x + self.D @ f + self.Fz @ h + self.offset_y
             g = np.array([function(y[o]) for function, o in zip(self.feedback, self.output_of)])
-            change = self.A @ x + self.B @ f + self.E @ g + self.L @ y + self.offset_x - x
+            change = self.A @ x + self.B @ f + self.E @ g + self.L @ y + self.Ez @ h + self.offset_x - x
             size = np.abs(x).max(initial=0.0) + np.abs(self.B @ f + self.offset_x).max(initial=0.0)
             if np.abs(change).max(initial=0.0) <= RESTS * size:
                 return x, y
-            x = x - np.linalg.lstsq(self._slope(y), change)[0]
+            x = x - np.linalg.lstsq(self._tangent(x, y, points)[0] - np.eye(self.nx), change)[0]
             if not np.all(np.isfinite(x)):
                 break
-        if not self.feedback:
-            _solved(self._slope(np.zeros(self.l)), self.B)
+        if not self.feedback and not self.latent:
+            _solved(self.A + self.L @ self.C - np.eye(self.nx), self.B)
         raise StructureError(
             f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there."
         )
@@ -247,24 +273,37 @@ class StateSpace(Model):
         Raises:
             StructureError: as `equilibrium`.
         """
-        _, y = self.equilibrium(u0)
-        points, slopes = self._operating_point(u0), np.zeros((len(self.nonlinearities), self.m))
-        for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
-            slopes[j, c] = f.slope(points[c])
-        driven = self.B + self._feedback_slope(y) @ self.D
-        gain = (self.D - self.C @ _solved(self._slope(y), driven)) @ slopes
+        A, B, C, D = self._tangent(*self.equilibrium(u0), self._operating_point(u0))
+        gain = D - C @ _solved(A - np.eye(self.nx), B)
         return float(gain[0, 0]) if gain.size == 1 else gain
 
-    def _feedback_slope(self, y: Array) -> Array:
-        """Derivative (n, l) of the next state with respect to the outputs."""
-        total = np.array(self.L)
-        for j, (g, o) in enumerate(zip(self.feedback, self.output_of)):
-            total[:, o] += self.E[:, j] * g.slope(y[o])
-        return total
+    def _tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+        """Return A, B, C, D of the free run near a state (n,), outputs (l,) and inputs (m,)."""
+        slopes = np.zeros((len(self.nonlinearities), self.m))
+        for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
+            slopes[j, c] = f.slope(u[c])
+        z = self.latent_signals(x[None], u[None])[0]
+        inner = np.array([h.slope(one) for h, one in zip(self.latent, z)])[:, None]
+        C, D = self.C + self.Fz @ (inner * self.Cz), self.D @ slopes + self.Fz @ (inner * self.Dz)
+        back = self.returned(y[None])[0]
+        A = self.A + self.Ez @ (inner * self.Cz) + back @ C
+        return A, self.B @ slopes + self.Ez @ (inner * self.Dz) + back @ D, C, D
 
-    def _slope(self, y: Array) -> Array:
-        """Derivative (n, n) of the change of the state with respect to the state, at the outputs y."""
-        return self.A - np.eye(self.nx) + self._feedback_slope(y) @ self.C
+    def latent_signals(self, x: Array, u: Array) -> Array:
+        """Return z (N, k) at states x (N, n) and inputs u (N, m)."""
+        return x @ self.Cz.T + u @ self.Dz.T + self.offset_z
+
+    def latent_values(self, x: Array, u: Array) -> Array:
+        """Return h(z) (N, k) at states x (N, n) and inputs u (N, m)."""
+        z = self.latent_signals(x, u)
+        return np.column_stack([h(z[:, j]) for j, h in enumerate(self.latent)]) if self.latent else z
+
+    def returned(self, y: Array) -> Array:
+        """Return the derivative (N, n, l) of the next state with respect to the outputs y (N, l) fed back."""
+        total = np.tile(self.L, (len(y), 1, 1))
+        for j, (g, o) in enumerate(zip(self.feedback, self.output_of)):
+            total[:, :, o] += g.slope(y[:, o])[:, None] * self.E[:, j]
+        return total
 
     # -- forms that predict the same -----------------------------------------------------------------------------
 
@@ -285,16 +324,17 @@ class StateSpace(Model):
             raise StructureError("T is singular: a change of states can be undone.")
         back = np.linalg.inv(turn)
         noise = None if self.noise is None else self.noise.mapped(turn, np.eye(self.l))
-        moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "offset_x")}
-        return replace(self, A=turn @ self.A @ back, C=self.C @ back, noise=noise, gauge="none", **moved)
+        moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "Ez", "offset_x")}
+        return replace(self, A=turn @ self.A @ back, C=self.C @ back, Cz=self.Cz @ back, noise=noise, gauge="none", **moved)
 
     def balanced(self) -> Self:
-        """Return the model in balanced states: both Gramians of (A, [B E], C) are diagonal and equal.
+        """Return the model in balanced states: both Gramians of (A, [B E Ez], [C; Cz]) are diagonal and equal.
 
         Raises:
             StructureError: an unstable model, or one that is not minimal.
         """
-        return self if self.nx == 0 else self.transformed(balancing(self.A, np.hstack([self.B, self.E]), self.C))
+        return self if self.nx == 0 else self.transformed(
+            balancing(self.A, np.hstack([self.B, self.E, self.Ez]), np.vstack([self.C, self.Cz])))
 
     def injected(self, gain: ArrayLike) -> Self:
         """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
@@ -313,7 +353,7 @@ class StateSpace(Model):
             raise StructureError(f"The gain has shape {moved.shape}; {self.L.shape} is needed.")
         return replace(
             self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
-            offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none",
+            Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none",
         )
 
     def _regauged(self, gauge: str, signs: bool) -> Self:
@@ -361,6 +401,7 @@ class StateSpace(Model):
         # the states take the unit that all outputs share: C, and with it what a norm of B means, stays as it is then
         state = gain[0] if np.all(gain == gain[0]) else 1.0
         injection = state * self.L / gain
+        inward = self.Dz / np.array(transform.u_scale)
         return replace(
             self, B=state * self.B, C=gain[:, None] * self.C / state, D=gain[:, None] * self.D, E=state * self.E,
             L=injection, K=state * self.K / gain,
@@ -368,6 +409,8 @@ class StateSpace(Model):
             offset_y=gain * (self.offset_y + self.D @ constants) + shift,
             nonlinearities=tuple(f for f, _ in functions), feedback=tuple(g for g, _ in feedback),
             noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
+            Ez=state * self.Ez, Fz=gain[:, None] * self.Fz, Cz=self.Cz / state, Dz=inward,
+            offset_z=self.offset_z - inward @ np.array(transform.u_offset),
         )
 
     # -- content of files ----------------------------------------------------------------------------------------
@@ -379,16 +422,20 @@ class StateSpace(Model):
             "input_of": list(self.input_of),
             "feedback": [g.to_dict() for g in self.feedback],
             "output_of": list(self.output_of),
+            "latent": [h.to_dict() for h in self.latent],
             "noise": None if self.noise is None else self.noise.to_dict(),
         }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
-        sizes = (len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback"))
+        content = {"latent": [], **content}  # models without latent functions may be older than those
+        sizes = (len(content[name]) for name in ("A", "inputs", "outputs", "nonlinearities", "feedback", "latent"))
         shapes = cls._shapes(*sizes)
         return cls(
-            **{name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()},
+            **{name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()
+               if name in content},
+            latent=tuple(Nonlinearity.from_dict(h, functions) for h in content["latent"]),
             input_of=tuple(content["input_of"]), output_of=tuple(content["output_of"]),
             feedback=tuple(Nonlinearity.from_dict(g, functions) for g in content["feedback"]),
             noise=None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"]),

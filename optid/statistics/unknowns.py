@@ -38,10 +38,14 @@ class Unknowns:
 
     @cached_property
     def products(self) -> tuple[tuple[str, str], ...]:
-        """Parts (mu, b) of free inputs, and (nu, e) of feedback, of which the output shows the product alone."""
-        partner = {"mu": "b", "nu": "e"}
-        return tuple((part, partner[part[:2]] + part[2:]) for part, at in self.slices.items()
-                     if part[:2] in partner and at.stop > at.start)
+        """Pairs of parts of which the output shows the product alone: (mu, b), (nu, e) of feedback, (c, g) of latent."""
+        partner, found = {"mu": "b", "nu": "e", "c": "g"}, []
+        for part, at in self.slices.items():
+            kind = part.rstrip("0123456789")
+            other = partner.get(kind, "") + part[len(kind) :]
+            if kind in partner and part != kind and at.stop > at.start and other in self.slices:
+                found.append((part, other))
+        return tuple(found)
 
     def parts(self, x: Array) -> dict[str, Array]:
         """Return the shared parts of x in their shapes."""

@@ -21,7 +21,8 @@ from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
 from optid.statistics.expansion import Expansion
 from optid.statistics.linearised import Linearised
-from optid.statistics.state_sensitivities import StatePoint, StateUnknowns, linearise_states, residuals
+from optid.statistics.state_sensitivities import linearise_states, residuals
+from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
 FLOOR = 1e-7
@@ -34,8 +35,7 @@ class StateErrors(Criterion):
 
     Attributes:
         data: the record.
-        unknowns: their order; with innovations the errors are those of one-step prediction, otherwise of simulation
-            with measured feedback.
+        unknowns: their order, and whose errors are meant.
         weight: (l, l) weight of the errors.
         limit: modulus below which the poles that carry the state must stay.
         checks: constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is.
@@ -128,8 +128,13 @@ class StateErrors(Criterion):
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""
         matrices = point.A, point.b, point.C, point.d
-        return state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e, K=point.K,
-                           offset=point.offset)
+        plain = state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e, K=point.K,
+                            offset=point.offset)
+        if not self.unknowns.latent:
+            return plain
+        functions = [Nonlinearity(one.basis, one.vectors @ c) for one, c in zip(self.unknowns.latent, point.cs)]
+        return replace(plain, latent=tuple(functions), Ez=point.Ez, Fz=point.Fz, Cz=point.Cz, Dz=point.Dz,
+                       offset_z=point.offset_z)
 
     def point_of(self, model: HammersteinSS) -> StatePoint:
         """Return the point of a model of the same structure, its initial states zero.
@@ -165,7 +170,9 @@ class StateErrors(Criterion):
         d = model.D * scale * np.array(unknowns.feedthrough)
         offset = model.offset_y + model.C @ shift if unknowns.constant else np.zeros(unknowns.l)
         x0 = np.zeros((unknowns.experiments, unknowns.n))
-        return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0)
+        cs = tuple(np.linalg.lstsq(one.vectors, h.mu)[0] for one, h in zip(unknowns.latent, model.latent))
+        return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0, cs,
+                          model.Ez + injection @ model.Fz, model.Fz, model.Cz, model.Dz, model.offset_z)
 
 
 def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
