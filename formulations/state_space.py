@@ -28,12 +28,14 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
+from optid.bases import parse
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
 from optid.identify.design.expansion import Bases
+from optid.identify.prediction_error.latent_search import add_channels
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -46,7 +48,7 @@ from optid.program.units import energy_unit, inverse, outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
-from optid.statistics.state_unknowns import StateUnknowns
+from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 Array = np.ndarray
 
@@ -110,9 +112,39 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
                       constraints)
 
 
+def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3", latent: str = "states+inputs",
+        direct: bool = False, basis: Bases = "linear", criterion: str = "simulation",
+        block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
+        feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+        initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
+        constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation or prediction error of a model with functions of latent signals z = Cz x + Dz u + const.
+
+        x(k+1) = A x + B f(u) + Ez h(z) + K e,    y(k) = C x + D f(u) + Fz h(z) + d + e
+
+    Args:
+        data: the record.
+        nx: number of states, or "auto".
+        channels: number of latent signals.
+        latent_basis: basis of every h, on z in [-1, 1]; what is affine in z belongs to A, B, C and D.
+        latent: what z is made of, "states+inputs" or "states".
+        direct: whether h acts on the outputs, too.
+        seed: of the directions of z that are tried.
+
+    The other arguments and the errors raised are those of `hammerstein_ss`.
+    """
+    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
+    whole_number("channels", channels, 1)
+    one_of("latent", latent, ("states+inputs", "states"))
+    inner = replace((parse(latent_basis) if isinstance(latent_basis, str) else latent_basis), interval=(-1.0, 1.0), outside="extrapolate")
+    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
+    return _procedure("lfr.exact", data, nx, basis, None, words, block_rows, offset, feedthrough, initial, iterations,
+                      constraints, (one,) * channels, seed)
+
+
 def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],
                block_rows: Any, offset: bool, feedthrough: Any, initial: Any, iterations: Any,
-               constraints: Sequence[Any]) -> Procedure:
+               constraints: Sequence[Any], latent: tuple[Latent, ...] = (), seed: int = 0) -> Procedure:
     for what, word in words.items():
         one_of(what, word, WORDS[what])
     whole_number("iterations", iterations, 1)
@@ -133,7 +165,8 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
                                  "use it with hammerstein_ss.asivid")
     given = _block_rows(plan) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
     others = tuple(rule for rule in constraints if rule not in poles)
-    run = _run(plan, words, given, block_rows is None, found, int(iterations), poles, others)
+    run = _run(plan, words, given, block_rows is None, found, int(iterations), poles, others, latent,
+               int(seed))
     return in_record_units(run, plan)
 
 
@@ -148,8 +181,8 @@ def _block_rows(plan: Plan) -> list[int | None]:
 
 
 def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None], imputes: bool,
-         found: dict[str, HammersteinSS], iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...]
-         ) -> Procedure:
+         found: dict[str, HammersteinSS], iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...],
+         latent: tuple[Latent, ...], seed: int) -> Procedure:
     refusal, nx = None, plan.order
     for rows in block_rows:
         try:
@@ -175,6 +208,9 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
     errors, best, figures = search_states(errors, starts, words["weighting"], iterations)
+    if latent:
+        errors, best, more = add_channels(errors, best, latent, seed=seed, iterations=iterations)
+        figures |= more
     fit = _Fit(plan.name, errors, constraints, plan.units)
     evidence = yield from refine(fit, best, {"order": nx, **figures}, fit.signed(best.x))
     return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))

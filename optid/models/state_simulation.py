@@ -117,6 +117,15 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
     return outputs
 
 
+def visited(job: Run, x0: Array) -> Array:
+    """Compute the states (N, n) of a run; errors as `run`."""
+    x, found = np.array(x0, dtype=float), []
+    for first, last, stretch in _stretches(job):
+        found.append(np.empty((last - first, x.size)))
+        march(job, first, stretch, x, np.empty((last - first, job.model.l)), found[-1])
+    return np.vstack(found)
+
+
 def _latent(model: StateSpace, states: Array, z: Array) -> Array:
     """Values (T, k) of the latent functions at states (T, n), z (T, k) being what the inputs add."""
     values = [h(one) for h, one in zip(model.latent, (z + states @ model.Cz.T).T)]

@@ -114,7 +114,8 @@ class StateSpace(Model):
                               len(fixed["latent"]))
         for name in SHAPES:
             given = getattr(self, name)
-            fixed.setdefault(name, finite(np.zeros(shapes[name]) if given is None else given, name))
+            absent = given is None or (np.size(given) == 0 and 0 in shapes[name])
+            fixed.setdefault(name, finite(np.zeros(shapes[name]) if absent else given, name))
         self._fix(fixed, m, len(fixed["C"]))
         self._check(shapes)
 

@@ -26,6 +26,8 @@ class Latent:
         direct: whether Fz is unknown; where not, it is one at `output`.
         output: index of an output that h is added to as it is, and that alone; -1 for none.
         moved: whether the inputs act on z: Dz is unknown; zero where not.
+        row: (n + m + 1,) known row [Cz, Dz, constant] of the argument, with coefficients one; None where both are
+            unknown.
     """
 
     basis: Basis
@@ -34,6 +36,7 @@ class Latent:
     direct: bool = False
     output: int = -1
     moved: bool = True
+    row: Array | None = None
 
     @property
     def size(self) -> int:
@@ -161,10 +164,10 @@ class StateUnknowns(Unknowns):
                 found[f"nu{f}"] = (family.size,)
             found[f"e{f}"] = (n,)
         for i, one in enumerate(self.latent):
-            found[f"c{i}"] = (one.size,)
+            if one.row is None:
+                found |= {f"c{i}": (one.size,), f"z{i}": (n + self.expansion.m * one.moved + 1,)}
             if one.feeds or one.direct:
                 found[f"g{i}"] = (n * one.feeds + outputs * one.direct,)
-            found[f"z{i}"] = (n + self.expansion.m * one.moved + 1,)
         return found
 
     def pack(self, point: StatePoint) -> Array:
@@ -193,8 +196,8 @@ class StateUnknowns(Unknowns):
                 d[:, c] = part[f"b{c}"][n:]
         Ez, Fz, Cz, Dz, constants = np.zeros((n, k)), np.zeros((outputs, k)), np.zeros((k, n)), np.zeros((k, m)), []
         for i, one in enumerate(self.latent):
-            row = part[f"z{i}"]
-            Cz[i], Dz[i, : m * one.moved] = row[:n], row[n:-1]
+            row = part[f"z{i}"] if one.row is None else one.row
+            Cz[i], Dz[i, : row.size - n - 1] = row[:n], row[n:-1]
             constants.append(row[-1])
             if one.feeds:
                 Ez[:, i] = part[f"g{i}"][:n]
@@ -207,7 +210,7 @@ class StateUnknowns(Unknowns):
             part.get("offset", np.zeros(outputs)), tuple(part.get(f"mu{c}", np.ones(1)) for c in range(m)), b, d,
             tuple(part.get(f"nu{f}", np.ones(1)) for f in range(s)),
             np.column_stack([part[f"e{f}"] for f in range(s)]) if s else np.zeros((n, 0)),
-            x[self.shared :].reshape(self.experiments, n), tuple(part[f"c{i}"] for i in range(k)), Ez, Fz, Cz, Dz,
+            x[self.shared :].reshape(self.experiments, n), tuple(part.get(f"c{i}", np.ones(one.size)) for i, one in enumerate(self.latent)), Ez, Fz, Cz, Dz,
             np.array(constants))
 
     def similarity(self, x: Array) -> Array:
@@ -228,7 +231,8 @@ class StateUnknowns(Unknowns):
             for f in range(point.e.shape[1]):
                 to[at[f"e{f}"]] = one @ point.e[:, f]
             for k, latent in enumerate(self.latent):
-                to[at[f"z{k}"]][:n] = -point.Cz[k] @ one
+                if latent.row is None:
+                    to[at[f"z{k}"]][:n] = -point.Cz[k] @ one
                 if latent.feeds:
                     to[at[f"g{k}"]][:n] = one @ point.Ez[:, k]
         return directions

@@ -56,6 +56,9 @@ class StateErrors(Criterion):
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input, or of a family of feedback functions."""
         x = self.unknowns.expansion
+        if name in ("c", "g", "z"):
+            word = {"c": "mu latent", "g": "b latent", "z": "z"}[name]
+            return word if len(self.unknowns.latent) == 1 else f"{word}[{number + 1}]"
         if name in ("nu", "e"):
             word = {"nu": "mu feedback", "e": "b feedback"}[name]
             return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"

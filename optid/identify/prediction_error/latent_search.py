@@ -1,0 +1,174 @@
+"""Starts for functions of latent signals, one after another: directions of z by the gain of one Gauss-Newton step.
+
+With Ez and Fz at zero the errors are linear in both, for every direction of z. The rank-one part of the step that the
+best directions promise starts a short descent; the best of those descends further.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import DataError, RankError
+from optid.identify.prediction_error.descent import Descent, descend
+from optid.identify.prediction_error.state_errors import StateErrors
+from optid.models import state_simulation as simulation
+from optid.statistics.state_unknowns import SIMULATORS, Latent, StatePoint
+
+RANKED = 8_000
+"""Samples on which directions are ranked and short descents made."""
+
+STAGE = 20_000
+"""Samples of the descent before the one on the whole record."""
+
+MARGIN = 1.15
+"""Interval of a basis, as a multiple of the range of z at the start."""
+
+SHORT = 12
+SIZES = (1.0, 0.3, 0.05)
+"""Shares of the Gauss-Newton step from which a descent may start."""
+
+
+def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 16,
+                 finalists: int = 4, seed: int = 0, iterations: int = 60) -> tuple[StateErrors, Descent, dict[str, Any]]:
+    """Give a model functions of latent signals and descend to an optimum with all of them.
+
+    Args:
+        errors: the criterion of the model without them.
+        best: its optimum.
+        channels: the functions, each on the interval [-1, 1] of its argument.
+        candidates: directions of z that are ranked, at least.
+        finalists: of them that are tried in descents.
+        seed: of the random directions.
+        iterations: of a descent at most.
+
+    Returns:
+        The criterion with the functions, its optimum, and figures of the search.
+
+    Raises:
+        RankError: no direction of z leads to a model whose run stays finite.
+    """
+    rng, figures = np.random.default_rng(seed), {}
+    x, steps = best.x, best.steps
+    for number, latent in enumerate(channels, start=1):
+        errors, x = whitened(errors, x)
+        part, x_part = _first(errors, x, RANKED)
+        ranked = sorted(_ranked(part, x_part, latent, candidates, rng), key=lambda one: -one[0])
+        ends = [end for one in ranked[:finalists] if (end := _short(part, x_part, latent, *one[1:])) is not None]
+        if not ends:
+            raise RankError(f"no direction of latent signal {number} leads to a model that stays finite: use fewer "
+                            "latent signals, another basis, or latent='states'.")
+        short = min(ends, key=lambda end: end.value)
+        errors = _widened(errors, (latent,))
+        for size in sorted({min(STAGE, errors.data.n_samples), errors.data.n_samples}):
+            stage, start = _first(errors, _lengthened(short.x, errors), size)
+            short = descend(stage, start, iterations=iterations, start=best.start)
+            steps += short.steps
+        x = short.x
+        figures[f"gain promised by latent signal {number}"] = ranked[0][0]
+    return errors, replace(short, steps=steps), figures
+
+
+def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
+    """Return the same model in states of unit covariance over the record."""
+    point = errors.unknowns.unpack(x)
+    runs = _visited(errors, point)
+    covariance = np.atleast_2d(np.cov(np.vstack(runs).T))
+    values, vectors = np.linalg.eigh(covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance)))
+    turn = (vectors / np.sqrt(values)).T
+    back = np.linalg.inv(turn)
+    moved = replace(point, A=turn @ point.A @ back, C=point.C @ back, K=turn @ point.K, b=turn @ point.b,
+                    e=turn @ point.e, Ez=turn @ point.Ez, Cz=point.Cz @ back, x0=point.x0 @ turn.T)
+    return errors, errors.normalised(errors.unknowns.pack(moved))
+
+
+def _visited(errors: StateErrors, point: StatePoint) -> list[Array]:
+    """States (N, n) of every experiment."""
+    model, word = errors.at(point), SIMULATORS[errors.unknowns.criterion]
+    return [simulation.visited(simulation.prepared(model, word, e.u, e.y, None, ""), x0)
+            for e, x0 in zip(errors.data.experiments, point.x0)]
+
+
+def _first(errors: StateErrors, x: Array, size: int) -> tuple[StateErrors, Array]:
+    """The criterion on the first samples of a long record, and the unknowns that belong to it."""
+    data = errors.data
+    if data.n_samples <= size or data.n_experiments > 1:
+        return errors, x
+    return replace(errors, data=data.window(0, size)), x
+
+
+def _lengthened(x: Array, errors: StateErrors) -> Array:
+    return np.concatenate([x, np.zeros(errors.unknowns.size - x.size)])
+
+
+def _widened(errors: StateErrors, latent: tuple[Latent, ...]) -> StateErrors:
+    return replace(errors, unknowns=replace(errors.unknowns, latent=(*errors.unknowns.latent, *latent)))
+
+
+def _with(point: StatePoint, rows: Array, cs: tuple[Array, ...], Ez: Array, Fz: Array) -> StatePoint:
+    """The point with further latent functions; ``rows`` (k, n + m + 1) are those of their arguments."""
+    n = len(point.A)
+    return replace(point, cs=(*point.cs, *cs), Ez=np.hstack([point.Ez, Ez]), Fz=np.hstack([point.Fz, Fz]),
+                   Cz=np.vstack([point.Cz, rows[:, :n]]), Dz=np.vstack([point.Dz, rows[:, n:-1]]),
+                   offset_z=np.concatenate([point.offset_z, rows[:, -1]]))
+
+
+def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: int, rng: np.random.Generator
+                ) -> Iterator[Array]:
+    """Yield rows [Cz, Dz, constant] whose z fills [-1, 1] on the record: states, inputs, outputs, random ones."""
+    n, m = errors.unknowns.n, errors.unknowns.expansion.m
+    states = np.vstack(_visited(errors, point))
+    signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
+    moving = np.concatenate([np.ones(n), np.full(m, float(latent.moved))])
+    known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))])]
+    spread = signals.std(axis=0)
+    weight = moving / np.where(spread > 0, spread, 1.0)
+    for number in range(max(count, len(known))):
+        v = known[number] if number < len(known) else weight * rng.normal(size=n + m)
+        z = signals @ v
+        low, high = float(z.min()), float(z.max())
+        if high - low > 1e-9 * np.abs(signals).max() * np.abs(v).max():
+            factor = 2 / (MARGIN * (high - low))
+            yield np.concatenate([factor * v, [-factor * (low + high) / 2]])
+
+
+def _ranked(errors: StateErrors, x: Array, latent: Latent, count: int, rng: np.random.Generator
+            ) -> Iterator[tuple[float, Array, Array]]:
+    """Yield (share of the errors that a Gauss-Newton step takes away, row of z, matrix [Ez; Fz] (n + l, r) of it)."""
+    point, n = errors.unknowns.unpack(x), errors.unknowns.n
+    r, outputs = latent.size, errors.unknowns.l
+    for row in _directions(errors, point, latent, count, rng):
+        single = [replace(latent, vectors=latent.vectors[:, [j]], row=row) for j in range(r)]
+        trial = _widened(errors, tuple(single))
+        start = _with(point, np.tile(row, (r, 1)), (np.ones(1),) * r, np.zeros((n, r)), np.zeros((outputs, r)))
+        at = trial.linearise(trial.unknowns.pack(start))
+        if not np.isfinite(at.value):
+            continue
+        size = np.linalg.norm(at.root, axis=0)
+        used = at.root / np.where(size > 0, size, 1.0)
+        step = np.linalg.lstsq(np.vstack([used, np.sqrt(1e-3) * np.eye(len(size))]),
+                               np.concatenate([-at.pull, np.zeros(len(size))]))[0]
+        left = float(np.sum((used @ step + at.pull) ** 2)) + at.remainder
+        found = trial.unknowns.unpack(np.concatenate([step / np.where(size > 0, size, 1.0), np.zeros(
+            trial.unknowns.size - len(size))]))
+        yield 1 - left / at.value, row, np.vstack([found.Ez[:, -r:], found.Fz[:, -r:]])
+
+
+def _short(errors: StateErrors, x: Array, latent: Latent, row: Array, matrix: Array) -> Descent | None:
+    """Descend a little from the rank-one part of a Gauss-Newton step; None where no share of it stays finite."""
+    point, trial, n = errors.unknowns.unpack(x), _widened(errors, (latent,)), errors.unknowns.n
+    left, values, right = np.linalg.svd(matrix, full_matrices=False)
+    before = errors.linearise(x).value
+    for share in SIZES:
+        size = np.sqrt(values[0] * share)
+        start = trial.unknowns.pack(_with(point, row[None], (size * right[0],), size * left[:n, :1], size * left[n:, :1]))
+        if trial.admissible(start) and trial.linearise(start).value < 10 * before:
+            break
+    else:
+        return None
+    try:
+        return descend(trial, start, iterations=SHORT)
+    except (DataError, np.linalg.LinAlgError):
+        return None
