@@ -268,9 +268,9 @@ def test_every_point_of_a_descent_is_stable():
     unknowns = TransferUnknowns(Layout(2, (2,), (0,), (BASIS,), ("y",), ("u",)), 1, (True,))
 
     class Watched(TransferErrors):
-        def linearise(self, x):
+        def linearise(self, x, method="auto"):
             assert roots.radius(x[self.unknowns.slices["a"]]) < 1
-            return super().linearise(x)
+            return super().linearise(x, method)
 
     search.search(Watched(data, unknowns, "norm"), lambda part: plant_starts(part, 8, 0))
 

@@ -87,7 +87,7 @@ def test_sensitivities_equal_finite_differences(criterion, missing, basis, laten
 def test_chunks_and_methods_agree():
     criterion, x = problem("prediction", 0.1, True)
     found = [linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at,
-                              criterion.gauge_rows(x), chunk) for chunk in (0, 7)]
+                              criterion.gauge_rows(x), chunk=chunk) for chunk in (0, 7)]
     grams = [one.whole[0].T @ one.whole[0] for one in found]
     assert grams[0] == pytest.approx(grams[1], rel=1e-9, abs=1e-9 * np.abs(grams[0]).max())
 

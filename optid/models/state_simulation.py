@@ -38,7 +38,8 @@ class Run(NamedTuple):
     Attributes:
         model: the model.
         u: (N, m) inputs.
-        known: (N, l) outputs that the simulator may see, NaN elsewhere; None for a free run.
+        y: (N, l) outputs, None where there are none.
+        known: those that the simulator may see, NaN elsewhere; None for a free run.
         gain: (n, l) gain of the correction.
         low: (l,) lower end of the range allowed.
         high: (l,) upper end.
@@ -47,6 +48,7 @@ class Run(NamedTuple):
 
     model: StateSpace
     u: Array
+    y: Array | None
     known: Array | None
     gain: Array
     low: Array
@@ -73,7 +75,7 @@ def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limit
     low, high = limits if limits is not None else (np.full(model.l, -np.finfo(float).max), np.finfo(float).max)
     low, high = (np.array(np.broadcast_to(end, model.l), dtype=float) for end in (low, high))
     known = None if simulator == "free" else y
-    return Run(model, u, known, model.K if simulator == "predict" else none, low, high, label)
+    return Run(model, u, y, known, model.K if simulator == "predict" else none, low, high, label)
 
 
 def run(job: Run, x0: Array) -> Array:

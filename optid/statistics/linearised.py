@@ -41,6 +41,11 @@ class Linearised:
     method: Literal["gram", "qr"]
 
     @property
+    def exact(self) -> bool:
+        """Whether the factor has the digits that a Gram matrix of its condition lacks."""
+        return self.method == "qr" or self.condition < CONDITION_LIMIT
+
+    @property
     def reach(self) -> float:
         """By how much a full step of the linearised problem would lower the sum of squares."""
         return float(self.pull @ self.pull) + sum(float(e @ e) for _, _, e in self.states)

@@ -25,7 +25,8 @@ NUMBERS = 500_000
 
 
 def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any,
-                     gauge: Array | None = None, chunk: int = 0) -> Linearised:
+                     gauge: Array | None = None, *, limits: Any = None, chunk: int = 0, method: str = "auto"
+                     ) -> Linearised:
     """Run a model over all experiments and compress its errors (model less record) with their sensitivities.
 
     Where an output is missing its error is left out, nothing is corrected by it, and the model's own output is fed
@@ -39,7 +40,9 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
             of the block of its inverse.
         model: (point) -> `StateSpace`.
         gauge: (rows, shared) directions that change no output; they get weight in the factor, not in the errors.
+        limits: range that the outputs of every experiment must not leave, from `allowed_range`; None for none.
         chunk: samples at a time; chosen by their size where 0.
+        method: of compression, see `optid.statistics.linearised.linearised`.
 
     Returns:
         The errors near x; of infinite value where a run leaves the range allowed.
@@ -48,13 +51,13 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
     point = unknowns.unpack(x)
     found = model(point)
     try:
-        return linearised(lambda i: _blocks(data, unknowns, point, i, weight, found, chunk), unknowns.experiments,
-                          unknowns.n, unknowns.shared, gauge)
+        return linearised(lambda i: _blocks(_job(data, unknowns, found, i, limits), unknowns, point, i, weight, chunk),
+                          unknowns.experiments, unknowns.n, unknowns.shared, gauge, method)
     except (FloatingPointError, DataError):
         return _infinite(unknowns)
 
 
-def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any) -> list[Array]:
+def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any, limits: Any = None) -> list[Array]:
     """Return the errors (N, l) (model less record) of every experiment, NaN where the output is missing.
 
     Raises:
@@ -62,14 +65,23 @@ def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any) -> li
     """
     point = unknowns.unpack(x)
     found = model(point)
-    return [simulation.run(_job(unknowns, found, e), x0) - e.y for e, x0 in zip(data.experiments, point.x0)]
+    return [simulation.run(_job(data, unknowns, found, i, limits), point.x0[i]) - e.y
+            for i, e in enumerate(data.experiments)]
 
 
-def _job(unknowns: StateUnknowns, model: StateSpace, e: Any) -> simulation.Run:
-    """The run whose errors are meant; where outputs act on states or latent signals do, it must not leave the range."""
-    nonlinear = (model.feedback or model.latent) and not unknowns.innovations
-    return simulation.prepared(model, SIMULATORS[unknowns.criterion], e.u, e.y,
-                               simulation.allowed_range([e.y]) if nonlinear else None, "")
+def squares(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any, limits: Any = None) -> float:
+    """Return the weighted sum of squared errors; infinite where a run leaves the range allowed."""
+    try:
+        found = residuals(data, unknowns, x, model, limits)
+    except DataError:
+        return np.inf
+    total = sum(float(np.sum(_weighted(e[:, :, None], np.linalg.inv(weight)) ** 2)) for e in found)
+    return total if np.isfinite(total) else np.inf
+
+
+def _job(data: "Data", unknowns: StateUnknowns, model: StateSpace, index: int, limits: Any) -> simulation.Run:
+    e = data.experiments[index]
+    return simulation.prepared(model, SIMULATORS[unknowns.criterion], e.u, e.y, limits and limits[index], "")
 
 
 def _infinite(unknowns: StateUnknowns) -> Linearised:
@@ -78,28 +90,34 @@ def _infinite(unknowns: StateUnknowns) -> Linearised:
     return Linearised(np.eye(p), np.zeros(p), (nothing,) * unknowns.experiments, np.inf, 0, 1.0, "gram")
 
 
-def _blocks(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, weight: Array, model: StateSpace,
-            chunk: int) -> Iterator[tuple[Array, int]]:
+def _blocks(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, weight: Array, chunk: int
+            ) -> Iterator[tuple[Array, int]]:
     """Yield weighted rows [x0 | shared | error], zero where the output is missing, and their number."""
-    record, covariance = data.experiments[index].y, np.linalg.inv(weight)
-    first, root = 0, _root(covariance, np.zeros(unknowns.l, dtype=bool))
-    for outputs, block in _runs(data, unknowns, point, index, model, chunk):
-        block[:, :, -1] = outputs - record[first : first + len(outputs)]
+    covariance, first = np.linalg.inv(weight), 0
+    for outputs, block in _runs(job, unknowns, point, index, chunk):
+        block[:, :, -1] = outputs - job.y[first : first + len(outputs)]
         first += len(outputs)
-        missing = np.isnan(block[:, :, -1])
-        complete = not missing.any()
-        if complete and not np.any(root - np.diag(np.diag(root))):
-            block *= np.diag(root)[:, None]
-        elif complete:
-            block = root @ block
-        else:
-            block[missing] = 0.0
-            for pattern in np.unique(missing, axis=0):
-                rows = (missing == pattern).all(axis=1)
-                block[rows] = _root(covariance, pattern) @ block[rows]
+        count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
+        block = _weighted(block, covariance)
         if not np.isfinite(block.sum()):
             raise FloatingPointError
-        yield block.reshape(-1, block.shape[2]), int(np.count_nonzero(~missing))
+        yield block.reshape(-1, block.shape[2]), count
+
+
+def _weighted(block: Array, covariance: Array) -> Array:
+    """Weigh rows (T, l, q), the last column the errors, in place where that is possible; zero where one is missing."""
+    missing = np.isnan(block[:, :, -1])
+    if missing.any():
+        block[missing] = 0.0
+        for pattern in np.unique(missing, axis=0):
+            rows = (missing == pattern).all(axis=1)
+            block[rows] = _root(covariance, pattern) @ block[rows]
+        return block
+    root = _root(covariance, missing[0])
+    if np.any(root - np.diag(np.diag(root))):
+        return root @ block
+    block *= np.diag(root)[:, None]
+    return block
 
 
 def _root(covariance: Array, missing: Any) -> Array:
@@ -110,11 +128,10 @@ def _root(covariance: Array, missing: Any) -> Array:
     return root
 
 
-def _runs(data: "Data", unknowns: StateUnknowns, point: StatePoint, index: int, model: StateSpace, chunk: int
+def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int
           ) -> Iterator[tuple[Array, Array]]:
     """Yield outputs (T, l), and sensitivities (T, l, n + shared + 1) with a column to write in, chunk by chunk."""
-    n, l = unknowns.n, unknowns.l  # noqa: E741
-    job, parts = _job(unknowns, model, data.experiments[index]), model.parts
+    n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
     places, state = unknowns.places(parts), np.array(point.x0[index], dtype=float)
     turn = np.zeros((n, n + unknowns.shared))
     turn[:, :n] = np.eye(n)

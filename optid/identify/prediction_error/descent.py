@@ -22,6 +22,12 @@ STEPS = 100
 COMPARED = 1e-6
 """Relative gain of a full step below which a start counts as arrived; only the best of them descends further."""
 
+DAMPED = 1e-7
+"""Damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has."""
+
+LOWER, LOWER_AGAIN = 0.1, 0.5
+"""Factors of the damping after a good step: the first one, and where a larger step was refused just before."""
+
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
 
@@ -60,8 +66,12 @@ class Criterion(ABC):
         """Name a quantity of a channel, such as "mu" of input 0."""
 
     @abstractmethod
-    def linearise(self, x: Array) -> Linearised:
-        """Return the errors near x."""
+    def linearise(self, x: Array, method: str = "auto") -> Linearised:
+        """Return the errors near x, compressed as in `optid.statistics.linearised.linearised`."""
+
+    @abstractmethod
+    def value(self, x: Array) -> float:
+        """Return the sum of squared errors at x, without sensitivities; infinite where a run leaves its range."""
 
     @abstractmethod
     def admissible(self, x: Array) -> bool:
@@ -131,6 +141,10 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
     for count in range(1, iterations + 1):
         root = at.root[:, free]
         gain = _gain(root, at)
+        if gain <= tolerance * at.value and not at.exact:
+            at = criterion.linearise(x)
+            root = at.root[:, free]
+            gain = _gain(root, at)
         if gain <= tolerance * at.value or at.value <= least:
             return Descent(x, at, count, True, start=start)
         scale = np.maximum(scale, np.linalg.norm(root, axis=0))
@@ -141,14 +155,16 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         step[free] = np.linalg.lstsq(stacked, pull, rcond=1e-15)[0] / weights
         moved = criterion.normalised(np.concatenate([x[:p] + step, x[p:] + at.follow(step)]))
         expected = at.reach - float(np.sum((at.root @ step + at.pull) ** 2))
-        new = criterion.linearise(moved) if criterion.admissible(moved) else None
-        ratio = (at.value - new.value) / max(expected, 1e-300) if new is not None else -1.0
-        if new is not None and ratio > 1e-3 and np.isfinite(new.value):
-            x, at, rejected, blocked = moved, new, 0, False
-            damping = 0.1 * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
+        allowed = criterion.admissible(moved)
+        ratio = (at.value - criterion.value(moved)) / max(expected, 1e-300) if allowed else -1.0
+        if ratio > 1e-3:
+            lower = LOWER if rejected == 0 else LOWER_AGAIN
+            x, rejected, blocked = moved, 0, False
+            at = criterion.linearise(x, "gram" if damping > DAMPED else "auto")
+            damping = lower * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
             damping = damping if damping > 1e-14 else 0.0
             continue
-        rejected, blocked = rejected + 1, blocked or new is None
+        rejected, blocked = rejected + 1, blocked or not allowed
         damping = max(8.0 * damping, 1e-6)
         if rejected > 20 or damping > 1e12:
             # at this size of the gain rounding decides whether a step descends

@@ -19,9 +19,10 @@ from optid.errors import StructureError
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
+from optid.models.state_simulation import allowed_range
 from optid.statistics.expansion import Expansion
 from optid.statistics.linearised import Linearised
-from optid.statistics.state_sensitivities import linearise_states, residuals
+from optid.statistics.state_sensitivities import linearise_states, residuals, squares
 from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
@@ -71,9 +72,18 @@ class StateErrors(Criterion):
         y = np.nan_to_num(y - np.nanmean(y, axis=0))
         return float(np.sum((y @ self.weight) * y))
 
-    def linearise(self, x: Array) -> Linearised:
+    @cached_property
+    def limits(self) -> tuple[Any, ...] | None:
+        """Ranges that runs must not leave, where outputs act on states, or latent signals do."""
+        unknowns = self.unknowns
+        if unknowns.innovations or not (unknowns.expansion.feedback or unknowns.latent):
+            return None
+        return tuple(allowed_range([e.y]) for e in self.data.experiments)
+
+    def linearise(self, x: Array, method: str = "auto") -> Linearised:
         """Return the errors near x."""
-        return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x))
+        return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x),
+                                limits=self.limits, method=method)
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""
@@ -97,13 +107,12 @@ class StateErrors(Criterion):
         return vectors[values > 1e-12 * values[0]]
 
     def value(self, x: Array) -> float:
-        """Return the weighted sum of squared errors, what is missing counting as zero."""
-        errors = np.nan_to_num(np.vstack(self.residuals(x)))
-        return float(np.sum((errors @ self.weight) * errors))
+        """Return the weighted sum of squared errors."""
+        return squares(self.data, self.unknowns, x, self.weight, self.at, self.limits)
 
     def residuals(self, x: Array) -> list[Array]:
         """Return the errors (N, l) of every experiment."""
-        return residuals(self.data, self.unknowns, x, self.at)
+        return residuals(self.data, self.unknowns, x, self.at, self.limits)
 
     def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.

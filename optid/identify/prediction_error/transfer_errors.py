@@ -72,10 +72,14 @@ class TransferErrors(Criterion):
         y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
         return float(np.nansum((y - np.nanmean(y)) ** 2))
 
-    def linearise(self, x: Array) -> Linearised:
+    def linearise(self, x: Array, method: str = "auto") -> Linearised:
         """Return the errors near x."""
         return linearise(self.data, self.unknowns, self.unknowns.unpack(x), gauge=self.gauge_rows(x),
-                         functions=self.functions)
+                         functions=self.functions, method=method)
+
+    def value(self, x: Array) -> float:
+        """Return the sum of squared errors at x."""
+        return float(sum(np.nansum(e**2) for e in self.innovations(x)))
 
     def innovations(self, x: Array) -> list[Array]:
         """Return the innovations (N,) of every experiment, NaN where there is none."""
