@@ -35,7 +35,7 @@ from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
 from optid.identify.design.expansion import Bases
-from optid.identify.prediction_error.latent_search import add_channels
+from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -142,6 +142,22 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
                       constraints, (one,) * channels, seed)
 
 
+def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3", **settings: Any) -> Procedure:
+    return hammerstein_wiener_ss(data, nx=nx, basis="linear", output_basis=output_basis, name="wiener_ss.exact", **settings)
+
+
+def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", output_basis: Any = "polynomial:3",
+                          criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
+                          weighting: str = "auto", feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+                          initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+                          constraints: Sequence[Any] = (), name: str = "hammerstein_wiener_ss.exact") -> Procedure:
+    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
+    inner = replace(parse(output_basis) if isinstance(output_basis, str) else output_basis, interval=(-1.0, 1.0), outside="extrapolate")
+    functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=basis == "linear" and bool(feedthrough)) for o in range(data.l))
+    return _procedure(name, data, nx, basis, None, words, block_rows, True, feedthrough and basis == "linear", initial, iterations,
+                      constraints, functions)
+
+
 def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],
                block_rows: Any, offset: bool, feedthrough: Any, initial: Any, iterations: Any,
                constraints: Sequence[Any], latent: tuple[Latent, ...] = (), seed: int = 0) -> Procedure:
@@ -208,7 +224,10 @@ def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None],
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
     errors, best, figures = search_states(errors, starts, words["weighting"], iterations)
-    if latent:
+    if latent and latent[0].output >= 0:
+        errors, best, more = add_output_functions(errors, best, latent, iterations=iterations)
+        figures |= more
+    elif latent:
         errors, best, more = add_channels(errors, best, latent, seed=seed, iterations=iterations)
         figures |= more
     fit = _Fit(plan.name, errors, constraints, plan.units)
@@ -257,7 +276,7 @@ class _Fit(TangentFit):
         """
         expansion, n, found = self.criterion.unknowns.expansion, self.criterion.unknowns.n, {}
         left = np.eye(n) - values["A"]
-        static = not expansion.feedback and np.linalg.cond(left) <= 1e12
+        static = not expansion.feedback and not self.criterion.unknowns.latent and np.linalg.cond(left) <= 1e12
         to_state = np.linalg.inv(left) if static else left
         for c in range(expansion.m):
             mu, b = self.criterion.key("mu", c), self.criterion.key("b", c)

@@ -71,6 +71,32 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
     return errors, replace(short, steps=steps), figures
 
 
+def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[Latent, ...], iterations: int = 60
+                         ) -> tuple[StateErrors, Descent, dict[str, Any]]:
+    """Let every output be a function of what it was: y_o = h_o(z_o) + constant, z_o the output of the model so far.
+
+    Arguments and errors as `add_channels`; ``functions`` has one for every output, of basis functions as they are.
+    """
+    point, n = errors.unknowns.unpack(best.x), errors.unknowns.n
+    signals = np.hstack([np.vstack(_visited(errors, point)), np.vstack([e.u for e in errors.data.experiments])])
+    measured, offsets, cs, rows = np.vstack([e.y for e in errors.data.experiments]), [], [], []
+    for o, one in enumerate(functions):
+        v = np.concatenate([point.C[o], point.d[o]])
+        z, here = signals @ v, ~np.isnan(measured[:, o])
+        factor = 2 / (MARGIN * max(np.ptp(z), 1e-300))
+        rows.append(np.concatenate([factor * v, [-factor * (z.max() + z.min()) / 2]]))
+        values = np.hstack([one.basis.values(factor * z + rows[-1][-1]) @ one.vectors, np.ones((len(z), 1))])
+        found = np.linalg.lstsq(values[here], measured[here, o])[0]
+        cs.append(found[:-1])
+        offsets.append(found[-1])
+    Ez, Fz = np.zeros((n, len(functions))), np.eye(errors.unknowns.l)
+    unknowns = replace(errors.unknowns, linear_output=False, feedthrough=(False,) * len(errors.unknowns.feedthrough))
+    errors = _widened(replace(errors, unknowns=unknowns), functions)
+    start = _with(replace(point, offset=np.array(offsets)), np.array(rows), tuple(cs), Ez, Fz)
+    found = descend(errors, errors.unknowns.pack(start), iterations=iterations, start=best.start)
+    return errors, replace(found, steps=best.steps + found.steps), {}
+
+
 def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
     """Return the same model in states of unit covariance over the record."""
     point = errors.unknowns.unpack(x)
