@@ -28,7 +28,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
-from optid.bases import parse
+from optid.bases import Basis, Polynomial, parse
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
@@ -136,7 +136,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     words = {"criterion": criterion, "weighting": weighting, "stability": stability}
     whole_number("channels", channels, 1)
     one_of("latent", latent, ("states+inputs", "states"))
-    inner = replace((parse(latent_basis) if isinstance(latent_basis, str) else latent_basis), interval=(-1.0, 1.0), outside="extrapolate")
+    inner = _inner(latent_basis)
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
     return _procedure("lfr.exact", data, nx, basis, None, words, block_rows, offset, feedthrough, initial, iterations,
                       constraints, (one,) * channels, seed)
@@ -152,10 +152,16 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
                           initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
                           constraints: Sequence[Any] = (), name: str = "hammerstein_wiener_ss.exact") -> Procedure:
     words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    inner = replace(parse(output_basis) if isinstance(output_basis, str) else output_basis, interval=(-1.0, 1.0), outside="extrapolate")
+    inner = _inner(output_basis)
     functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=basis == "linear" and bool(feedthrough)) for o in range(data.l))
     return _procedure(name, data, nx, basis, None, words, block_rows, True, feedthrough and basis == "linear", initial, iterations,
                       constraints, functions)
+
+
+def _inner(given: Any) -> Basis:
+    """The basis of a latent function, on [-1, 1]: polynomials go on beyond as they are, splines straight."""
+    basis = parse(given) if isinstance(given, str) else given
+    return replace(basis, interval=(-1.0, 1.0), outside="extrapolate" if isinstance(basis, Polynomial) else "linear")
 
 
 def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],

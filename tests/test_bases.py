@@ -52,7 +52,7 @@ def with_outside(basis, rule):
 
 
 @every
-@pytest.mark.parametrize("rule", ["clamp", "extrapolate"])
+@pytest.mark.parametrize("rule", ["clamp", "linear", "extrapolate"])
 def test_values_are_the_complete_family_times_the_contrast(basis, rule):
     basis = with_outside(basis, rule)
     u = np.random.default_rng(0).uniform(-1.5, 2.0, 300)
@@ -124,13 +124,21 @@ def test_piecewise_constant_has_one_level_a_cell_and_the_last_cell_is_closed():
 
 
 @pytest.mark.parametrize("basis", [*SMOOTH, FITTED[1]], ids=names([*SMOOTH, FITTED[1]]))
-@pytest.mark.parametrize("rule", ["clamp", "extrapolate"])
+@pytest.mark.parametrize("rule", ["clamp", "linear", "extrapolate"])
 def test_slopes_equal_finite_differences(basis, rule):
     basis = with_outside(basis, rule)
     u = np.random.default_rng(4).uniform(-1.2, 1.8, 60)
     step = 1e-6
     numeric = (basis.values(u + step) - basis.values(u - step)) / (2 * step)
     assert basis.slopes(u) == pytest.approx(numeric, abs=2e-6 * np.max(np.abs(numeric)))
+
+
+@every
+def test_beyond_the_interval_it_may_go_on_straight(basis):
+    basis = with_outside(basis, "linear")
+    ends = np.array([-0.7, 1.3])
+    straight = basis.values(ends) + basis.slopes(ends) * np.array([[-0.4], [2.0]])
+    assert basis.values(ends + [-0.4, 2.0]) == pytest.approx(straight, abs=1e-7)
 
 
 def test_user_slopes_by_differences_when_not_given():

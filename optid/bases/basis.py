@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 
-Outside = Literal["clamp", "extrapolate", "error"]
-OUTSIDE = ("clamp", "extrapolate", "error")
+Outside = Literal["clamp", "linear", "extrapolate", "error"]
+OUTSIDE = ("clamp", "linear", "extrapolate", "error")
 
 
 class Basis:
@@ -25,7 +25,8 @@ class Basis:
 
     Attributes:
         interval: (lower, upper) in units of the input; None until `fitted`.
-        outside: what happens beyond the interval: "clamp" (f stays at its end value), "extrapolate" or "error".
+        outside: what happens beyond the interval: "clamp" (f stays at its end value), "linear" (it goes on straight),
+            "extrapolate" (its formula goes on) or "error".
         shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient on
             the whole interval.
         dropped: index of the function left out of a complete family that sums to one; None when nothing is redundant.
@@ -118,6 +119,13 @@ class Basis:
         """
         x, missing = self._inside(samples(u))
         first, weights = self._evaluate(x)
+        if self.outside == "linear" and (beyond := self.is_outside(u)).any():
+            excess = samples(u)[beyond] - x[beyond]
+            slopes = self._derivative(x[beyond], 1)
+            if self.dropped is not None:  # the complete family sums to one, its slopes to zero
+                slopes = np.insert(slopes, self.dropped, -slopes.sum(axis=1), axis=1)
+            columns = first[beyond][:, None] + np.arange(weights.shape[1])
+            weights[beyond] += excess[:, None] * np.take_along_axis(slopes, columns, axis=1)
         if missing is not None:
             weights[missing] = 0.0
         return first, weights
@@ -211,8 +219,8 @@ class Basis:
         if self.outside == "error" and (out := self.is_outside(u)).any():
             k, (lo, hi) = int(np.argmax(out)), span(self)
             raise DataError(f"Sample {k} of the input is {u[k]:g}, outside the interval [{lo:g}, {hi:g}] of the basis "
-                            f"({int(out.sum())} such samples). Use data inside it, or outside='clamp' or "
-                            "'extrapolate'.")
+                            f"({int(out.sum())} such samples). Use data inside it, or outside='clamp', "
+                            "'linear' or 'extrapolate'.")
         return u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
 
     def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:

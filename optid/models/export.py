@@ -1,12 +1,13 @@
 """Models for other tools: SciPy, python-control, and CasADi for predictive control."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import OptidError, StructureError, nearest
-from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, USER, tabulated
+from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, tabulated
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_space import StateSpace
 from optid.models.transfer_function import TransferFunction
@@ -139,6 +140,11 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
             f"{type(nonlinearity.basis).__name__} has no symbolic form for CasADi: fit the model again with BSpline or "
             "Triangular."
         )
+    if tables.outside[0] == LINEAR:
+        slope = nonlinearity.slope(np.array([low, high]))
+        inside = symbolic(Nonlinearity(replace(nonlinearity.basis, outside="clamp"), nonlinearity.mu,
+                                       nonlinearity.offset), u)
+        return inside + float(slope[0]) * ca.fmin(u - low, 0) + float(slope[1]) * ca.fmax(u - high, 0)
     if tables.outside[0] != FREE:
         u = ca.fmin(ca.fmax(u, low), high)
     f: Any = nonlinearity.offset or 0.0

@@ -16,7 +16,7 @@ from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.models.nonlinearity import Nonlinearity
 
 USER, CELLS, LEGENDRE, TRIGONOMETRIC = -1, 0, 1, 2
-FREE, CLAMPED, REFUSED = 0, 1, 2
+FREE, CLAMPED, REFUSED, LINEAR = 0, 1, 2, 3
 
 
 class Tables(NamedTuple):
@@ -26,7 +26,7 @@ class Tables(NamedTuple):
         kind: (s,) one of USER, CELLS, LEGENDRE, TRIGONOMETRIC.
         low: (s,) lower end of the interval.
         high: (s,) upper end of the interval.
-        outside: (s,) FREE, CLAMPED or REFUSED beyond the interval.
+        outside: (s,) FREE, CLAMPED, REFUSED or LINEAR beyond the interval.
         cells: (s,) number of cells, or of coefficients.
         rate: (s,) angle per unit of the argument (trigonometric sums).
         numbers: (s, cells, degree + 1) coefficients, highest power first in the position within the cell.
@@ -63,7 +63,7 @@ def tabulated(functions: Sequence[Nonlinearity]) -> Tables:
 def _row(f: Nonlinearity) -> tuple[int, float, float, int, int, float, Array]:
     basis, mu = f.basis, np.asarray(f.mu)
     low, high = basis.interval if basis.interval is not None else (0.0, 1.0)
-    outside = {"extrapolate": FREE, "clamp": CLAMPED, "error": REFUSED}[basis.outside]
+    outside = {"extrapolate": FREE, "clamp": CLAMPED, "error": REFUSED, "linear": LINEAR}[basis.outside]
     outside = FREE if basis.interval is None else outside
     if isinstance(basis, Linear):
         return CELLS, low, high, outside, 1, 0.0, np.array([[mu[0] * (high - low), mu[0] * low]])

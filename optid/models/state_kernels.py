@@ -25,8 +25,10 @@ def value_and_slope(tables, j, v):
     slack = 1e-12 * max(abs(low), abs(high))
     beyond = v < low - slack or v > high + slack
     refused = beyond and tables.outside[j] == 2
-    frozen = (v < low or v > high) and tables.outside[j] != 0
+    frozen = (v < low or v > high) and tables.outside[j] != 0 and tables.outside[j] != 3
+    excess = 0.0
     if tables.outside[j] != 0:
+        excess = v - min(max(v, low), high) if tables.outside[j] == 3 else 0.0
         v = min(max(v, low), high)
     value, slope = 0.0, 0.0
     if tables.kind[j] == 0:
@@ -59,7 +61,7 @@ def value_and_slope(tables, j, v):
             cosine, sine = np.cos(angle), np.sin(angle)
             value += tables.numbers[j, k, last - 1] * cosine + tables.numbers[j, k, last] * sine
             slope += rate * (tables.numbers[j, k, last] * cosine - tables.numbers[j, k, last - 1] * sine)
-    return value, 0.0 if frozen else slope, refused
+    return value + slope * excess, 0.0 if frozen else slope, refused
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -134,6 +134,8 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
     """
     x = criterion.normalised(x)
     at = criterion.linearise(x)
+    if not np.isfinite(at.value):
+        return Descent(x, at, 0, False, "the run leaves its range", start, True)
     p = len(at.pull)
     free = np.ones(p, dtype=bool) if held is None else np.logical_not(held)
     scale, least = np.zeros(int(free.sum())), EXACT * criterion.energy

@@ -30,6 +30,9 @@ SHORT = 12
 SIZES = (1.0, 0.3, 0.05)
 """Shares of the Gauss-Newton step from which a descent may start."""
 
+SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
+"""What a function is shrunk to where a longer record would take the run out of its range."""
+
 
 def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 16,
                  finalists: int = 4, seed: int = 0, iterations: int = 60) -> tuple[StateErrors, Descent, dict[str, Any]]:
@@ -54,21 +57,21 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
         errors, x = whitened(errors, x)
-        part, x_part = _first(errors, x, RANKED)
-        ranked = sorted(_ranked(part, x_part, latent, candidates, rng), key=lambda one: -one[0])
-        ends = [end for one in ranked[:finalists] if (end := _short(part, x_part, latent, *one[1:])) is not None]
+        part = _first(errors, RANKED)
+        ranked = sorted(_ranked(part, x, latent, candidates, rng), key=lambda one: -one[0])
+        ends = [end for one in ranked[:finalists] if (end := _short(part, x, latent, *one[1:])) is not None]
         if not ends:
             raise RankError(f"no direction of latent signal {number} leads to a model that stays finite: use fewer "
                             "latent signals, another basis, or latent='states'.")
-        short = min(ends, key=lambda end: end.value)
         errors = _widened(errors, (latent,))
+        starts = [end.x for end in sorted(ends, key=lambda end: end.value)]
         for size in sorted({min(STAGE, errors.data.n_samples), errors.data.n_samples}):
-            stage, start = _first(errors, _lengthened(short.x, errors), size)
-            short = descend(stage, start, iterations=iterations, start=best.start)
-            steps += short.steps
-        x = short.x
+            stage = _first(errors, size)
+            end = descend(stage, _finite(stage, starts), iterations=iterations, start=best.start)
+            steps, starts = steps + end.steps, [end.x]
+        x = end.x
         figures[f"gain promised by latent signal {number}"] = ranked[0][0]
-    return errors, replace(short, steps=steps), figures
+    return errors, replace(end, steps=steps), figures
 
 
 def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[Latent, ...], iterations: int = 60
@@ -117,16 +120,28 @@ def _visited(errors: StateErrors, point: StatePoint) -> list[Array]:
             for e, x0 in zip(errors.data.experiments, point.x0)]
 
 
-def _first(errors: StateErrors, x: Array, size: int) -> tuple[StateErrors, Array]:
-    """The criterion on the first samples of a long record, and the unknowns that belong to it."""
+def _first(errors: StateErrors, size: int) -> StateErrors:
+    """The criterion on the first samples of a long record."""
     data = errors.data
     if data.n_samples <= size or data.n_experiments > 1:
-        return errors, x
-    return replace(errors, data=data.window(0, size)), x
+        return errors
+    return replace(errors, data=data.window(0, size))
 
 
-def _lengthened(x: Array, errors: StateErrors) -> Array:
-    return np.concatenate([x, np.zeros(errors.unknowns.size - x.size)])
+def _finite(errors: StateErrors, starts: list[Array]) -> Array:
+    """Return the first start whose run stays in its range; the best with a smaller last function where none does.
+
+    More samples may take a signal to where a function was not known.
+    """
+    at, last = errors.unknowns.slices, len(errors.unknowns.latent) - 1
+    for share in (1.0, *SHARES):
+        for start in starts:
+            x = np.array(start)
+            x[at[f"g{last}"]] *= share
+            if np.isfinite(errors.value(x)):
+                return x
+    raise RankError("a model that stays finite on the first samples of the record leaves its range on the rest, however "
+                    "small its last latent function: use fewer latent signals, or another basis.")
 
 
 def _widened(errors: StateErrors, latent: tuple[Latent, ...]) -> StateErrors:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import StructureError
+from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.program.program import Program
@@ -57,6 +57,8 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
         The evidence, or None where a programme has no point: its status says why.
     """
     here = _Iterate.of(fit, x)
+    if not np.isfinite(here.at.value):
+        raise RankError("no start has a run that stays within its range; use another order or another basis")
     figures = {**figures, "Gauss-Newton steps": found.steps}
     if here.program.user_constraints:
         return (yield from _constrained(fit, here, figures))

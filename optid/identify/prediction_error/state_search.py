@@ -131,7 +131,9 @@ def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
 
 
 def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
-    """Add the noise model, and the Hankel bound to a simulation error with one weight per output.
+    """Add the noise model, and the Hankel bound to errors linear in functions of signals that the record shows.
+
+    Those are errors with one weight per output of models whose functions see inputs and measured outputs alone.
 
     Args:
         evidence: of a fit.
@@ -141,7 +143,9 @@ def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
     weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
     model, remarks = _with_noise(evidence.model, errors)
     bound = evidence.bound
-    if not unknowns.innovations and not np.any(weight - np.diag(np.diag(weight))):
+    shown = unknowns.criterion == "measured feedback" or (
+        unknowns.criterion == "simulation" and not unknowns.expansion.feedback)
+    if shown and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
         records = [np.hstack([e.u, e.y]) for e in errors.data.experiments]
         bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
                                  2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
@@ -158,15 +162,16 @@ def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinS
     """
     data = errors.data
     try:
-        if not errors.unknowns.innovations:
+        if not errors.unknowns.innovations and not errors.unknowns.latent:
             return with_noise(model, data), {}
-        found: Any = model.predict(data)
+        # what no gain is fitted to counts as white: with latent functions the optimal one would depend on the state
+        found: Any = model.predict(data) if errors.unknowns.innovations else model.simulate(data, x0="fit")
         predicted: Sequence[Array] = found if isinstance(found, tuple) else [found]
         rest = np.vstack([e.y for e in data.experiments]) - np.vstack(predicted)
         rest = rest[~np.isnan(rest).any(axis=1)]
         covariance = rest.T @ rest / max(len(rest), 1)
         return replace(model, noise=NoiseCovariances.of_innovations(model.K, covariance)), {}
-    except StructureError as reason:
+    except (StructureError, DataError) as reason:
         return model, {"noise model": f"none: {reason}"}
 
 
