@@ -7,6 +7,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
+from optid.errors import StructureError
 from optid.models.state_signals import Parts, Places
 from optid.statistics.expansion import Expansion
 from optid.statistics.unknowns import Unknowns
@@ -44,16 +45,23 @@ class Latent:
         return self.vectors.shape[1]
 
 
-def beyond_affine(basis: Basis, points: int = 400) -> Array:
+def beyond_affine(basis: Basis, points: int = 64) -> Array:
     """Return orthonormal coordinates (P, r) of the functions of a basis without a part in the span of {1, z}.
 
     That part is carried by the matrices. Orthogonal with respect to the uniform distribution on the interval.
+
+    Raises:
+        StructureError: nothing is left.
     """
     low, high = basis.interval if basis.interval is not None else (-1.0, 1.0)
-    z = low + (np.arange(points) + 0.5) * (high - low) / points
-    affine = np.column_stack([np.ones(points), z - z.mean()])
-    values, vectors = np.linalg.svd(affine.T @ basis.values(z) / points)[1:]
-    return vectors[int(np.sum(values > 1e-12 * values[0])) :].T
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    values = basis.values((low + high) / 2 + (high - low) / 2 * nodes)
+    sizes, vectors = np.linalg.svd((np.column_stack([np.ones(points), nodes]).T * weights) @ values)[1:]
+    found = vectors[int(np.sum(sizes > 1e-9 * sizes[0])) :].T
+    if not found.size:
+        raise StructureError(f"the basis {type(basis).__name__.lower()} of a latent function has no part that is not "
+                             "affine, which the matrices carry: use more functions.")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
