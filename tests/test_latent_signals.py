@@ -1,0 +1,162 @@
+"""Static functions of latent signals: the model, its simulation, its derivatives, and fits of plants that have them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import optid
+from optid.bases import BSpline, Polynomial, UserFunctions
+from optid.data.channels import Transform
+from optid.data.record import Data
+from optid.errors import OptidError, StructureError
+from optid.models import HammersteinSS, Nonlinearity
+from optid.statistics.state_unknowns import beyond_affine
+
+SMOOTH = Nonlinearity(Polynomial(3, interval=(-2.0, 2.0), outside="extrapolate"), np.array([0.2, -0.3, 0.1]))
+CELLS = Nonlinearity(BSpline(4, interval=(-1.0, 1.0), outside="linear"), np.array([0.3, -0.5, 0.2, 0.4, 0.1, -0.2]))
+USER = Nonlinearity(UserFunctions((np.tanh,), interval=(-1.0, 1.0), outside="extrapolate"), np.array([0.7]))
+FED = Nonlinearity(Polynomial(2, interval=(-3.0, 3.0)), np.array([0.1, 0.2]))
+
+
+def latent(first=SMOOTH, second=CELLS, seed=0, **changes):
+    """Three states, two inputs, two outputs, two latent signals, one output fed back."""
+    rng = np.random.default_rng(seed)
+    arguments = {
+        "A": np.diag([0.7, 0.5, -0.3]) + 0.05 * rng.normal(size=(3, 3)), "B": rng.normal(size=(3, 2)),
+        "C": rng.normal(size=(2, 3)), "D": 0.3 * rng.normal(size=(2, 2)), "latent": (first, second),
+        "Ez": 0.2 * rng.normal(size=(3, 2)), "Fz": 0.3 * rng.normal(size=(2, 2)), "Cz": 0.4 * rng.normal(size=(2, 3)),
+        "Dz": 0.3 * rng.normal(size=(2, 2)), "offset_z": np.array([0.1, -0.2]), "E": 0.1 * rng.normal(size=(3, 1)),
+        "feedback": (FED,), "output_of": (1,), "L": 0.05 * rng.normal(size=(3, 2)),
+        "offset_x": np.array([0.1, 0.0, -0.1]), "offset_y": np.array([0.5, -1.0])}
+    return HammersteinSS(**(arguments | changes))
+
+
+def by_hand(model, u, x0):
+    """The equations as they are written."""
+    x, y = np.array(x0, dtype=float), np.zeros((len(u), model.l))
+    for k in range(len(u)):
+        h = np.array([f(z) for f, z in zip(model.latent, model.Cz @ x + model.Dz @ u[k] + model.offset_z)])
+        y[k] = model.C @ x + model.D @ u[k] + model.Fz @ h + model.offset_y
+        g = np.array([f(y[k, o]) for f, o in zip(model.feedback, model.output_of)])
+        x = model.A @ x + model.B @ u[k] + model.E @ g + model.L @ y[k] + model.Ez @ h + model.offset_x
+    return y
+
+
+def inputs(samples=80, seed=1):
+    return np.random.default_rng(seed).normal(size=(samples, 2))
+
+
+MODELS = [latent(), latent(second=USER)]
+X0 = np.array([0.4, -0.2, 0.3])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_simulation_equals_the_equations(model):
+    u = inputs()
+    assert model.simulate(u, x0=X0) == pytest.approx(by_hand(model, u, X0), abs=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_several_steps_ahead_without_correction_are_the_free_run(model):
+    u = inputs()
+    y = by_hand(model, u, X0)
+    found = model.predict(Data(u, y), horizon=4, x0=X0)
+    assert found[3:] == pytest.approx(y[3:], abs=1e-11)
+
+
+@pytest.mark.parametrize("change", [
+    lambda model: model.transformed(np.array([[1.0, 0.3, 0.0], [0.0, 2.0, -0.1], [0.4, 0.0, 0.5]])),
+    lambda model: model.injected(0.1 * np.ones((3, 2))),
+    lambda model: HammersteinSS.from_dict(model.to_dict()),
+    lambda model: model.regauge("norm"),
+])
+def test_forms_that_simulate_the_same(change):
+    model, u = latent(), inputs()
+    other = change(model)
+    x0 = np.zeros(3)
+    assert other.simulate(u, x0=x0) == pytest.approx(model.simulate(u, x0=x0), abs=1e-10)
+
+
+def test_change_of_units():
+    model, u = latent(), inputs()
+    units = Transform((2.0, 0.5), (1.0, -3.0), (10.0, 10.0), (5.0, 7.0))
+    raw = model.with_transform(units)
+    expected = by_hand(model, (u - [1.0, -3.0]) / [2.0, 0.5], X0) * 10.0 + [5.0, 7.0]
+    assert raw.simulate(u, x0=10.0 * X0) == pytest.approx(expected, abs=1e-9)
+
+
+def test_initial_state_and_rest():
+    model, u = latent(), inputs()
+    data = Data(u, by_hand(model, u, X0))
+    assert model.initial_state(data) == pytest.approx(X0, abs=1e-6)
+    x, y = model.equilibrium([0.2, -0.1])
+    assert model.simulate(np.tile([0.2, -0.1], (5, 1)), x0=x) == pytest.approx(np.tile(y, (5, 1)), abs=1e-9)
+    step = 1e-6
+    for c in range(2):
+        near = [model.equilibrium(np.array([0.2, -0.1]) + sign * step * np.eye(2)[c])[1] for sign in (1, -1)]
+        slope = (near[0] - near[1]) / (2 * step)
+        assert model.static_gain([0.2, -0.1])[:, c] == pytest.approx(slope, abs=1e-6)
+
+
+def test_shapes_are_refused_by_name():
+    with pytest.raises(StructureError, match=r"Cz has shape \(2, 2\).*2 of latent signals"):
+        latent(Cz=np.zeros((2, 2)))
+    with pytest.raises(StructureError, match="no part that is not affine"):
+        beyond_affine(Polynomial(1, interval=(-1.0, 1.0)))
+
+
+@pytest.mark.parametrize("basis", [Polynomial(2), Polynomial(5), BSpline(6)])
+def test_coordinates_without_an_affine_part(basis):
+    basis = replace(basis, interval=(-1.0, 3.0))
+    z = np.linspace(-1, 3, 2001)
+    functions = basis.values(z) @ beyond_affine(basis)
+    assert functions.shape[1] == (basis.size - 2 if isinstance(basis, BSpline) else basis.size - 1)
+    share = functions.T @ np.column_stack([np.ones(z.size), z]) / z.size
+    assert np.abs(share).max() < 2e-2 * np.abs(functions).max()
+
+
+def oscillator(u, noise=0.0, seed=0):
+    """A hardening spring: the latent signal is a state that no output shows alone."""
+    x, v, y = 0.0, 0.0, np.zeros(len(u))
+    for k in range(len(u)):
+        y[k] = x + 0.2 * v
+        v += 0.3 * (1.2 * u[k] - 0.4 * v - x - 0.4 * x**3)
+        x += 0.3 * v
+    return y + noise * np.random.default_rng(seed).normal(size=len(u))
+
+
+def test_a_latent_spring_is_found():
+    u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 300), 4)
+    sigma = 0.01 * oscillator(u).std()
+    fit = optid.fit(Data(u[:800], oscillator(u, sigma)[:800]), "lfr.exact", nx=2, latent="states")
+    test = Data(u[800:], oscillator(u)[800:])
+    error = np.asarray(fit.model.simulate(test, x0="fit"))[:, 0] - test.y[:, 0]
+    assert np.sqrt(np.mean(error**2)) < 0.5 * sigma
+    linear = optid.fit(Data(u[:800], oscillator(u, sigma)[:800]), "ss.exact", nx=2)
+    assert fit.solution.objective < 0.01 * linear.solution.objective
+
+
+@pytest.mark.parametrize("formulation, front", [("wiener_ss.exact", False), ("hammerstein_wiener_ss.exact", True)])
+def test_functions_of_the_outputs_are_found(formulation, front):
+    rng = np.random.default_rng(5)
+    u = rng.uniform(-1, 1, 1600)
+    f = u + 0.4 * u**2 if front else u
+    x, z = np.zeros(2), np.zeros(1600)
+    for k in range(1600):
+        z[k] = x[0] - 0.4 * x[1]
+        x = np.array([[0.8, 0.3], [-0.3, 0.8]]) @ x + np.array([0.3, 0.5]) * f[k]
+    y = z + 0.4 * z**2
+    sigma = 0.02 * y.std()
+    fit = optid.fit(Data(u[:800], (y + sigma * rng.normal(size=1600))[:800]), formulation, nx=2)
+    error = np.asarray(fit.model.simulate(Data(u[800:], y[800:]), x0="fit"))[:, 0] - y[800:]
+    assert np.sqrt(np.mean(error**2)) < 0.3 * sigma
+    assert fit.solution.status.value == "locally optimal"
+
+
+def test_words_are_refused():
+    data = Data(inputs(60)[:, :1], inputs(60)[:, 1:])
+    for arguments in ({"channels": 0}, {"latent": "outputs"}, {"latent_basis": "polynomial:1"},
+                      {"latent_basis": "spline"}):
+        with pytest.raises(OptidError):
+            optid.fit(data, "lfr.exact", nx=1, **arguments)
