@@ -87,8 +87,10 @@ CELLS = [
     *_states("ss.exact", structure={"criterion": "prediction"}),
     *_states("ss.exact", structure={"nx": "auto"}, outputs=(2,)),
     *_states("hammerstein_ss.exact", structure=CUBIC, curved=True),
-    *_states("hammerstein_ss.exact", structure=FED, curved=True, fed=True, outputs=(2,)),
+    *_states("hammerstein_ss.exact", structure={**FED, "criterion": "measured feedback"}, curved=True, fed=True,
+             outputs=(2,)),
     *_states("hammerstein_ss.exact", structure={**FED, "criterion": "prediction"}, curved=True, fed=True, outputs=(2,)),
+    *(cell for name in ("lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact") for cell in _states(name)),
     Cell("subspace.nuclear", "states", {"nx": 2, "block_rows": 5}, samples=300),
     Cell("subspace.nuclear", "states", {"nx": 2, "block_rows": 5, "weight": 1e3}, outputs=2, samples=200),
 ]

@@ -39,7 +39,7 @@ def slow_input(rng: np.random.Generator, samples: int, channels: int = 1, hold: 
 
 
 def duffing(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """x'' + 0.3 x' + x + 0.4 x^3 = 1.5 u in semi-implicit steps of 0.3; the parameters vary by 20 %."""
+    """X'' + 0.3 x' + x + 0.4 x^3 = 1.5 u in semi-implicit steps of 0.3; the parameters vary by 20 %."""
     damping, spring, gain = np.array([0.3, 0.4, 1.5]) * rng.uniform(0.8, 1.2, 3)
 
     def run(u: np.ndarray) -> np.ndarray:
@@ -197,8 +197,9 @@ def main() -> None:
         if name in options.only:
             rows = [simulated(name, seed) for seed in range(options.seeds)]
             errors = np.array([error for error, _, _ in rows])
+            spent = np.median([seconds for _, seconds, _ in rows])
             print(f"{name:<20}{np.median(errors):8.3f}{np.quantile(errors, 0.9, method='higher'):8.3f}"
-                  f"{100 * np.mean(errors <= GOAL):10.0f} %{np.median([spent for _, spent, _ in rows]):8.2f}", flush=True)
+                  f"{100 * np.mean(errors <= GOAL):10.0f} %{spent:8.2f}", flush=True)
             for failure in sorted({status for error, _, status in rows if not np.isfinite(error)}):
                 print(f"    {failure}")
     folder = os.environ.get("OPTID_DATA")

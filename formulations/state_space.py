@@ -1,12 +1,12 @@
-"""State-space models by prediction errors: simulation or one-step errors of all outputs minimised.
+"""State-space models by simulation or prediction errors of all outputs, with static functions of many kinds.
 
-    x(k+1) = A x + B f(u) + E g(y) + K e,    y(k) = C x + D f(u) + d + e
+    x(k+1) = A x + B f(u) + E g(y) + Ez h(z) + K e,    y(k) = C x + D f(u) + Fz h(z) + d + e,    z = Cz x + Dz u + const
 
-``criterion="simulation"`` takes K = 0 and the simulation with measured feedback (P2); a noise model is estimated from
-the errors it leaves. ``"prediction"`` estimates K with the other unknowns. Both are procedures: starts from subspace
-fits with several block rows, Gauss-Newton descents on streamed sensitivities, errors weighted anew by their own
-covariance (`optid.identify.prediction_error`) and, at the optimum z0 or under constraints, convex programmes in the
-tangent of the iterate,
+The parts there are make the formulation: none of f, g, h (`ss`), f and g (`hammerstein_ss`), h of latent signals
+(`formulations.lfr`), h in the place of C x + D f(u) (`formulations.wiener_ss`). ``criterion="simulation"`` takes K = 0
+and the free run, ``"measured feedback"`` K = 0 with the measured outputs in g, ``"prediction"`` estimates K with the
+other unknowns. All are procedures (`formulations.state_space_procedure`): starts from subspace fits, descents on
+streamed sensitivities and, at the optimum z0 or under constraints, convex programmes in the tangent of the iterate,
 
     minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the user's constraints,
 
@@ -14,46 +14,35 @@ where R (z - z0) + e0 are the errors to first order in the unknowns z, compresse
 are part of R. Constraints on poles are kept by every iterate through the length of the steps.
 
 Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
-(not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, and the
-affine expressions ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names
-carry the channel, as in ``mu[valve]``. Without feedback the static curves (`shape.gain`, `shape.value_range`, ...) are
+(not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, per latent
+signal ``mu latent``, ``b latent`` (= [Ez_i; Fz_i]) and ``z`` (= [Cz_i, Dz_i, constant]), and the affine expressions
+``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names carry the channel,
+as in ``mu[valve]``. Without feedback and latent signals the static curves (`shape.gain`, `shape.value_range`, ...) are
 constrained to first order about the iterate as well.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from formulations.subspace_procedure import identified
-from optid.bases import Basis, Polynomial, parse
+from formulations import state_space_procedure as procedure
 from optid.data.channels import Transform
 from optid.data.record import Data
-from optid.data.stretches import with_whole_inputs
-from optid.errors import RankError, StructureError
-from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
 from optid.identify.design.expansion import Bases
-from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
-from optid.identify.prediction_error.refinement import refine
-from optid.identify.prediction_error.state_errors import STABLE, StateErrors
-from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
+from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.tangent_fit import TangentFit
-from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
-from optid.program.units import energy_unit, inverse, outer_bases
+from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
-from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 Array = np.ndarray
-
-WORDS = {"criterion": ("simulation", "measured feedback", "prediction"), "stability": ("stable", "free"),
-         "weighting": ("auto", "scale", "variance", "determinant")}
 
 
 def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
@@ -73,7 +62,8 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         nx: number of states, or "auto" (gap of the singular values of the first subspace fit).
         basis: basis of the input nonlinearity, one per input or one for all.
         feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
-        criterion: "simulation" (P2: measured feedback, K = 0) or "prediction" (P1: innovation form, K estimated).
+        criterion: "simulation" (P3: the free run), "measured feedback" (P2: the measured outputs are fed back) or
+            "prediction" (P1: innovation form, K estimated).
         block_rows: of the subspace fits to start from, one or several; None chooses three, for which missing outputs
             may be estimated as in `formulations.hammerstein_ss.sid`.
         weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
@@ -93,9 +83,10 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         DataError: no stretch of some length in which every input is present.
         RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
     """
-    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    return _procedure("hammerstein_ss.exact", data, nx, basis, feedback_basis, words, block_rows, offset, feedthrough,
-                      initial, iterations, constraints)
+    return procedure.state_space_fit(
+        "hammerstein_ss.exact", data, nx, StateSpaceFit, basis=basis, feedback_basis=feedback_basis,
+        criterion=criterion, block_rows=block_rows, weighting=weighting, offset=offset, feedthrough=feedthrough,
+        stability=stability, initial=initial, iterations=iterations, constraints=constraints)
 
 
 def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
@@ -107,142 +98,21 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
     Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``. Arguments as in `hammerstein_ss`, as
     are the errors raised.
     """
-    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    return _procedure("ss.exact", data, nx, "linear", None, words, block_rows, offset, feedthrough, initial, iterations,
-                      constraints)
-
-
-def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3", latent: str = "states+inputs",
-        direct: bool = False, basis: Bases = "linear", criterion: str = "simulation",
-        block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
-        feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
-        initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
-        constraints: Sequence[Any] = ()) -> Procedure:
-    """Minimise the simulation or prediction error of a model with functions of latent signals z = Cz x + Dz u + const.
-
-        x(k+1) = A x + B f(u) + Ez h(z) + K e,    y(k) = C x + D f(u) + Fz h(z) + d + e
-
-    Args:
-        data: the record.
-        nx: number of states, or "auto".
-        channels: number of latent signals.
-        latent_basis: basis of every h, on z in [-1, 1]; what is affine in z belongs to A, B, C and D.
-        latent: what z is made of, "states+inputs" or "states".
-        direct: whether h acts on the outputs, too.
-        seed: of the directions of z that are tried.
-
-    The other arguments and the errors raised are those of `hammerstein_ss`.
-    """
-    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    whole_number("channels", channels, 1)
-    one_of("latent", latent, ("states+inputs", "states"))
-    inner = _inner(latent_basis)
-    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
-    return _procedure("lfr.exact", data, nx, basis, None, words, block_rows, offset, feedthrough, initial, iterations,
-                      constraints, (one,) * channels, seed)
-
-
-def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3", **settings: Any) -> Procedure:
-    return hammerstein_wiener_ss(data, nx=nx, basis="linear", output_basis=output_basis, name="wiener_ss.exact", **settings)
-
-
-def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", output_basis: Any = "polynomial:3",
-                          criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
-                          weighting: str = "auto", feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
-                          initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
-                          constraints: Sequence[Any] = (), name: str = "hammerstein_wiener_ss.exact") -> Procedure:
-    words = {"criterion": criterion, "weighting": weighting, "stability": stability}
-    inner = _inner(output_basis)
-    functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=basis == "linear" and bool(feedthrough)) for o in range(data.l))
-    return _procedure(name, data, nx, basis, None, words, block_rows, True, feedthrough and basis == "linear", initial, iterations,
-                      constraints, functions)
-
-
-def _inner(given: Any) -> Basis:
-    """The basis of a latent function, on [-1, 1]: polynomials go on beyond as they are, splines straight."""
-    basis = parse(given) if isinstance(given, str) else given
-    return replace(basis, interval=(-1.0, 1.0), outside="extrapolate" if isinstance(basis, Polynomial) else "linear")
-
-
-def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, words: Mapping[str, str],
-               block_rows: Any, offset: bool, feedthrough: Any, initial: Any, iterations: Any,
-               constraints: Sequence[Any], latent: tuple[Latent, ...] = (), seed: int = 0) -> Procedure:
-    for what, word in words.items():
-        one_of(what, word, WORDS[what])
-    whole_number("iterations", iterations, 1)
-    in_memory(data, f"{words['criterion']} errors")
-    instruments = "inputs+past" if feedback_basis is None else "simulated"
-    if feedback_basis is not None and words["criterion"] == "prediction":
-        instruments = "simulated+past"
-    # the fit lives in the units of the samples; what leaves it is taken back to raw units by the caller
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
-                   instruments=instruments, feedthrough=feedthrough, stability="free",
-                   iterations=2 * (feedback_basis is not None))
-    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
-    found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
-    poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
-    for rule in poles:
-        if getattr(rule, "verify", None) is None:
-            raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
-                                 "use it with hammerstein_ss.asivid")
-    given = _block_rows(plan) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-    others = tuple(rule for rule in constraints if rule not in poles)
-    run = _run(plan, words, given, block_rows is None, found, int(iterations), poles, others, latent,
-               int(seed))
-    return in_record_units(run, plan)
-
-
-def _block_rows(plan: Plan) -> list[int | None]:
-    """Three numbers of block rows: what the subspace fit would choose, and multiples of what the order needs."""
-    if plan.order is None:
-        return [None]
-    least = plan.order // plan.data.l + 2
-    shortest = min(e.n_samples for e in plan.data.experiments)
-    most = max(shortest // (4 * (plan.data.m + plan.data.l + 1)), least)
-    return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
-
-
-def _run(plan: Plan, words: Mapping[str, str], block_rows: Sequence[int | None], imputes: bool,
-         found: dict[str, HammersteinSS], iterations: int, poles: tuple[Any, ...], constraints: tuple[Any, ...],
-         latent: tuple[Latent, ...], seed: int) -> Procedure:
-    refusal, nx = None, plan.order
-    for rows in block_rows:
-        try:
-            start = replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows, imputes=imputes)
-            evidence = yield from quietly(identified(start))
-        except (RankError, StructureError, np.linalg.LinAlgError) as error:
-            refusal = refusal or error
-            continue
-        if evidence.model is not None:
-            nx = nx or int(evidence.figures["order"])
-            model = evidence.extended()[0] if words["criterion"] == "prediction" else evidence.model  # K counts there
-            found[f"{evidence.figures['block rows']} block rows"] = model
-    if nx is None or not found:
-        raise refusal or RankError("no subspace fit has a point to start from; use another order")
-    expansion, data = plan.expansion(), with_whole_inputs(plan.data, 2 * nx + 1)
-    unknowns = StateUnknowns(nx, expansion, data.n_experiments, plan.direct(), words["criterion"], plan.offset)
-    # similarity takes away the freedom of as many unknowns as A has entries
-    enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
-    variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
-    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
-                         STABLE if words["stability"] == "stable" else np.inf, tuple(rule.verify for rule in poles))
-    starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
-    if not starts:
-        raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
-    errors, best, figures = search_states(errors, starts, words["weighting"], iterations)
-    if latent and latent[0].output >= 0:
-        errors, best, more = add_output_functions(errors, best, latent, iterations=iterations)
-        figures |= more
-    elif latent:
-        errors, best, more = add_channels(errors, best, latent, seed=seed, iterations=iterations)
-        figures |= more
-    fit = _Fit(plan.name, errors, constraints, plan.units)
-    evidence = yield from refine(fit, best, {"order": nx, **figures}, fit.signed(best.x))
-    return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
+    return procedure.state_space_fit(
+        "ss.exact", data, nx, StateSpaceFit, criterion=criterion, block_rows=block_rows, weighting=weighting,
+        offset=offset, feedthrough=feedthrough, stability=stability, initial=initial, iterations=iterations,
+        constraints=constraints)
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit(TangentFit):
+class StateSpaceFit(TangentFit):
+    """The programmes of a state-space model, and the model of their values.
+
+    Attributes:
+        criterion: the errors.
+        units: from those of the programme to those of the record.
+    """
+
     criterion: StateErrors
     units: Transform
 

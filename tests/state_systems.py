@@ -44,7 +44,8 @@ def with_feedback(basis=None, seed=0, **changes):
 FEEDBACK_BASES = [
     Polynomial(3), Polynomial(4, outside="extrapolate"), Triangular(5), Triangular(4, outside="extrapolate"),
     BSpline(5), BSpline(4, degree=2, outside="extrapolate"),
-    BSpline(4, outside="linear"), Polynomial(3, outside="linear"), PiecewiseConstant(6), Trigonometric(2), Linear(), USER,
+    BSpline(4, outside="linear"), Polynomial(3, outside="linear"), PiecewiseConstant(6), Trigonometric(2), Linear(),
+    USER,
 ]
 
 

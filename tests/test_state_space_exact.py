@@ -97,7 +97,7 @@ def test_chunks_and_methods_agree():
 def test_directions_of_the_gauge_change_nothing(word, latent):
     criterion, x = problem(word, 0.0, True, latent=latent)
     rows = criterion.gauge_rows(x)
-    assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, the scales of functions of inputs, outputs, states
+    assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, scales of functions
     assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
     plain = linearise_states(criterion.data, criterion.unknowns, x, criterion.weight, criterion.at)
     assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()

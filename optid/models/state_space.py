@@ -326,7 +326,8 @@ class StateSpace(Model):
         back = np.linalg.inv(turn)
         noise = None if self.noise is None else self.noise.mapped(turn, np.eye(self.l))
         moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "Ez", "offset_x")}
-        return replace(self, A=turn @ self.A @ back, C=self.C @ back, Cz=self.Cz @ back, noise=noise, gauge="none", **moved)
+        return replace(self, A=turn @ self.A @ back, C=self.C @ back, Cz=self.Cz @ back, noise=noise, gauge="none",
+                       **moved)
 
     def balanced(self) -> Self:
         """Return the model in balanced states: both Gramians of (A, [B E Ez], [C; Cz]) are diagonal and equal.

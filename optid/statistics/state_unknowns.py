@@ -151,7 +151,7 @@ class StateUnknowns(Unknowns):
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Shape of every part in the order of the vector: "A", "C", "K", "offset", "mu0", "b0", ..., "nu0", "e0", ..., "c0", "g0", "z0".
+        """Shape of every part in order: "A", "C", "K", "offset", "mu0", "b0", ..., "nu0", "e0", ..., "c0", "g0", "z0".
 
         g = [Ez; Fz] and z = [Cz, Dz, constant] of a latent function, as far as they are unknown.
         """
@@ -218,7 +218,8 @@ class StateUnknowns(Unknowns):
             part.get("offset", np.zeros(outputs)), tuple(part.get(f"mu{c}", np.ones(1)) for c in range(m)), b, d,
             tuple(part.get(f"nu{f}", np.ones(1)) for f in range(s)),
             np.column_stack([part[f"e{f}"] for f in range(s)]) if s else np.zeros((n, 0)),
-            x[self.shared :].reshape(self.experiments, n), tuple(part.get(f"c{i}", np.ones(one.size)) for i, one in enumerate(self.latent)), Ez, Fz, Cz, Dz,
+            x[self.shared :].reshape(self.experiments, n),
+            tuple(part.get(f"c{i}", np.ones(one.size)) for i, one in enumerate(self.latent)), Ez, Fz, Cz, Dz,
             np.array(constants))
 
     def similarity(self, x: Array) -> Array:
@@ -269,6 +270,7 @@ class StateUnknowns(Unknowns):
             c=listed([first(f"c{i}") for i, _ in latent]),
             ez=listed([first(f"g{i}", 0, one.feeds) for i, one in latent]),
             fz=listed([first(f"g{i}", n * one.feeds, one.direct) for i, one in latent]),
-            cz=listed([first(f"z{i}") for i, _ in latent]), dz=listed([first(f"z{i}", n, one.moved) for i, one in latent]),
+            cz=listed([first(f"z{i}") for i, _ in latent]),
+            dz=listed([first(f"z{i}", n, one.moved) for i, one in latent]),
             oz=listed([first(f"z{i}", n + m * one.moved) for i, one in latent]),
             members=ends([one.size for _, one in latent]))

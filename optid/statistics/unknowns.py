@@ -38,7 +38,7 @@ class Unknowns:
 
     @cached_property
     def products(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of parts of which the output shows the product alone: (mu, b), (nu, e) of feedback, (c, g) of latent."""
+        """Parts of which the output shows the product alone: (mu, b), (nu, e) of feedback, (c, g) of latent ones."""
         partner, found = {"mu": "b", "nu": "e", "c": "g"}, []
         for part, at in self.slices.items():
             kind = part.rstrip("0123456789")

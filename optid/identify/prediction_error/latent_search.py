@@ -35,7 +35,8 @@ SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
 
 
 def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 16,
-                 finalists: int = 4, seed: int = 0, iterations: int = 60) -> tuple[StateErrors, Descent, dict[str, Any]]:
+                 finalists: int = 4, seed: int = 0, iterations: int = 60
+                 ) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Give a model functions of latent signals and descend to an optimum with all of them.
 
     Args:
@@ -140,8 +141,8 @@ def _finite(errors: StateErrors, starts: list[Array]) -> Array:
             x[at[f"g{last}"]] *= share
             if np.isfinite(errors.value(x)):
                 return x
-    raise RankError("a model that stays finite on the first samples of the record leaves its range on the rest, however "
-                    "small its last latent function: use fewer latent signals, or another basis.")
+    raise RankError("a model that stays finite on the first samples of the record leaves its range on the rest, "
+                    "however small its last latent function: use fewer latent signals, or another basis.")
 
 
 def _widened(errors: StateErrors, latent: tuple[Latent, ...]) -> StateErrors:
@@ -204,7 +205,8 @@ def _short(errors: StateErrors, x: Array, latent: Latent, row: Array, matrix: Ar
     before = errors.linearise(x).value
     for share in SIZES:
         size = np.sqrt(values[0] * share)
-        start = trial.unknowns.pack(_with(point, row[None], (size * right[0],), size * left[:n, :1], size * left[n:, :1]))
+        start = trial.unknowns.pack(
+            _with(point, row[None], (size * right[0],), size * left[:n, :1], size * left[n:, :1]))
         if trial.admissible(start) and trial.linearise(start).value < 10 * before:
             break
     else:
