@@ -12,6 +12,23 @@ MOST_LEVELS = 1000
 """Counting of distinct values stops here: above it a channel counts as continuous."""
 
 
+class Ports:
+    """Named inputs and outputs: what a record, a stream, the columns of a regression and a model share."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+
 @dataclass(frozen=True)
 class Transform:
     """Affine maps back to the units of the source: raw = value * scale + offset, one pair per channel.

@@ -9,7 +9,16 @@ import numpy as np
 
 from optid.arrays import as_samples, is_scalar_list
 from optid.data import preprocessing
-from optid.data.channels import Channel, Transform, channel_names, channel_units, check_distinct, listed, sampling_time
+from optid.data.channels import (
+    Channel,
+    Ports,
+    Transform,
+    channel_names,
+    channel_units,
+    check_distinct,
+    listed,
+    sampling_time,
+)
 from optid.errors import DataError, nearest
 
 
@@ -41,7 +50,7 @@ class Experiment:
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class Data:
+class Data(Ports):
     """Inputs and outputs of one or several experiments, sampled every dt.
 
     Attributes:
@@ -133,16 +142,6 @@ class Data:
     # -- sizes and arrays ---------------------------------------------------------------------------------------
 
     @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
-
-    @property
     def n_samples(self) -> int:
         """Number of samples of all experiments together."""
         return sum(e.n_samples for e in self.experiments)
@@ -155,17 +154,17 @@ class Data:
     @property
     def u(self) -> Any:
         """Inputs (N, m), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.u for e in self.experiments])
+        return one_or_all([e.u for e in self.experiments])
 
     @property
     def y(self) -> Any:
         """Outputs (N, l), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.y for e in self.experiments])
+        return one_or_all([e.y for e in self.experiments])
 
     @property
     def time(self) -> Any:
         """Sampling instants (N,), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
+        return one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -386,5 +385,6 @@ def _take(values: tuple, positions: Sequence[int]) -> tuple:
     return tuple(values[p] for p in positions)
 
 
-def _one_or_all(arrays: list[np.ndarray]) -> np.ndarray | tuple[np.ndarray, ...]:
+def one_or_all(arrays: list[np.ndarray]) -> Any:
+    """Return the array of the only experiment, or a tuple with one array for each."""
     return arrays[0] if len(arrays) == 1 else tuple(arrays)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optid.data.channels import Transform, channel_names, channel_units, check_distinct, sampling_time
+from optid.data.channels import Ports, Transform, channel_names, channel_units, check_distinct, sampling_time
 from optid.data.reading.chunks import Channels, Chunk
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Stream:
+class Stream(Ports):
     """A record that is read chunk by chunk; every iteration is a new pass.
 
     Iterating yields (u (n, m), y (n, l)), float64, in time order; NaN = missing. An infinite sample raises a
@@ -79,16 +79,6 @@ class Stream:
     def n_experiments(self) -> int:
         """Number of experiments."""
         return self.parts[-1].experiment + 1 if self.parts else 1
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
 
     @property
     def transform(self) -> Transform:

@@ -1,7 +1,6 @@
-"""Records given to a model: channels and units, missing inputs, horizons and initial states are checked here."""
+"""Records and initial states given to a model: channels, units and shapes are checked here."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,25 +9,11 @@ from optid.arrays import Array, as_samples, is_scalar_list
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 
-
-class Channels(Protocol):
-    """A model as far as its channels go."""
-
-    @property
-    def inputs(self) -> tuple[str, ...]: ...  # noqa: D102 - names of the inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]: ...  # noqa: D102 - names of the outputs
-
-    @property
-    def dt(self) -> float: ...  # noqa: D102 - sampling time
-
-
 Record = tuple[Array, Array | None, str]
 """Inputs (N, m), outputs (N, l) or None, and the words that name the experiment in a message."""
 
 
-def in_units_of(model: Channels, data: Data) -> Data:
+def in_units_of(model: Any, data: Data) -> Data:
     """Return the data in raw units, given that channels and sampling time are the model's.
 
     Raises:
@@ -45,7 +30,7 @@ def in_units_of(model: Channels, data: Data) -> Data:
     return data if data.transform.is_identity else data.raw()
 
 
-def records_of(model: Channels, data: Any) -> tuple[list[Record], bool]:
+def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
     """Return the record of every experiment, and whether the inputs were one-dimensional.
 
     Args:
@@ -78,23 +63,7 @@ def samples_of(values: ArrayLike, what: str, count: int) -> Array:
     return samples
 
 
-def one_or_all(arrays: list[Array]) -> Any:
-    """Return the array of the only experiment, or a tuple with one array for each."""
-    return arrays[0] if len(arrays) == 1 else tuple(arrays)
-
-
-def checked_horizon(horizon: Any) -> int:
-    """Return a prediction horizon as an int.
-
-    Raises:
-        StructureError: not a positive integer.
-    """
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise StructureError(f"horizon = {horizon!r}: a positive integer number of samples.")
-    return int(horizon)
-
-
-def check_inputs(model: Channels, u: Array, label: str) -> None:
+def check_inputs(model: Any, u: Array, label: str) -> None:
     """Refuse missing and infinite inputs, beyond which no state is known.
 
     Raises:
@@ -124,35 +93,6 @@ def state_like(x0: Any, shape: tuple[int, ...]) -> Array:
     if not np.all(np.isfinite(state)):
         raise DataError("x0 contains a value that is not finite.")
     return state
-
-
-def states_of(
-    records: Sequence[Record], x0: Any, shape: tuple[int, ...], fitted: Callable[[int], Array]
-) -> list[Array]:
-    """Return the initial state of every record.
-
-    Args:
-        records: the records.
-        x0: "zero", "fit", or a state for each record.
-        shape: of a state.
-        fitted: returns the state that fits best, by the index of the record.
-
-    Raises:
-        StructureError: an x0 that cannot be read.
-        DataError: a state that is not finite.
-    """
-    if isinstance(x0, str):
-        if x0 == "zero":
-            return [np.zeros(shape)] * len(records)
-        if x0 != "fit":
-            raise StructureError(f"x0={x0!r}: use 'zero', 'fit' or an array {shape}.")
-        if any(y is None for _, y, _ in records):
-            raise StructureError("x0='fit' needs the outputs: pass Data, or x0='zero' or a state.")
-        return [fitted(i) for i in range(len(records))]
-    states = list(x0) if len(records) > 1 else [x0]
-    if len(states) != len(records):
-        raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
-    return [state_like(state, shape) for state in states]
 
 
 def signal_units(y: Array) -> Array:

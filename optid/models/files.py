@@ -16,21 +16,8 @@ KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any] | None], Any]] = {}
 """What builds a model from the content of its file, by the kind written there; every class enters itself."""
 
 
-def save(model: Any, path: str | Path) -> Path:
-    """Write a model to a JSON file; numbers are written so that they are read back to the last bit.
-
-    Args:
-        model: the model.
-        path: the file, replaced when it exists.
-
-    Returns:
-        The path.
-    """
-    return write(model.to_dict(), path, FORMAT, VERSION)
-
-
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
-    """Read a model from a file written by `save`.
+    """Read a model from a file that its `save` wrote.
 
     Args:
         path: the file.

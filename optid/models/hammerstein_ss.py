@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, one_or_all
 from optid.errors import DataError
-from optid.models import export, state_text
 from optid.models import state_simulation as simulation
-from optid.models.experiments import Record, one_or_all, records_of
+from optid.models import text
+from optid.models.experiments import Record, records_of
 from optid.models.files import KINDS
 from optid.models.state_space import StateSpace
 
@@ -20,11 +20,11 @@ class HammersteinSS(StateSpace):
 
     def equation(self, digits: int = 4) -> str:
         """Write the model as equations: one per state up to four states, in matrices with the poles beyond."""
-        return state_text.written(self, digits)
+        return text.state_equations(self, digits)
 
     def coefficients(self) -> list[tuple[str, float]]:
         """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
-        return state_text.listed(self)
+        return text.matrix_entries(self)
 
     SIMULATORS = simulation.SIMULATORS
 
@@ -82,14 +82,6 @@ class HammersteinSS(StateSpace):
         from scipy.signal import dlti
 
         return dlti(self.A, self.B, self.C, self.D, dt=self.dt)
-
-    def to_control(self) -> Any:
-        """Return (A, B, C, D), from every f to every output, as a python-control system."""
-        return export.control_package().ss(self.A, self.B, self.C, self.D, self.dt)
-
-    def to_casadi(self) -> Any:
-        """Return (x, u) -> (x_next, y) as a `casadi.Function`, the free run without noise."""
-        return export.state_space_to_casadi(self)
 
 
 KINDS["HammersteinSS"] = HammersteinSS.from_dict

@@ -110,7 +110,7 @@ class HammersteinTF(TransferFunction):
         n, outputs = self.largest_lag, self.l
         if n == 0:
             return np.zeros((0, outputs))
-        whitened = simulator == "predict" and not self.shares_poles
+        whitened = simulator == "predict" and self.d is not None
         count = min(len(y), self._horizon(max(self.radius, roots.radius(self.c) if whitened else 0.0)))
         units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
         present = np.isfinite(rest)
@@ -168,14 +168,6 @@ class HammersteinTF(TransferFunction):
     def to_dlti(self, output: int | str = 0, input: int | str = 0) -> Any:
         """Return the linear part of the plant from one f to one output as a `scipy.signal.dlti`."""
         return export.to_dlti(self, output, input)
-
-    def to_control(self) -> Any:
-        """Return the linear part of the plant, all inputs and outputs, as a python-control system."""
-        return export.to_control(self)
-
-    def to_casadi(self) -> Any:
-        """Return the plant, without noise, as a `casadi.Function`; see `optid.models.export.to_casadi`."""
-        return export.to_casadi(self)
 
 
 KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

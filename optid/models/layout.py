@@ -7,11 +7,12 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
+from optid.data.channels import Ports
 from optid.errors import StructureError
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(Ports):
     """The columns of Phi: -y_o(k-i), i = 1..na, o inner; then per input and per lag eta(u_c(k - nk_c - j)); then 1.
 
     The coefficients of input c are vec(Theta_c), Theta_c (P_c, nb_c), column by column.
@@ -50,16 +51,6 @@ class Layout:
         ]:
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
                 raise StructureError(f"{name} must be an integer >= {smallest}; got {value!r}.")
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
 
     @cached_property
     def n_columns(self) -> int:

@@ -2,22 +2,25 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
-from optid.data.channels import Transform, numbered_names
-from optid.data.record import Data
+from optid.arrays import Array, check_integer
+from optid.data.channels import Ports, Transform, numbered_names
+from optid.data.record import Data, one_or_all
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError, nearest
-from optid.models import files, roots
-from optid.models.experiments import Record, checked_horizon, one_or_all, records_of, states_of
+from optid.models import export, files, roots
+from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
-NAMES = ("inputs", "outputs", "input_units", "output_units")
+TITLES = {
+    "oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space",
+}
 
 
 def finite(values: Any, name: str) -> Array:
@@ -33,7 +36,7 @@ def finite(values: Any, name: str) -> Array:
     return array
 
 
-class Model:
+class Model(Ports):
     """A linear part between static functions, with named channels; the fields are those of its dataclasses.
 
     Attributes:
@@ -51,14 +54,13 @@ class Model:
 
     nonlinearities: tuple[Nonlinearity, ...]
     dt: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     gauge: str
     poles: Any
     memory: int
     structure: Any
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
     equation: Callable[..., str]
@@ -93,24 +95,16 @@ class Model:
             raise StructureError(f"Unknown gauge {self.gauge!r}: use one of {', '.join(self.GAUGES)}.")
 
     @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
-
-    @property
     def kind(self) -> str:
         """The word for this class in model files."""
         return type(self).__name__
 
     @property
-    def _family(self) -> str:
-        """The first word of the title."""
-        return "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        family = "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
+        fed_back = " with nonlinear feedback" if getattr(self, "feedback", ()) else ""
+        return f"{family} {TITLES[self.structure]} model{fed_back}"
 
     @property
     def radius(self) -> float:
@@ -167,7 +161,7 @@ class Model:
                 leave the range of numbers.
             StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
         """
-        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
+        horizon, (records, _) = check_integer(horizon, "horizon"), records_of(self, data)
         fit = isinstance(x0, str) and x0 == "fit"
         states = [None] * len(records) if fit else self._states("predict", records, x0)
         predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
@@ -265,7 +259,18 @@ class Model:
             raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
         if simulator != "free" and any(y is None for _, y, _ in records):
             raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
-        return states_of(records, x0, self._state_shape, lambda i: self._fitted(simulator, *records[i]))
+        if isinstance(x0, str):
+            if x0 == "zero":
+                return [np.zeros(self._state_shape)] * len(records)
+            if x0 != "fit":
+                raise StructureError(f"x0={x0!r}: use 'zero', 'fit' or an array {self._state_shape}.")
+            if any(y is None for _, y, _ in records):
+                raise StructureError("x0='fit' needs the outputs: pass Data, or x0='zero' or a state.")
+            return [self._fitted(simulator, *record) for record in records]
+        states = list(x0) if len(records) > 1 else [x0]
+        if len(states) != len(records):
+            raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
+        return [state_like(state, self._state_shape) for state in states]
 
     def _warn_unstable(self) -> None:
         if not self.is_stable:
@@ -314,28 +319,42 @@ class Model:
         # units do not turn signs: what a constraint decided about them stays
         return self._in_raw_units(transform).regauge(self.gauge, signs=False)
 
-    # -- files ---------------------------------------------------------------------------------------------------
+    # -- other tools and files -----------------------------------------------------------------------------------
+
+    def to_control(self) -> Any:
+        """Return the linear part as a python-control system; see `optid.models.export.to_control`."""
+        return export.to_control(self)
+
+    def to_casadi(self) -> Any:
+        """Return the free run without noise as a `casadi.Function`; see `optid.models.export.to_casadi`."""
+        return export.to_casadi(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""
-        return {
-            "kind": self.kind,
-            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
-            "dt": self.dt,
-            **{name: list(getattr(self, name)) for name in NAMES},
-            "gauge": self.gauge,
-        }
+        return {"kind": self.kind} | {one.name: _in_json(getattr(self, one.name)) for one in fields(self)}
 
-    @staticmethod
-    def _shared_fields(content: Mapping[str, Any], functions: dict[str, Any] | None) -> dict[str, Any]:
-        """Read the fields that `Model.to_dict` described."""
-        return {
-            "nonlinearities": tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
-            "dt": content["dt"],
-            **{name: tuple(content[name]) for name in NAMES},
-            "gauge": content["gauge"],
-        }
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
+        """Build the model that `to_dict` described; the errors are those of the parts.
+
+        Args:
+            content: what `to_dict` returned.
+            functions: those of a basis of UserFunctions, by name.
+        """
+        given = {one.name: content[one.name] for one in fields(cls)}
+        for name in given.keys() & {"nonlinearities", "feedback"}:
+            given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])
+        return cls(**given)
 
     def save(self, path: str | Path) -> Path:
-        """Write the model to a JSON file, from which `optid.load` restores it exactly."""
-        return files.save(self, path)
+        """Write the model to a JSON file, from which `optid.load` restores it to the last bit."""
+        return files.write(self.to_dict(), path, files.FORMAT, files.VERSION)
+
+
+def _in_json(value: Any) -> Any:
+    """Arrays as lists, parts as what they say of themselves."""
+    if isinstance(value, tuple):
+        return [_in_json(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.to_dict() if hasattr(value, "to_dict") else value

@@ -52,11 +52,7 @@ class StateSpace(Model):
         offset_x: (n,) constant of the state equation.
         offset_y: (l,) constant of the output equation.
         noise: covariances of the noises, or None.
-        dt: sampling time.
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: one per input, "" where unknown.
-        output_units: one per output, "" where unknown.
+        dt, inputs, outputs, input_units, output_units: see `Model`.
         gauge: how the scale between f and B is fixed: "norm", "gain" or "none"; see `regauge`.
 
     Raises:
@@ -85,6 +81,8 @@ class StateSpace(Model):
     output_units: tuple[str, ...] = ()
     gauge: str = field(default="none", kw_only=True)
     GAUGES = ("norm", "gain", "none")
+    structure = "ss"
+    memory = 0  # the initial state is estimated
 
     def __post_init__(self) -> None:
         fixed: dict[str, Any] = {name: finite(np.atleast_2d(getattr(self, name)), name) for name in ("A", "B", "C")}
@@ -141,24 +139,9 @@ class StateSpace(Model):
         return len(self.A)
 
     @property
-    def structure(self) -> str:
-        """State space, "ss"."""
-        return "ss"
-
-    @property
-    def title(self) -> str:
-        """What kind of model this is, in words."""
-        return f"{self._family} state-space model" + (" with nonlinear feedback" if self.feedback else "")
-
-    @property
     def orders(self) -> dict[str, Any]:
         """The number of states nx."""
         return {"nx": self.nx}
-
-    @property
-    def memory(self) -> int:
-        """Samples at the start of a record that cannot be predicted: none, the initial state is estimated."""
-        return 0
 
     @cached_property
     def parts(self) -> Parts:
@@ -370,30 +353,13 @@ class StateSpace(Model):
             noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
         )
 
-    # -- content of files ----------------------------------------------------------------------------------------
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe the model in JSON types."""
-        return super().to_dict() | {
-            **{name: getattr(self, name).tolist() for name in SHAPES},
-            "input_of": list(self.input_of),
-            "feedback": [g.to_dict() for g in self.feedback],
-            "output_of": list(self.output_of),
-            "noise": None if self.noise is None else self.noise.to_dict(),
-        }
-
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
-        sizes = (len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback"))
-        shapes = cls._shapes(*sizes)
-        return cls(
-            **{name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()},
-            input_of=tuple(content["input_of"]), output_of=tuple(content["output_of"]),
-            feedback=tuple(Nonlinearity.from_dict(g, functions) for g in content["feedback"]),
-            noise=None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"]),
-            **cls._shared_fields(content, functions),
-        )
+        shapes = cls._shapes(*(len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback")))
+        parts = {name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()}
+        noise = None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"])
+        return super().from_dict({**content, **parts, "noise": noise}, functions)
 
 
 def _signs(response: Array) -> Array:

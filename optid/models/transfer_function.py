@@ -22,8 +22,6 @@ from optid.models.text import polynomial, signed_sum, signed_terms
 TINY_SUM = 1e-6
 """Share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured."""
 
-TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins"}
-
 
 @dataclass(frozen=True, eq=False)
 class TransferFunction(Model):
@@ -39,11 +37,7 @@ class TransferFunction(Model):
         nonlinearities: one per input, their offsets None: the constants together are `offset`. See `f`.
         nk: delay in samples, one per input.
         offset: (l,) constant of the equation.
-        dt: sampling time.
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: one per input, "" where unknown.
-        output_units: one per output, "" where unknown.
+        dt, inputs, outputs, input_units, output_units: see `Model`.
         c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...; one output.
         d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; one output. None where D is A.
         gauge: how the scale between f and B is fixed: "norm", "gain", "b0" or "none"; see `regauge`.
@@ -70,17 +64,18 @@ class TransferFunction(Model):
     GAUGES = GAUGES
 
     def __post_init__(self) -> None:
+        a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))
         fields = {
-            "a": finite(self.a, "a"),
+            "a": a.reshape(0, offset.size, offset.size) if offset.size > 1 and not a.size else a,
             "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
             "nk": tuple(int(delay) for delay in self.nk),
-            "offset": np.atleast_1d(finite(self.offset, "offset")),
+            "offset": offset,
             "c": finite(self.c, "c"),
             "d": None if self.d is None else finite(self.d, "d"),
         }
-        if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], fields["a"]):
+        if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], a):
             fields["d"] = None
-        self._fix(fields, len(self.b), fields["offset"].size)
+        self._fix(fields, len(self.b), offset.size)
         self._check_plant()
         self._check_noise()
 
@@ -153,7 +148,7 @@ class TransferFunction(Model):
 
         The largest lag for ARX and ARMAX; none for output error and Box-Jenkins, whose initial state is estimated.
         """
-        return self.largest_lag if self.shares_poles else 0
+        return self.largest_lag if self.d is None else 0
 
     @property
     def layout(self) -> Layout:
@@ -180,16 +175,6 @@ class TransferFunction(Model):
         return "bj" if self.c.size or self.d.size else "oe"
 
     @property
-    def title(self) -> str:
-        """What kind of model this is, in words."""
-        return f"{self._family} {TITLES[self.structure]} model"
-
-    @property
-    def shares_poles(self) -> bool:
-        """Whether D is A: the noise enters the equation of the plant (ARX, ARMAX)."""
-        return self.d is None
-
-    @property
     def noise_denominator(self) -> Array:
         """Coefficients of D after the leading one: `d`, or `a` where D is A."""
         return self.a if self.d is None else self.d
@@ -202,16 +187,6 @@ class TransferFunction(Model):
             "arx": "", "armax": f"C = {c}, D = A", "bj": f"C = {c}, D = {d}",
             "oe": "e is added to the output: C = D = 1",
         }[self.structure]
-
-    @cached_property
-    def noise_poles(self) -> Any:
-        """Roots of D, complex, largest first."""
-        return self.poles if self.d is None else roots.largest_first(roots.roots_of(self.d))
-
-    @cached_property
-    def noise_zeros(self) -> Any:
-        """Roots of C, complex (nc,), largest first; all inside the unit circle."""
-        return roots.largest_first(roots.roots_of(self.c))
 
     def noise_impulse_response(self, n: int = 100) -> Array:
         """Return the response of C/D to a unit impulse of e, (n,); (n, l, l) for several outputs."""
@@ -407,40 +382,16 @@ class TransferFunction(Model):
     def __str__(self) -> str:
         """Return the equations, the poles and the noise model."""
         text = super().__str__()
-        apart = () if self.d is None else self.noise_poles
-        for name, found in (("zeros of the noise", self.noise_zeros), ("poles of the noise", apart)):
-            if len(found):
-                text += f"\n{name}: {roots.in_words(found)}"
+        for name, values in (("zeros", self.c), ("poles", self.d)):
+            if values is not None and values.size:
+                text += f"\n{name} of the noise: {roots.in_words(roots.largest_first(roots.roots_of(values)))}"
         return text
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe the model in JSON types."""
-        return super().to_dict() | {
-            "a": self.a.tolist(),
-            "b": [b.tolist() for b in self.b],
-            "nk": list(self.nk),
-            "offset": self.offset.tolist(),
-            "c": self.c.tolist(),
-            "d": None if self.d is None else self.d.tolist(),
-        }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
-        """Build the model that `to_dict` described; the errors are those of the parts.
-
-        Args:
-            content: what `to_dict` returned, or the content of a file with the plant apart, or without noise.
-            functions: those of a basis of UserFunctions, by name.
-        """
+        """Build the model that `to_dict` described, or a file says with the plant apart or without noise."""
         if content["kind"] == "HammersteinARX":
             content = {**content, "c": (), "d": None}
         elif "plant" in content:
             content = {**content["plant"], "c": content["c"], "d": content["d"]}
-        outputs = len(content["outputs"])
-        a = np.array(content["a"], dtype=float)
-        return cls(
-            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
-            b=tuple(np.array(b, dtype=float) for b in content["b"]),
-            nk=tuple(content["nk"]), offset=np.array(content["offset"], dtype=float), c=content["c"], d=content["d"],
-            **cls._shared_fields(content, functions),
-        )
+        return super().from_dict(content, functions)
