@@ -1,4 +1,8 @@
-"""Excitation signals: (N,) float64 records that stay within an amplitude range low to high.
+"""Excitation signals: (n,) float64 records that stay within an amplitude range.
+
+Each takes the number of samples n, the smallest and the largest value low and high, where it needs them the sampling
+time dt, which gives frequencies their unit, and the seed of what is random, besides the arguments that it describes. An
+argument out of its range raises a `StructureError` that names it.
 
 A static nonlinearity is identified only where the input goes: a binary signal cannot show it (it collapses to an affine
 function), and one sinusoid of a polynomial of degree p has p harmonics only. Signals of many levels are the safe choice
@@ -9,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.errors import StructureError
 
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
@@ -26,19 +31,12 @@ def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
 
     Args:
         n: samples, a multiple of `periods`.
-        low: smallest value.
-        high: largest value.
-        dt: sampling time; gives `band` and the argument of `spectrum` their unit.
         lines: harmonics of the period, 1 up to below half the samples of a period; all when not given.
         band: lowest and highest frequency (1/unit of dt), instead of lines.
         spectrum: relative amplitude of each line, or a function of the frequencies (k,); flat when not given.
         phases: "schroeder" or "random" (uniform, from the seed).
         periods: number of periods.
         crest_steps: rounds of crest factor reduction.
-        seed: seed of the random phases.
-
-    Raises:
-        StructureError: an argument out of its range, both lines and band, or no line in the band.
     """
     _check(n, low, high)
     size = _part(n, periods, "periods", "periods")
@@ -57,7 +55,8 @@ def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
         if np.max(np.abs(np.fft.irfft(better, size))) >= np.max(np.abs(period)):
             break
         coefficients = better
-    return np.tile(_stretched(np.fft.irfft(coefficients, size), low, high), periods)
+    period = np.fft.irfft(coefficients, size)
+    return np.tile(low + (high - low) * (period - period.min()) / np.ptp(period), periods)
 
 
 def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, dt: float = 1.0, phase: float = 0.0
@@ -67,15 +66,8 @@ def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, 
     Never a sufficient excitation by itself: a static polynomial of degree p turns it into p harmonics.
 
     Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
         frequency: 1/unit of dt, at most half the sampling rate.
-        dt: sampling time.
         phase: at the first sample, rad.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     _check(n, low, high)
     _check_rate(frequency, dt, "frequency")
@@ -95,15 +87,8 @@ def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: i
     hold * (2**bits - 1) samples. A binary input cannot identify a static nonlinearity, only linear dynamics.
 
     Args:
-        n: samples.
-        low: one value.
-        high: the other value.
         hold: samples for which each value is held.
         bits: length of the register, 2 to 32; the shortest that does not repeat within n when not given.
-        seed: seed of the initial state of the register.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import max_len_seq
 
@@ -124,16 +109,10 @@ def chirp(n: int, low: float = -1.0, high: float = 1.0, *, f0: float, f1: float,
 
     Args:
         n: samples, a multiple of `repeats`.
-        low: smallest value.
-        high: largest value.
         f0: frequency at the start of a sweep (1/unit of dt), positive for method "logarithmic".
         f1: frequency at its end, at most half the sampling rate.
-        dt: sampling time.
         method: "linear", "quadratic", "logarithmic" or "hyperbolic" (`scipy.signal.chirp`).
         repeats: number of sweeps.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import chirp as swept
 
@@ -154,17 +133,9 @@ def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: 
     The filter runs in before the record starts, so that the record is stationary.
 
     Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
         cutoff: edge of a low-pass, or the edges of a band-pass (1/unit of dt), below half the sampling rate.
-        dt: sampling time.
         order: order of the filter.
         clip: number of standard deviations that reach from the middle to low and to high.
-        seed: seed of the noise.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import butter, sosfilt
 
@@ -191,15 +162,8 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
     """Return independent uniform values, each held for some samples; with hold 1 uniform white noise.
 
     Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
         hold: samples for which each value is held.
         levels: number of equally spaced values to draw from; any value when not given.
-        seed: seed of the draws.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     _check(n, low, high)
     rng = np.random.default_rng(seed)
@@ -212,14 +176,8 @@ def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold
     """Return a staircase from low to high and back, again and again.
 
     Args:
-        n: samples.
-        low: lowest level.
-        high: highest level.
         levels: number of equally spaced levels, at least 2.
         hold: samples per step; one staircase up and down fills the record when not given.
-
-    Raises:
-        StructureError: an argument out of its range, or n too small for the staircase.
     """
     _check(n, low, high)
     up = _spaced(low, high, levels)
@@ -232,14 +190,9 @@ def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold
 
 
 def _check(n: int, low: float, high: float) -> None:
-    _check_count("n", n)
+    check_integer(n, "n")
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise StructureError(f"low = {low}, high = {high}: low must be below high.")
-
-
-def _check_count(name: str, value: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise StructureError(f"{name} = {value!r}: a positive number of samples is needed.")
 
 
 def _check_rate(frequency: float, dt: float, what: str) -> None:
@@ -260,18 +213,13 @@ def _filled(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def _held_draws(n: int, hold: int) -> int:
-    _check_count("hold", hold)
-    return -(-n // hold)
+    return -(-n // check_integer(hold, "hold"))
 
 
 def _spaced(low: float, high: float, levels: int) -> np.ndarray:
     if levels < 2:
         raise StructureError(f"levels = {levels}: at least 2 are needed.")
     return np.linspace(low, high, levels)
-
-
-def _stretched(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    return low + (high - low) * (x - x.min()) / (x.max() - x.min())
 
 
 def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None
