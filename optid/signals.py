@@ -1,8 +1,8 @@
 """Excitation signals: (n,) float64 records that stay within an amplitude range.
 
 Each takes the number of samples n, the smallest and the largest value low and high, where it needs them the sampling
-time dt, which gives frequencies their unit, and the seed of what is random, besides the arguments that it describes. An
-argument out of its range raises a `StructureError` that names it.
+time dt, which gives frequencies their unit, and the seed of what is random, besides the further arguments that it
+describes. An argument out of its range raises a `StructureError` that names it.
 
 A static nonlinearity is identified only where the input goes: a binary signal cannot show it (it collapses to an affine
 function), and one sinusoid of a polynomial of degree p has p harmonics only. Signals of many levels are the safe choice
@@ -29,7 +29,7 @@ def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
     lowers it further by clipping and restoring the amplitudes in turn (Van der Ouderaa, Schoukens, Renneboog, IEEE
     Trans. Instrum. Meas. 37, 1988). Stretching changes the amplitudes by one common factor and the mean.
 
-    Args:
+    Further arguments:
         n: samples, a multiple of `periods`.
         lines: harmonics of the period, 1 up to below half the samples of a period; all when not given.
         band: lowest and highest frequency (1/unit of dt), instead of lines.
@@ -65,7 +65,7 @@ def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, 
 
     Never a sufficient excitation by itself: a static polynomial of degree p turns it into p harmonics.
 
-    Args:
+    Further arguments:
         frequency: 1/unit of dt, at most half the sampling rate.
         phase: at the first sample, rad.
     """
@@ -86,7 +86,7 @@ def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: i
     The register (`scipy.signal.max_len_seq`; Golomb, Shift Register Sequences, 1967) repeats after
     hold * (2**bits - 1) samples. A binary input cannot identify a static nonlinearity, only linear dynamics.
 
-    Args:
+    Further arguments:
         hold: samples for which each value is held.
         bits: length of the register, 2 to 32; the shortest that does not repeat within n when not given.
     """
@@ -107,7 +107,7 @@ def chirp(n: int, low: float = -1.0, high: float = 1.0, *, f0: float, f1: float,
           method: str = "linear", repeats: int = 1) -> np.ndarray:
     """Return a sine whose frequency runs from f0 to f1, several times over.
 
-    Args:
+    Further arguments:
         n: samples, a multiple of `repeats`.
         f0: frequency at the start of a sweep (1/unit of dt), positive for method "logarithmic".
         f1: frequency at its end, at most half the sampling rate.
@@ -132,7 +132,7 @@ def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: 
 
     The filter runs in before the record starts, so that the record is stationary.
 
-    Args:
+    Further arguments:
         cutoff: edge of a low-pass, or the edges of a band-pass (1/unit of dt), below half the sampling rate.
         order: order of the filter.
         clip: number of standard deviations that reach from the middle to low and to high.
@@ -161,7 +161,7 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
                    seed: int = 0) -> np.ndarray:
     """Return independent uniform values, each held for some samples; with hold 1 uniform white noise.
 
-    Args:
+    Further arguments:
         hold: samples for which each value is held.
         levels: number of equally spaced values to draw from; any value when not given.
     """
@@ -175,7 +175,7 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
 def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold: int | None = None) -> np.ndarray:
     """Return a staircase from low to high and back, again and again.
 
-    Args:
+    Further arguments:
         levels: number of equally spaced levels, at least 2.
         hold: samples per step; one staircase up and down fills the record when not given.
     """
