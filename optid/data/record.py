@@ -1,6 +1,6 @@
 """Records of inputs and outputs: one or several experiments with names, units and a sampling time."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -55,12 +55,7 @@ class Data(Ports):
 
     Attributes:
         experiments: the records, each with read-only arrays u (N, m) and y (N, l).
-        dt: sampling time, in the user's unit of time (seconds where units matter).
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: their units, "" where unknown.
-        output_units: their units, "" where unknown.
-        name: name of the data set.
+        dt, inputs, outputs, input_units, output_units, name: as given, a name and a unit ("" where unknown) for each.
         transform: how to return to raw units; identity unless `detrend` or `scale` was used.
     """
 
@@ -90,7 +85,7 @@ class Data(Ports):
         Args:
             u: (N,) or (N, m), or a list of such arrays, one per experiment; NaN = missing.
             y: (N,) or (N, l), or a list of as many arrays; NaN = missing.
-            dt: sampling time, positive.
+            dt: sampling time, positive, in the user's unit of time (seconds where units matter).
             inputs: names of the inputs; u, or u1, u2, ... when not given.
             outputs: names of the outputs; y, or y1, y2, ... when not given.
             input_units: one unit per input.
@@ -132,9 +127,6 @@ class Data(Ports):
             name=str(name),
             transform=Transform.identity(m, l),
         )
-        self._check_present()
-
-    def _check_present(self) -> None:
         for channel, share in self.missing.items():
             if share == 1.0:
                 raise DataError(f"channel {channel!r}: every sample is missing. Check the column, or leave it out.")
@@ -236,9 +228,9 @@ class Data(Ports):
                 raise DataError(
                     f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
                 )
-        first = [self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts)]
-        second = [self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts)]
-        return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
+        first = tuple(self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts))
+        second = tuple(self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts))
+        return self._with(experiments=first), self._with(experiments=second)
 
     def window(self, first: int, last: int) -> "Data":
         """Return samples first to last - 1 of every experiment.
@@ -311,17 +303,7 @@ class Data(Ports):
 
     # -- changes of the samples --------------------------------------------------------------------------------------
 
-    def detrend(self, order: int = 0) -> "Data":
-        """Subtract the means (order 0), and a drift of the outputs too (order 1): `preprocessing.detrend`."""
-        return preprocessing.detrend(self, order)
-
-    def scale(self, factors: Mapping[str, float] | None = None) -> "Data":
-        """Divide by the standard deviations or by the factors given: `preprocessing.scale`."""
-        return preprocessing.scale(self, factors)
-
-    def decimate(self, q: int) -> "Data":
-        """Low-pass with zero phase and keep every q-th sample: `preprocessing.decimate`."""
-        return preprocessing.decimate(self, q)
+    detrend, scale, decimate = preprocessing.detrend, preprocessing.scale, preprocessing.decimate
 
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""

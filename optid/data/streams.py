@@ -14,8 +14,7 @@ from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_s
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
 from optid.data.reading.survey import Survey, joined, surveyed, widened
-from optid.data.reduction import fetched, reduced
-from optid.data.workers import available_threads
+from optid.data.reduction import available_threads, fetched, reduced
 from optid.errors import DataError
 
 CHUNK = 131072
@@ -32,12 +31,7 @@ class Stream(Ports):
     `DataError` that names the channel and the sample when its chunk is reached.
 
     Attributes:
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        dt: sampling time.
-        input_units: their units, "" where unknown.
-        output_units: their units, "" where unknown.
-        name: name of the data set.
+        dt, inputs, outputs, input_units, output_units, name: as of `Data`.
         n_samples: number of samples, None where only a pass can tell (CSV, Dask data frames).
         parts: what can be read apart, in order; empty where the record is one experiment that is read from its
             beginning to its end.
@@ -108,13 +102,7 @@ class Stream(Ports):
         merge: Callable[[Sequence[Result]], Result],
         threads: int = 1,
     ) -> Result:
-        """Reduce the parts to one result, each where it is read; see `optid.data.reduction.reduced`.
-
-        Args:
-            leaf: what is made of a part and the chunks that are read from it.
-            merge: what is made of results that are neighbours.
-            threads: threads that read parts on this machine.
-        """
+        """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
         return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
     @property
@@ -174,22 +162,15 @@ def open_stream(
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
 
-    Args:
+    Arguments as in `optid.data.readers.read`, besides:
         source: path of a .csv, .txt, .parquet or .npy file; {channel: path of an .npy file (N,)}; a folder whose
             .parquet files, in the order of their names (2 before 10), are one experiment; a Dask data frame, a Dask
             array (N, channels) or {channel: Dask array (N,)}; or a list of these, one per experiment. An npy file holds
             (N, channels) numbers; it is read, not mapped, because mapped pages count as resident memory.
-        inputs: columns by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
-        outputs: likewise; y, or y1, y2, ..., when not given.
         dt: sampling time; when not given from the first block or part with two time stamps, 1 without stamps.
         chunk: samples read at a time.
         time: column of time stamps, checked on every pass; a column t or time when not given; False ignores it.
         columns: names of the columns of an npy file, a Dask array, or a CSV file without a header.
-        input_units: one unit per input.
-        output_units: one unit per output.
-        name: name of the data set; the file's when not given.
-        delimiter: character between the cells of a CSV file.
-        decimal: decimal mark of a CSV file.
         time_tolerance: largest deviation of a time step from the first chunk's median step, relative to it.
         scheduler: address of a Dask scheduler ("tcp://host:8786"), or an open `distributed.Client`, whose workers read
             the parts of the record: row groups of Parquet files, whole files of another kind, partitions of Dask

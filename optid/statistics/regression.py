@@ -14,7 +14,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
-from optid.data.workers import available_threads, mapped
+from optid.data.reduction import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
