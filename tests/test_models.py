@@ -357,7 +357,7 @@ def test_orders_and_layout():
         ({"a": [np.inf]}, "not finite"),
         ({"dt": 0.0}, "positive"),
         ({"gauge": "unit"}, "gauge"),
-        ({"outputs": ("y", "z")}, "2 outputs"),
+        ({"outputs": ("y", "z")}, "2 names"),
         ({"nonlinearities": (replace(nonlinearity(Triangular(3)), offset=1.0),)}, "offset="),
     ],
 )

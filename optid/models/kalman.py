@@ -1,6 +1,5 @@
 """Covariances of the noises of a state-space model, and the steady Kalman gain that belongs to them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -75,16 +74,6 @@ class NoiseCovariances:
     def to_dict(self) -> dict[str, Any]:
         """Describe the matrices in JSON types."""
         return {name: getattr(self, name).tolist() for name in ("Q", "R", "S", "innovation")}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "NoiseCovariances":
-        """Build what `to_dict` described."""
-        outputs = np.array(content["R"], dtype=float)
-        n = len(content["Q"])
-        return cls(
-            np.array(content["Q"], dtype=float).reshape(n, n), outputs,
-            np.array(content["S"], dtype=float).reshape(n, len(outputs)), np.array(content["innovation"], dtype=float),
-        )
 
 
 def _check_positive(name: str, matrix: Array) -> None:

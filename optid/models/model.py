@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -49,6 +49,8 @@ class Model(Ports):
         gauge: how the scale between f and B is fixed; see `regauge`.
         poles: complex, largest first.
         memory: samples at the start of a record that cannot be predicted.
+        c0: offset of f where the data tell it from the constants of the equations, else None.
+        offset_note: why c0 is None; "" where it is known.
         structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
     """
 
@@ -63,8 +65,11 @@ class Model(Ports):
     __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
+    c0: Any
+    offset_note: Any
     equation: Callable[..., str]
     impulse_response: Callable[..., Array]
+    _static_gain: Callable[[Array], Array]
     _state_shape: Any
     _predicted: Callable[[Array, Array, int, Array, str], Array]
     _run: Callable[[str, Sequence[Record], Any], list[Array]]
@@ -89,6 +94,10 @@ class Model(Ports):
             fixed[f"{kind}_units"] = tuple(getattr(self, f"{kind}_units")) or ("",) * len(fixed[f"{kind}s"])
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
+        for kind, count in (("input", m), ("output", l)):
+            names, units = fixed[f"{kind}s"], fixed[f"{kind}_units"]
+            if len(names) != count or len(units) != count:
+                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise StructureError(f"dt = {self.dt!r}: a positive number.")
         if self.gauge not in self.GAUGES:
@@ -119,6 +128,27 @@ class Model(Ports):
     def step_response(self, n: int = 100) -> Array:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
         return np.cumsum(self.impulse_response(n), axis=0)
+
+    @property
+    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
+        """The nonlinearity of the input, with its offset where `c0` knows it; a tuple when there are several."""
+        functions = self.nonlinearities
+        return replace(functions[0], offset=self.c0) if len(functions) == 1 else functions
+
+    def static_gain(self, u0: ArrayLike) -> Any:
+        """Return the slope of the steady-state characteristic at u0, feedback included.
+
+        Args:
+            u0: operating point, a number or (m,).
+
+        Returns:
+            A number for one input and output, otherwise (l, m).
+
+        Raises:
+            StructureError: u0 of the wrong size, an integrator (a pole at 1), or no equilibrium found.
+        """
+        gain = self._static_gain(self._operating_point(u0))
+        return float(gain[0, 0]) if gain.size == 1 else gain
 
     def _operating_point(self, u0: ArrayLike) -> Array:
         """Read constant inputs (m,).
@@ -349,6 +379,17 @@ class Model(Ports):
     def save(self, path: str | Path) -> Path:
         """Write the model to a JSON file, from which `optid.load` restores it to the last bit."""
         return files.write(self.to_dict(), path, files.FORMAT, files.VERSION)
+
+
+def static_solution(matrix: Array, right: Array) -> Array:
+    """Solve the equations of a steady state.
+
+    Raises:
+        StructureError: they are singular.
+    """
+    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
+        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
 
 
 def _in_json(value: Any) -> Any:

@@ -1,6 +1,6 @@
 """The equations of a state-space model: matrices, poles, responses, forms that predict the same, content of files."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -17,13 +17,15 @@ from optid.models.balancing import balancing
 from optid.models.feedback_tables import Parts, tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, finite
+from optid.models.model import Model, finite, static_solution
 from optid.models.nonlinearity import Nonlinearity
 
-SHAPES = {
+MATRICES = {
     "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
 }
 """Shapes of the matrices: n states, l outputs, r functions of the inputs and s of the outputs."""
+
+COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 NEWTON_STEPS = 100
 RESTS = 1e-12
@@ -83,24 +85,21 @@ class StateSpace(Model):
     GAUGES = ("norm", "gain", "none")
     structure = "ss"
     memory = 0  # the initial state is estimated
+    c0 = None
+    offset_note = "The constants of f and g are part of the constants of the state and output equations."
 
     def __post_init__(self) -> None:
         fixed: dict[str, Any] = {name: finite(np.atleast_2d(getattr(self, name)), name) for name in ("A", "B", "C")}
         functions = tuple(self.nonlinearities) or (Nonlinearity(Linear(), np.ones(1)),) * fixed["B"].shape[1]
         fixed |= {"nonlinearities": functions, "feedback": tuple(self.feedback)}
-        shapes = self._shapes(len(fixed["A"]), len(fixed["C"]), len(functions), len(fixed["feedback"]))
+        shapes = _shapes(len(fixed["A"]), len(fixed["C"]), len(functions), len(fixed["feedback"]))
         for name in ("D", "E", "L", "K", "offset_x", "offset_y"):
             given = getattr(self, name)
             fixed[name] = finite(np.zeros(shapes[name]) if given is None else given, name)
         fixed["input_of"] = tuple(int(c) for c in self.input_of) or tuple(range(len(functions)))
         fixed["output_of"] = tuple(int(o) for o in self.output_of) or tuple(range(len(fixed["feedback"])))
-        self._fix(fixed, 1 + max(fixed["input_of"], default=-1), len(fixed["C"]))
+        self._fix(fixed, len(self.inputs) or 1 + max(fixed["input_of"], default=-1), len(fixed["C"]))
         self._check(shapes)
-
-    @staticmethod
-    def _shapes(n: int, l: int, r: int, s: int) -> dict[str, tuple[int, ...]]:  # noqa: E741 - the field's letters
-        sizes = {"n": n, "l": l, "r": r, "s": s}
-        return {name: tuple(sizes[letter] for letter in letters) for name, letters in SHAPES.items()}
 
     def _check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Refuse parts that do not agree, naming the part and the shape that is needed."""
@@ -110,8 +109,8 @@ class StateSpace(Model):
                 f"E has {n + outputs} rows for {n} states: its last {outputs} would carry g(y) to the output y of the "
                 "same sample, an algebraic loop. Delay the feedback by one sample: keep the first rows only."
             )
-        for name, shape in shapes.items():
-            found = getattr(self, name).shape
+        for name in MATRICES:
+            found, shape = getattr(self, name).shape, shapes[name]
             if found != shape:
                 raise StructureError(
                     f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs and "
@@ -126,12 +125,8 @@ class StateSpace(Model):
             for j, f in enumerate(functions):
                 if f.offset:
                     raise StructureError(f"{kind}[{j}] has an offset: the constants belong to offset_x and offset_y.")
-        for kind, count in (("inputs", self.m), ("outputs", outputs)):
-            names, units = getattr(self, kind), getattr(self, kind[:-1] + "_units")
-            if len(names) != count or len(units) != count:
-                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}.")
-        if self.noise is not None and self.noise.S.shape != (n, outputs):
-            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {(n, outputs)} is needed.")
+        if self.noise is not None and self.noise.S.shape != shapes["S"]:
+            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {shapes['S']} is needed.")
 
     @property
     def nx(self) -> int:
@@ -148,16 +143,6 @@ class StateSpace(Model):
         """Matrices and tables as the compiled recursions read them."""
         matrices = [np.array(part, order="C") for part in (self.A, self.C, self.E, self.L, self.K)]
         return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), tabulated(self.feedback)])
-
-    @property
-    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
-        """The nonlinearity of the input; a tuple when there are several."""
-        return self.nonlinearities[0] if len(self.nonlinearities) == 1 else self.nonlinearities
-
-    @property
-    def offset_note(self) -> str:
-        """Why the offsets of f and g are not identifiable."""
-        return "The constants of f and g are part of the constants of the state and output equations."
 
     def expanded(self, u: Array) -> Array:
         """Return the values of the r nonlinearities at the inputs u (N, m), (N, r)."""
@@ -213,30 +198,18 @@ class StateSpace(Model):
             if not np.all(np.isfinite(x)):
                 break
         if not self.feedback:
-            _solved(self._slope(np.zeros(self.l)), self.B)
+            static_solution(self._slope(np.zeros(self.l)), self.B)
         raise StructureError(
             f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there."
         )
 
-    def static_gain(self, u0: ArrayLike) -> Any:
-        """Return the slope of the steady-state characteristic at u0, feedback included.
-
-        Args:
-            u0: operating point, a number or (m,).
-
-        Returns:
-            A number for one input and output, otherwise (l, m).
-
-        Raises:
-            StructureError: as `equilibrium`.
-        """
-        _, y = self.equilibrium(u0)
-        points, slopes = self._operating_point(u0), np.zeros((len(self.nonlinearities), self.m))
+    def _static_gain(self, points: Array) -> Array:
+        _, y = self.equilibrium(points)
+        slopes = np.zeros((len(self.nonlinearities), self.m))
         for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
             slopes[j, c] = f.slope(points[c])
         driven = self.B + self._feedback_slope(y) @ self.D
-        gain = (self.D - self.C @ _solved(self._slope(y), driven)) @ slopes
-        return float(gain[0, 0]) if gain.size == 1 else gain
+        return (self.D - self.C @ static_solution(self._slope(y), driven)) @ slopes
 
     def _feedback_slope(self, y: Array) -> Array:
         """Derivative (n, l) of the next state with respect to the outputs."""
@@ -356,10 +329,13 @@ class StateSpace(Model):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
-        shapes = cls._shapes(*(len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback")))
-        parts = {name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()}
-        noise = None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"])
-        return super().from_dict({**content, **parts, "noise": noise}, functions)
+        shapes = _shapes(*(len(content[name]) for name in ("A", "outputs", "nonlinearities", "feedback")))
+
+        def read(part: Mapping[str, Any], names: Iterable[str]) -> dict[str, Array]:
+            return {name: np.array(part[name], dtype=float).reshape(shapes[name]) for name in names}
+
+        noise = content["noise"] and NoiseCovariances(**read(content["noise"], COVARIANCES))
+        return super().from_dict({**content, **read(content, MATRICES), "noise": noise}, functions)
 
 
 def _signs(response: Array) -> Array:
@@ -367,7 +343,6 @@ def _signs(response: Array) -> Array:
     return np.array([leading_sign(response[:, :, j].ravel(), 1e-6) for j in range(response.shape[2])])
 
 
-def _solved(matrix: Array, right: Array) -> Array:
-    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
-        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
-    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
+def _shapes(n: int, l: int, r: int, s: int) -> dict[str, tuple[int, ...]]:  # noqa: E741 - the field's letters
+    sizes = {"n": n, "l": l, "r": r, "s": s}
+    return {name: tuple(sizes[letter] for letter in letters) for name, letters in (MATRICES | COVARIANCES).items()}

@@ -14,7 +14,7 @@ from optid.errors import StructureError
 from optid.models import noise_filter, roots
 from optid.models.gauges import GAUGES, gauge_factor
 from optid.models.layout import Layout
-from optid.models.model import Model, finite
+from optid.models.model import Model, finite, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression
 from optid.models.text import polynomial, signed_sum, signed_terms
@@ -83,11 +83,9 @@ class TransferFunction(Model):
         l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
         if not m:
             raise StructureError("A model needs at least one input.")
-        if self.offset.ndim != 1 or len(self.outputs) != l or len(self.output_units) != l:
-            raise StructureError(
-                f"offset has shape {self.offset.shape} for {len(self.outputs)} outputs: one each is needed."
-            )
-        for name in ("nonlinearities", "nk", "inputs", "input_units"):
+        if self.offset.ndim != 1:
+            raise StructureError(f"offset has shape {self.offset.shape}; (l,) is needed.")
+        for name in ("nonlinearities", "nk"):
             if len(getattr(self, name)) != m:
                 raise StructureError(
                     f"{name} has {len(getattr(self, name))} entries; b has one array for each of {m} inputs."
@@ -205,13 +203,6 @@ class TransferFunction(Model):
     # -- plant ---------------------------------------------------------------------------------------------------
 
     @property
-    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
-        """The nonlinearity, with its offset where `c0` knows it; a tuple when there are several inputs."""
-        if self.m > 1:
-            return self.nonlinearities
-        return replace(self.nonlinearities[0], offset=self.c0)
-
-    @property
     def c0(self) -> float | None:
         """Offset of f, d / sum b; None where the data cannot tell it from the constant: see `offset_note`."""
         return None if self.offset_note else self._ratio[0]
@@ -249,26 +240,10 @@ class TransferFunction(Model):
             companion[: self.l] = -np.hstack(list(self.matrices))
         return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
 
-    def static_gain(self, u0: ArrayLike) -> Any:
-        """Return the slope of the steady-state characteristic at u0, A(1)^-1 sum_j b_j f'(u0).
-
-        Args:
-            u0: operating point, a number or (m,).
-
-        Returns:
-            A number for one input and output, otherwise (l, m).
-
-        Raises:
-            StructureError: u0 of the wrong size, or an integrator (a pole at 1), which has no static gain.
-        """
-        points = self._operating_point(u0)
-        at_one = np.eye(self.l) + self.matrices.sum(axis=0)
-        if np.linalg.svd(at_one, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(self.a).sum()):
-            raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+    def _static_gain(self, points: Array) -> Array:
         slopes = np.array([f.slope(u) for f, u in zip(self.nonlinearities, points)])
         sums = np.stack([np.atleast_1d(b.sum(axis=0)) for b in self.b], axis=1)
-        gain = np.linalg.solve(at_one, sums * slopes)
-        return float(gain[0, 0]) if gain.size == 1 else gain
+        return static_solution(np.eye(self.l) + self.matrices.sum(axis=0), sums * slopes)
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""

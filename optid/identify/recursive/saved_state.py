@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from optid.errors import ModelFileError, OptidError
-from optid.models.state_file import read_state, set_arrays, write_state
+from optid.models.files import read_state, set_arrays, write_state
 
 VERSION = 1  # version of the file
 
