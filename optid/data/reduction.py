@@ -12,8 +12,8 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import Any, TypeVar
 
+from optid.arrays import check_integer
 from optid.data.reading.parts import Part
-from optid.errors import StructureError
 
 One = TypeVar("One")
 Result = TypeVar("Result")
@@ -28,11 +28,9 @@ def available_threads(threads: int | None) -> int:
     Raises:
         StructureError: not a positive integer.
     """
-    if threads is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise StructureError(f"threads={threads!r}: a positive number of threads is needed, or None for every core.")
-    return threads
+    if threads is not None:
+        return check_integer(threads, "threads")
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def mapped(function: Callable[[One], Result], parts: Iterable[One], threads: int) -> Iterator[Result]:

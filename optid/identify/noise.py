@@ -109,7 +109,7 @@ def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
         StructureError: a pole on or outside the unit circle that the outputs do not see.
     """
     observer = _observer(model)
-    data, _ = between_gaps(data.without_transform(), 2 * model.nx + 1)
+    data = between_gaps(data.without_transform(), 2 * model.nx + 1)
     rest = residuals(replace(model, K=observer, noise=None), data)
     if not _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
         return Noise(observer, NoiseCovariances.of_innovations(observer, covariance_of(rest)))

@@ -48,9 +48,7 @@ def static_functions(model: Any) -> list[StaticFunction]:
 
     With one input and one function of it the word is "f"; several functions of one input are numbered.
     """
-    shown = tuple(model.nonlinearities)
-    if model.m == 1 and len(shown) == 1 and isinstance(getattr(model, "f", None), Nonlinearity):
-        shown = (model.f,)  # with its offset, where the model knows it
+    shown = model.f if isinstance(model.f, tuple) else (model.f,)  # with its offset, where the model knows it
     places = tuple(getattr(model, "input_of", range(model.m)))
     names = _words("f", places, model.inputs, alone=model.m == 1)
     found = [

@@ -205,20 +205,9 @@ class Model(Ports):
         return one_or_all(predicted)
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
-        """Predict one record in raw units; see `predict`.
+        """Predict (N, l) one record in raw units as `predict` does, from arrays u (N, m) and y (N, l), NaN = missing.
 
-        Args:
-            u: (N, m) inputs, NaN = missing.
-            y: (N, l) outputs, NaN = missing.
-            horizon: how many samples ahead, from 1.
-            x0: state at the first sample; None for that of the smallest one-step prediction errors.
-            label: words that name the experiment in a message.
-
-        Returns:
-            (N, l), NaN where there is no prediction.
-
-        Raises:
-            DataError: as `predict`.
+        x0 None is the state of the smallest one-step prediction errors; `label` names the experiment in a message.
         """
         known, prediction = np.isfinite(u).all(axis=1), np.full(y.shape, np.nan)
         for first, last in runs_of(known):

@@ -7,13 +7,13 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import solve_discrete_lyapunov
 
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
-from optid.models.balancing import balancing
 from optid.models.feedback_tables import Parts, tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
@@ -346,3 +346,28 @@ def _signs(response: Array) -> Array:
 def _shapes(n: int, l: int, r: int, s: int) -> dict[str, tuple[int, ...]]:  # noqa: E741 - the field's letters
     sizes = {"n": n, "l": l, "r": r, "s": s}
     return {name: tuple(sizes[letter] for letter in letters) for name, letters in (MATRICES | COVARIANCES).items()}
+
+
+def balancing(A: Array, B: Array, C: Array) -> Array:
+    """Return the change of states T (n, n) that makes both Gramians of (A, B, C) diagonal and equal.
+
+    Raises:
+        StructureError: A is unstable, or the triple is not minimal.
+    """
+    largest = roots.spectral_radius(A)
+    if largest >= 1:
+        raise StructureError(f"The model is unstable (largest pole {largest:.6g}): it has no Gramians.")
+    reach = _root(solve_discrete_lyapunov(A, B @ B.T))
+    see = _root(solve_discrete_lyapunov(A.T, C.T @ C))
+    left, values, right = np.linalg.svd(see.T @ reach)
+    if values[-1] <= 1e-13 * values[0]:
+        raise StructureError(
+            f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
+            "Identify it with fewer states."
+        )
+    return (left / np.sqrt(values)).T @ see.T
+
+
+def _root(gramian: Array) -> Array:
+    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))

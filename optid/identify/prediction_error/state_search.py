@@ -14,8 +14,8 @@ from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, NoiseCovariances
-from optid.models.balancing import balancing
 from optid.models.roots import spectral_radius
+from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
 
