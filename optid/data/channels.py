@@ -135,30 +135,29 @@ def numbered_names(letter: str, count: int) -> tuple[str, ...]:
     return (letter,) if count == 1 else tuple(f"{letter}{c + 1}" for c in range(count))
 
 
-def channel_names(given: str | Sequence[str] | None, letter: str, count: int, what: str) -> tuple[str, ...]:
-    """Return one name per channel, the default being the letter, numbered from 1 when there are several.
+def channel_fields(
+    m: int, l: int, inputs: Any, outputs: Any, input_units: Any, output_units: Any  # noqa: E741 - the field's letter
+) -> dict[str, tuple[str, ...]]:
+    """Return the names and units of m inputs and l outputs by the names of these arguments.
+
+    Names are "u" and "y" when not given, numbered from 1 when there are several; units are "".
 
     Raises:
-        DataError: wrong number of names, or an empty one; `what` names the argument.
+        DataError: wrong number of names or units, an empty name, or one name for two channels.
     """
-    names = listed(given)
-    if names is None:
-        return numbered_names(letter, count)
-    if len(names) != count or not all(isinstance(name, str) and name for name in names):
-        raise DataError(f"{what} {names}: one non-empty name for each of the {count} channels is needed.")
-    return tuple(names)
-
-
-def channel_units(given: str | Sequence[str] | None, count: int, what: str) -> tuple[str, ...]:
-    """Return one unit per channel, "" when not given.
-
-    Raises:
-        DataError: wrong number of units; `what` names the argument.
-    """
-    units = listed(given) or [""] * count
-    if len(units) != count:
-        raise DataError(f"{what} {units}: one unit for each of the {count} channels is needed.")
-    return tuple(str(unit) for unit in units)
+    found: dict[str, tuple[str, ...]] = {}
+    for kind, letter, count, given, units in (
+        ("input", "u", m, inputs, input_units), ("output", "y", l, outputs, output_units)
+    ):
+        names, units = listed(given), listed(units) or [""] * count
+        if names is not None and (len(names) != count or not all(isinstance(name, str) and name for name in names)):
+            raise DataError(f"{kind}s {names}: one non-empty name for each of the {count} channels is needed.")
+        if len(units) != count:
+            raise DataError(f"{kind}_units {units}: one unit for each of the {count} channels is needed.")
+        found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
+        found[f"{kind}_units"] = tuple(str(unit) for unit in units)
+    check_distinct(found["inputs"] + found["outputs"])
+    return found
 
 
 def check_distinct(names: Sequence[str]) -> None:

@@ -4,7 +4,7 @@ import json
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -56,10 +56,10 @@ def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[An
             raise ClusterError("an asynchronous Client cannot be waited for here: open Client(address).")
         if scheduler.status != "running":
             raise ClusterError(f"the Client is {scheduler.status}, not running: open it again.")
-        check_workers(scheduler, packages)
-        yield scheduler
-        return
-    with _opened(Client, scheduler) as client:
+        opened = nullcontext(scheduler)
+    else:
+        opened = _opened(Client, scheduler)
+    with opened as client:
         check_workers(client, packages)
         yield client
 
@@ -188,22 +188,15 @@ def result_of(client: Any, task: Any) -> Any:
     Raises:
         ClusterError: the workers that ran it died, or the scheduler went away.
     """
-    with lost_in_words():
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm.core import CommClosedError
+
+    try:
         future = client.compute(task)
         try:
             return future.result()
         finally:
             future.release()
-
-
-@contextmanager
-def lost_in_words() -> Iterator[None]:
-    """Turn what Dask raises when workers or the scheduler are gone into a `ClusterError`."""
-    from distributed import CancelledError, KilledWorker
-    from distributed.comm.core import CommClosedError
-
-    try:
-        yield
     except KilledWorker as error:
         count = error.allowed_failures + 1
         raise ClusterError(

@@ -9,16 +9,7 @@ import numpy as np
 
 from optid.arrays import as_samples, is_scalar_list
 from optid.data import preprocessing
-from optid.data.channels import (
-    Channel,
-    Ports,
-    Transform,
-    channel_names,
-    channel_units,
-    check_distinct,
-    listed,
-    sampling_time,
-)
+from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
 from optid.errors import DataError, nearest
 
 
@@ -114,18 +105,14 @@ class Data(Ports):
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
         m, l = us[0].shape[1], ys[0].shape[1]  # noqa: E741
-        input_names, output_names = channel_names(inputs, "u", m, "inputs"), channel_names(outputs, "y", l, "outputs")
-        check_distinct(input_names + output_names)
+        names = channel_fields(m, l, inputs, outputs, input_units, output_units)
         _filled(
             self,
             experiments=tuple(experiments),
             dt=sampling_time(dt),
-            inputs=input_names,
-            outputs=output_names,
-            input_units=channel_units(input_units, m, "input_units"),
-            output_units=channel_units(output_units, l, "output_units"),
             name=str(name),
             transform=Transform.identity(m, l),
+            **names,
         )
         for channel, share in self.missing.items():
             if share == 1.0:

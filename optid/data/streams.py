@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optid.data.channels import Ports, Transform, channel_names, channel_units, check_distinct, sampling_time
+from optid.data.channels import Ports, Transform, channel_fields, check_distinct, sampling_time
 from optid.data.reading.chunks import Channels, Chunk
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
@@ -123,8 +123,7 @@ class Stream(Ports):
         Raises:
             DataError: every sample of an input is missing.
         """
-        lo, hi = self._ranges
-        return lo.copy(), hi.copy()
+        return self._ranges[0].copy(), self._ranges[1].copy()
 
     @cached_property
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
@@ -208,11 +207,8 @@ def open_stream(
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        inputs=channel_names(list(ins), "u", len(ins), "inputs"),
-        outputs=channel_names(list(outs), "y", len(outs), "outputs"),
+        **channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units),
         dt=step,
-        input_units=channel_units(input_units, len(ins), "input_units"),
-        output_units=channel_units(output_units, len(outs), "output_units"),
         name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
         _channels=Channels(ins, outs, clock, step, time_tolerance),

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, check_integer
 from optid.bases import from_dict, parse
 from optid.bases.basis import Basis
-from optid.data.channels import channel_units, check_distinct, listed, sampling_time
+from optid.data.channels import channel_fields, listed, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
@@ -95,7 +95,7 @@ class RecursiveARX(SavedState):
         m = len(names_u)
         bases = tuple(parse(b) if isinstance(b, str) else b for b in _each(basis, m))
         self.layout = Layout(na, _each(nb, m), _each(nk, m), bases, tuple(names_y), tuple(names_u))
-        check_distinct(names_u + names_y)
+        names = channel_fields(m, len(names_y), names_u, names_y, input_units, output_units)
         for channel, one in zip(names_u, bases):
             if one.interval is None and type(one).__name__ != "Linear":
                 raise StructureError(
@@ -105,8 +105,7 @@ class RecursiveARX(SavedState):
             raise StructureError(f"forgetting={forgetting!r}: a factor above 0 and at most 1, such as 0.995.")
         self.forgetting = float(forgetting)
         self.dt = sampling_time(dt)
-        self.input_units = channel_units(input_units, m, "input_units")
-        self.output_units = channel_units(output_units, self.layout.l, "output_units")
+        self.input_units, self.output_units = names["input_units"], names["output_units"]
         self.samples = self.candidates = self.rows = 0
         self.root = prior_factor(theta0, P0, self.layout)
         self.restart()
