@@ -35,14 +35,7 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
 
 
 def write(content: dict[str, Any], path: str | Path, form: str, version: int) -> Path:
-    """Write JSON types to a file that says of what form and version it is, and is complete or not there.
-
-    Args:
-        content: what to write.
-        path: the file, replaced when it exists.
-        form: "optid " and what it is.
-        version: of that form.
-    """
+    """Write JSON types to a file that says of what form ("optid model") and version it is; it replaces an older one."""
     path = Path(path)
     text = json.dumps({"format": form, "version": version, **content}, indent=1, allow_nan=False)
     with complete(path) as part:
@@ -52,20 +45,14 @@ def write(content: dict[str, Any], path: str | Path, form: str, version: int) ->
 
 @contextmanager
 def complete(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which becomes the file at the end: an interrupted write must not leave half of it."""
+    """Give a path to write to, which becomes the file at the end: an interrupted write leaves no half of it."""
     part = path.with_name(path.name + ".part")
     yield part
     os.replace(part, path)
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file written by `write`.
-
-    Args:
-        path: the file.
-        form: what it has to be.
-        version: the version that is read.
-        build: makes the object of the content.
+    """Return what `build` makes of the content of a file that `write` wrote in this form and version.
 
     Raises:
         FileNotFoundError: no such file.
@@ -111,15 +98,7 @@ def from_content(content: dict[str, Any], functions: dict[str, Any] | None = Non
 
 
 def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Path:
-    """Write a state; the file appears complete or not at all.
-
-    Args:
-        path: the file, replaced when it exists.
-        kind: what runs, e.g. "tracker".
-        version: of the form of its file.
-        head: JSON types.
-        arrays: by name.
-    """
+    """Write the state of a `kind` of estimator: a head of JSON types, and arrays by name; it replaces an older file."""
     path = Path(path)
     content = json.dumps({"optid": kind, "version": version, **head})
     with complete(path) as part, part.open("wb") as file:

@@ -36,23 +36,10 @@ class HammersteinSS(StateSpace):
         return simulation.ahead(simulation.prepared(self, "predict", u, y, None, label), state, horizon)
 
     def simulate_measured_feedback(self, data: Data, x0: Any = "zero") -> Any:
-        """Simulate with the measured outputs in the feedback (P2), without correcting the state.
+        """Simulate with the measured outputs in the feedback (P2), without correcting the state; see `simulate`.
 
-        Where an output is missing the model's own output is fed back. Without feedback this is `simulate`.
-
-        Args:
-            data: the record; detrended or scaled data are taken back to raw units first.
-            x0: "zero", "fit" (least squares on the outputs present), or the state (n,), one for each experiment.
-
-        Returns:
-            (N, l) in raw units; a tuple of such arrays for several experiments.
-
-        Raises:
-            DataError: as `simulate`.
-            StructureError: an x0 that cannot be read, or inputs without outputs.
-
-        Warns:
-            DataWarning: the model is unstable.
+        Where an output is missing the model's own output is fed back. Inputs without outputs are refused
+        (`StructureError`).
         """
         return one_or_all(self._run("measured_feedback", records_of(self, data)[0], x0))
 

@@ -244,12 +244,7 @@ class Model(Ports):
         return one_or_all([y[:, 0] for y in outputs] if flat and self.l == 1 else outputs)
 
     def innovations(self, data: Data, x0: Any = "fit") -> Any:
-        """Return the one-step prediction errors (N, l), NaN where there is none; a tuple for several experiments.
-
-        Args:
-            data: as `predict`.
-            x0: as `predict`.
-        """
+        """Return the errors (N, l) of `predict` one step ahead, NaN where it has none; a tuple for several records."""
         predicted = self.predict(data, 1, x0)
         several = predicted if isinstance(predicted, tuple) else (predicted,)
         return one_or_all([e.y - p for e, p in zip(data.raw().experiments, several)])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.channels import Transform
 from optid.errors import StructureError
-from optid.models import noise_filter, roots
+from optid.models import roots
 from optid.models.gauges import GAUGES, gauge_factor
 from optid.models.layout import Layout
 from optid.models.model import Model, finite, static_solution
@@ -186,12 +186,6 @@ class TransferFunction(Model):
             "oe": "e is added to the output: C = D = 1",
         }[self.structure]
 
-    def noise_impulse_response(self, n: int = 100) -> Array:
-        """Return the response of C/D to a unit impulse of e, (n,); (n, l, l) for several outputs."""
-        if self.l > 1:
-            return self.inverse_impulse(n)
-        return noise_filter.impulse_response(self.c, self.noise_denominator, n)
-
     def noise_frequency_response(self, w: ArrayLike) -> Any:
         """Return C/D at the frequencies w (radians per unit of time), complex (len(w),), or (len(w), l, l)."""
         shift = self._shift(w)
@@ -275,9 +269,7 @@ class TransferFunction(Model):
 
     def _denominator(self, shift: Any) -> Any:
         """A(q), (len(shift), l, l)."""
-        return np.eye(self.l) + sum(
-            (shift**i)[:, None, None] * matrix for i, matrix in enumerate(self.matrices, start=1)
-        ) + np.zeros((shift.size, 1, 1))
+        return np.eye(self.l) + np.tensordot(shift[:, None] ** np.arange(1, self.na + 1), self.matrices, 1)
 
     # -- gauge and units -----------------------------------------------------------------------------------------
 
