@@ -93,7 +93,7 @@ def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: i
     from scipy.signal import max_len_seq
 
     _check(n, low, high)
-    draws = _held_draws(n, hold)
+    draws = -(-n // check_integer(hold, "hold"))
     bits = max(2, int(draws).bit_length()) if bits is None else bits
     if not 2 <= bits <= 32:
         raise StructureError(f"bits = {bits}: a register has 2 to 32 bits.")
@@ -167,7 +167,7 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
     """
     _check(n, low, high)
     rng = np.random.default_rng(seed)
-    draws = _held_draws(n, hold)
+    draws = -(-n // check_integer(hold, "hold"))
     values = rng.uniform(low, high, draws) if levels is None else rng.choice(_spaced(low, high, levels), draws)
     return np.repeat(values, hold)[:n]
 
@@ -182,7 +182,7 @@ def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold
     _check(n, low, high)
     up = _spaced(low, high, levels)
     if hold is not None:
-        return np.repeat(np.resize(np.concatenate([up, up[-2:0:-1]]), _held_draws(n, hold)), hold)[:n]
+        return np.repeat(np.resize(np.concatenate([up, up[-2:0:-1]]), -(-n // check_integer(hold, "hold"))), hold)[:n]
     stairs = np.concatenate([up, up[-2::-1]])
     if n < stairs.size:
         raise StructureError(f"n = {n} samples cannot hold {stairs.size} steps; use fewer levels.")
@@ -210,10 +210,6 @@ def _part(n: int, count: int, what: str, argument: str) -> int:
 def _filled(values: np.ndarray, low: float, high: float) -> np.ndarray:
     """Map [-1, 1] to [low, high]."""
     return (low + high) / 2 + (high - low) / 2 * values
-
-
-def _held_draws(n: int, hold: int) -> int:
-    return -(-n // check_integer(hold, "hold"))
 
 
 def _spaced(low: float, high: float, levels: int) -> np.ndarray:

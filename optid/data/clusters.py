@@ -165,21 +165,18 @@ def check_workers(client: Any, packages: Sequence[str]) -> None:
         if not there:
             address = client.scheduler.address
             raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
-        if not (refusal := _differences(here, there)):
+        other = next((worker for worker, versions in there.items() if versions != here), None)
+        if other is None:
             return
+        if isinstance(there[other], BaseException):
+            refusal = f"cannot say which versions it has: {type(there[other]).__name__}: {there[other]}"
+        else:
+            refusal = f"has other packages: {difference(here, there[other])}. Install the same versions there."
+            if len(there) > 1:
+                same = sum(versions == there[other] for versions in there.values())
+                refusal = f"({same} of {len(there)} workers) {refusal}"
+        refusal = f"worker {other} {refusal}"
     raise ClusterError(refusal)
-
-
-def _differences(here: Mapping[str, str], workers: Mapping[str, Any]) -> str:
-    """Return a sentence on the first worker that differs, "" where none does."""
-    for worker, there in workers.items():
-        if isinstance(there, BaseException):
-            return f"worker {worker} cannot say which versions it has: {type(there).__name__}: {there}"
-        if text := difference(here, there):
-            same = sum(other == there for other in workers.values())
-            others = f" ({same} of {len(workers)} workers)" if len(workers) > 1 else ""
-            return f"worker {worker}{others} has other packages: {text}. Install the same versions there."
-    return ""
 
 
 def result_of(client: Any, task: Any) -> Any:
