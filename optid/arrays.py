@@ -100,7 +100,7 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) 
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
         kind = "a positive integer" if low == 1 else f"an integer >= {low}"
         kind = kind if high is None else f"an integer from {low} to {high}"
-        raise StructureError(f"{name}={value!r} must be {kind}.")
+        raise StructureError(f"{name} must be {kind}; got {value!r}.")
     return int(value)
 
 

@@ -72,7 +72,7 @@ def test_response_knows_where_it_knows_nothing():
 
 
 @pytest.mark.parametrize("make, error, words", [
-    (lambda: frequency_response(PENDULUM, segment=4), StructureError, "segment=4 must be an integer >= 8"),
+    (lambda: frequency_response(PENDULUM, segment=4), StructureError, "segment must be an integer >= 8; got 4"),
     (lambda: frequency_response(PENDULUM.window(0, 40)), DataError, "1 complete segments of 32 samples"),
     (lambda: frequency_response(optid.Data(np.column_stack([PENDULUM.u, PENDULUM.u]), PENDULUM.y)), DataError,
      "cannot be told apart"),
@@ -225,7 +225,7 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
     (lambda: design(PENDULUM, "multisin"), StructureError, "Did you mean 'multisine'"),
     (lambda: design(PENDULUM, "levels", shaped=True), StructureError, "shaping"),
     (lambda: design(PENDULUM, "levels", band=(0, 1)), StructureError, "set hold"),
-    (lambda: design(PENDULUM, levels=1), StructureError, "levels=1 must be"),
+    (lambda: design(PENDULUM, levels=1), StructureError, "levels must be"),
     (lambda: design(PENDULUM, levels=4), StructureError, "breaks a rule of design.*takes 4 levels"),
     (lambda: design(PENDULUM, levels=2), StructureError, "is binary"),
     (lambda: design(PENDULUM, n=4000, periods=200), StructureError, "breaks a rule of design.*spectral lines"),
@@ -233,8 +233,8 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
     (lambda: design(PENDULUM, band=(0, 99)), StructureError, "half the sampling rate, 25"),
     (lambda: design(PENDULUM, amplitude=(1, 2, 3)), StructureError, "one such pair for each of the 1 inputs"),
     (lambda: design(PENDULUM, amplitude=(2, 1)), StructureError, "low must be below high"),
-    (lambda: design(PENDULUM, candidates=0), StructureError, "candidates=0 must be"),
-    (lambda: design(PENDULUM, rows=2.5), StructureError, "rows=2.5 must be"),
+    (lambda: design(PENDULUM, candidates=0), StructureError, "candidates must be"),
+    (lambda: design(PENDULUM, rows=2.5), StructureError, "rows must.*got 2.5"),
     (lambda: design(PENDULUM, n=0), StructureError, "n = 0"),
     (lambda: design(PENDULUM, n=8), DataError, "samples"),
     (lambda: design(PENDULUM, basis="polynom:4"), LookupFailed, "polynomial"),

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases.basis import Basis
 from optid.data.channels import Ports
 from optid.errors import StructureError
@@ -44,13 +44,10 @@ class Layout(Ports):
                 raise StructureError(
                     f"{name} has {len(entries)} entries for {self.m} inputs ({', '.join(self.inputs)}): give one each."
                 )
-        for name, value, smallest in [("na", self.na, 0)] + [
-            (f"{order} of input {channel!r}", value, smallest)
-            for order, values, smallest in (("nb", self.nb, 1), ("nk", self.nk, 0))
-            for channel, value in zip(self.inputs, values)
-        ]:
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
-                raise StructureError(f"{name} must be an integer >= {smallest}; got {value!r}.")
+        check_integer(self.na, "na", 0)
+        for channel, b, delay in zip(self.inputs, self.nb, self.nk):
+            check_integer(b, f"nb of input {channel!r}")
+            check_integer(delay, f"nk of input {channel!r}", 0)
 
     @cached_property
     def n_columns(self) -> int:
