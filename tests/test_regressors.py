@@ -170,7 +170,7 @@ def test_short_record_starts_no_thread(monkeypatch):
     def refuse(*_):
         raise AssertionError("a pool was started")
 
-    monkeypatch.setattr("optid.data.workers.ThreadPoolExecutor", refuse)
+    monkeypatch.setattr("optid.data.reduction.ThreadPoolExecutor", refuse)
     data = random_data(np.random.default_rng(20), [3000], 1, 1)
     layout = layout_of(data, (Triangular(3),), 1, [1], [0])
     collect(data, layout, threads=2)
