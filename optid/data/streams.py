@@ -127,10 +127,8 @@ class Stream(Ports):
 
     @cached_property
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        lo, hi = np.full(self.m, np.nan), np.full(self.m, np.nan)
-        if self.parts:
-            lo, hi = widened(lo, hi, np.array([self._survey.lo, self._survey.hi]))
-        for u, _ in () if self.parts else self:
+        lo = hi = np.full(self.m, np.nan)
+        for u in [np.array([self._survey.lo, self._survey.hi])] if self.parts else (u for u, _ in self):
             lo, hi = widened(lo, hi, u)
         for name, value in zip(self.inputs, lo):
             if np.isnan(value):

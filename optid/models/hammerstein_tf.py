@@ -4,7 +4,6 @@ The state x (n, l) is what the past adds to the right-hand side of the next n eq
 It shifts by one every sample and receives B_i f(u) - A_i y, so a free response is 1/A driven by the rows of x.
 """
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -111,7 +110,9 @@ class HammersteinTF(TransferFunction):
         if n == 0:
             return np.zeros((0, outputs))
         whitened = simulator == "predict" and self.d is not None
-        count = min(len(y), self._horizon(max(self.radius, roots.radius(self.c) if whitened else 0.0)))
+        radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
+        forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)
+        count = len(y) if radius >= 1 else min(len(y), forgotten)
         units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
         present = np.isfinite(rest)
         if not present.any():
@@ -126,12 +127,6 @@ class HammersteinTF(TransferFunction):
             errors = [noise_filter.innovations(s, None, self.c, self.noise_denominator).innovations for s in signals]
             rest, columns = errors[0][:, None], np.column_stack(errors[1:])[:, None]
         return scaled_least_squares(columns[present], rest[present]).reshape(n, outputs)
-
-    def _horizon(self, radius: float) -> int:
-        """Number of samples that inform about an initial state forgotten at a rate."""
-        if radius >= 1:
-            return sys.maxsize
-        return 10 * self.largest_lag + (0 if radius == 0 else int(2 * np.log(FORGOTTEN) / np.log(radius)))
 
     def state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Return the state (n, l) that follows the samples u (N, m) and y (N, l), N >= n, of the plant without noise.
