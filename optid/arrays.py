@@ -55,11 +55,7 @@ def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np
 
 
 def is_scalar_list(values: Any) -> bool:
-    """Tell one record written as a list of numbers from a list of records (one array per experiment).
-
-    Raises:
-        DataError: a nested list, which could mean either.
-    """
+    """Tell one record, a list of numbers, from a list of one array per experiment; refuse others (`DataError`)."""
     if not isinstance(values, list | tuple):
         return True
     kinds = {_kind(item) for item in values}
@@ -91,11 +87,7 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
 
 
 def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) -> int:
-    """Return an integer argument as an int.
-
-    Raises:
-        StructureError: no integer, or one outside the bounds.
-    """
+    """Return an integer argument as an int; refuse others and those outside the bounds (`StructureError`)."""
     top = value if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
         kind = "a positive integer" if low == 1 else f"an integer >= {low}"

@@ -161,22 +161,14 @@ def channel_fields(
 
 
 def check_distinct(names: Sequence[str]) -> None:
-    """Refuse two channels of one name.
-
-    Raises:
-        DataError: names the name.
-    """
+    """Refuse two channels of one name (`DataError`)."""
     for name in names:
         if names.count(name) > 1:
             raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
 
 
 def sampling_time(dt: Any) -> float:
-    """Return dt as a float.
-
-    Raises:
-        DataError: dt is not a positive number.
-    """
+    """Return dt as a float; refuse what is not a positive number (`DataError`)."""
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
         raise DataError(f"dt = {dt!r}: the sampling time is a positive number.")
     return float(dt)

@@ -154,11 +154,7 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
 
 
 def check_workers(client: Any, packages: Sequence[str]) -> None:
-    """Refuse workers that have other versions than this process.
-
-    Raises:
-        ClusterError: no worker, or the first one that differs, with the difference.
-    """
+    """Refuse no workers, and workers with other versions than this process (`ClusterError` with the difference)."""
     reader, refusal = _reader(packages), ""
     for _ in range(LOOKS):
         here, there = reader(), client.run(reader, on_error="return")

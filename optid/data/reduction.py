@@ -23,11 +23,7 @@ FAN_IN = 8
 
 
 def available_threads(threads: int | None) -> int:
-    """Return the number of threads asked for; None asks for one per core that this process may use.
-
-    Raises:
-        StructureError: not a positive integer.
-    """
+    """Return the number of threads asked for, a positive integer; None asks for one per core of this process."""
     if threads is not None:
         return check_integer(threads, "threads")
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

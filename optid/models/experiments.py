@@ -14,11 +14,7 @@ Record = tuple[Array, Array | None, str]
 
 
 def in_units_of(model: Any, data: Data) -> Data:
-    """Return the data in raw units, given that channels and sampling time are the model's.
-
-    Raises:
-        DataError: other channels or another sampling time than the model's.
-    """
+    """Return data in raw units; refuse channels or a sampling time other than the model's (`DataError`)."""
     for kind, given, wanted in (("inputs", data.inputs, model.inputs), ("outputs", data.outputs, model.outputs)):
         if len(given) != len(wanted) or (given != wanted and set(given) == set(wanted)):
             raise DataError(
@@ -52,11 +48,7 @@ def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
 
 
 def samples_of(values: ArrayLike, what: str, count: int) -> Array:
-    """Read samples (N, count), or (N,) for one channel.
-
-    Raises:
-        DataError: another number of channels.
-    """
+    """Read samples (N, count), or (N,) for one channel; refuse another number of channels (`DataError`)."""
     samples = as_samples(values, what)
     if samples.shape[1] != count:
         raise DataError(f"{what} has {samples.shape[1]} channels; the model has {count}.")
@@ -64,11 +56,7 @@ def samples_of(values: ArrayLike, what: str, count: int) -> Array:
 
 
 def check_inputs(model: Any, u: Array, label: str) -> None:
-    """Refuse missing and infinite inputs, beyond which no state is known.
-
-    Raises:
-        DataError: naming the input and the first such sample.
-    """
+    """Refuse missing and infinite inputs, beyond which no state is known (`DataError`)."""
     bad = ~np.isfinite(u)
     if bad.any():
         k, c = np.argwhere(bad)[0]

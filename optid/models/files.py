@@ -109,11 +109,7 @@ def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, An
 def read_state(
     path: str | Path, kind: str, version: int, names: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read what `write_state` wrote: the head, and the arrays of these names.
-
-    Raises:
-        ModelFileError: truncated, of another version, or the state of something else.
-    """
+    """Read the head, and the arrays of these names, that `write_state` wrote; refuse others (`ModelFileError`)."""
     path = Path(path)
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
@@ -128,11 +124,7 @@ def read_state(
 
 
 def set_arrays(state: Any, arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Give a fresh state the arrays of a file.
-
-    Raises:
-        ModelFileError: another type or shape than the fresh one's.
-    """
+    """Give a fresh state the arrays of a file; refuse other types and shapes than its own (`ModelFileError`)."""
     for name, array in arrays.items():
         wanted = getattr(state, name)
         if array.dtype != wanted.dtype or array.shape != wanted.shape:

@@ -67,11 +67,7 @@ class NoiseCovariances:
 
 
 def _check_positive(name: str, matrix: Array) -> None:
-    """Refuse a negative variance along any direction, rounding aside.
-
-    Raises:
-        StructureError: naming the matrix.
-    """
+    """Refuse a negative variance along any direction, rounding aside (`StructureError`)."""
     variances = np.diag(matrix)
     size = np.sqrt(np.where(variances > 0, variances, 1.0))
     if variances.size and np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < ROUNDING:

@@ -24,11 +24,7 @@ TITLES = {
 
 
 def finite(values: Any, name: str) -> Array:
-    """Copy coefficients into a read-only float64 array.
-
-    Raises:
-        StructureError: a value that is not finite.
-    """
+    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise StructureError(f"{name} contains a value that is not finite.")
@@ -78,11 +74,7 @@ class Model(Ports):
     _in_raw_units: Callable[[Transform], Self]
 
     def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
-        """Set the fields of a new model, with default names and units for m inputs and l outputs.
-
-        Raises:
-            StructureError: an impossible sampling time, an unknown gauge.
-        """
+        """Set the fields of a new model, with default names and units for m inputs and l outputs, and check them."""
         fixed = {
             **fields,
             "nonlinearities": tuple(fields.get("nonlinearities", self.nonlinearities)),
@@ -151,11 +143,7 @@ class Model(Ports):
         return float(gain[0, 0]) if gain.size == 1 else gain
 
     def _operating_point(self, u0: ArrayLike) -> Array:
-        """Read constant inputs (m,).
-
-        Raises:
-            StructureError: another number of them.
-        """
+        """Read constant inputs (m,); refuse another number of them (`StructureError`)."""
         points = np.atleast_1d(np.asarray(u0, dtype=float))
         if points.shape != (self.m,):
             raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
@@ -366,11 +354,7 @@ class Model(Ports):
 
 
 def static_solution(matrix: Array, right: Array) -> Array:
-    """Solve the equations of a steady state.
-
-    Raises:
-        StructureError: they are singular.
-    """
+    """Solve the equations of a steady state; refuse those of an integrator, which are singular (`StructureError`)."""
     if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
         raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
     return np.asarray(np.linalg.solve(matrix, right), dtype=float)
