@@ -156,15 +156,11 @@ def channel_fields(
             raise DataError(f"{kind}_units {units}: one unit for each of the {count} channels is needed.")
         found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
         found[f"{kind}_units"] = tuple(str(unit) for unit in units)
-    check_distinct(found["inputs"] + found["outputs"])
-    return found
-
-
-def check_distinct(names: Sequence[str]) -> None:
-    """Refuse two channels of one name (`DataError`)."""
-    for name in names:
-        if names.count(name) > 1:
+    everything = found["inputs"] + found["outputs"]
+    for name in everything:
+        if everything.count(name) > 1:
             raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
+    return found
 
 
 def sampling_time(dt: Any) -> float:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optid.data.channels import Ports, Transform, channel_fields, check_distinct, sampling_time
+from optid.data.channels import Ports, Transform, channel_fields, sampling_time
 from optid.data.reading.chunks import Channels, Chunk
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
@@ -186,6 +186,7 @@ def open_stream(
         raise DataError("the list of sources is empty; give at least one.")
     opened = [open_source(one, int(chunk), columns, delimiter, decimal) for one in several]
     ins, outs, clock = _chosen(opened, inputs, outputs, time)
+    names = channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units)
     dt = None if dt is None else sampling_time(dt)
     if scheduler is not None:
         from optid.data.clusters import connected
@@ -205,7 +206,7 @@ def open_stream(
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        **channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units),
+        **names,
         dt=step,
         name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
@@ -223,7 +224,6 @@ def _chosen(
     found = []
     for one in opened:
         ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
-        check_distinct((*ins, *outs))
         found.append((ins, outs, time_column(one.names, time, [*ins.values(), *outs.values()], one.label)))
         if found[-1] != found[0]:
             raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "
