@@ -18,9 +18,7 @@ from optid.models import export, files, roots
 from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
-TITLES = {
-    "oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space",
-}
+TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
 
 
 def finite(values: Any, name: str) -> Array:
@@ -75,21 +73,15 @@ class Model(Ports):
 
     def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
         """Set the fields of a new model, with default names and units for m inputs and l outputs, and check them."""
-        fixed = {
-            **fields,
-            "nonlinearities": tuple(fields.get("nonlinearities", self.nonlinearities)),
-            "dt": float(self.dt),
-            "inputs": tuple(self.inputs) or numbered_names("u", m),
-            "outputs": tuple(self.outputs) or numbered_names("y", l),
-        }
-        for kind in ("input", "output"):
-            fixed[f"{kind}_units"] = tuple(getattr(self, f"{kind}_units")) or ("",) * len(fixed[f"{kind}s"])
-        for name, value in fixed.items():
-            object.__setattr__(self, name, value)
-        for kind, count in (("input", m), ("output", l)):
-            names, units = fixed[f"{kind}s"], fixed[f"{kind}_units"]
+        fixed = {**fields, "nonlinearities": tuple(fields["nonlinearities"]), "dt": float(self.dt)}
+        for kind, letter, count in (("input", "u", m), ("output", "y", l)):
+            names = tuple(getattr(self, f"{kind}s")) or numbered_names(letter, count)
+            units = tuple(getattr(self, f"{kind}_units")) or ("",) * len(names)
             if len(names) != count or len(units) != count:
                 raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
+            fixed |= {f"{kind}s": names, f"{kind}_units": units}
+        for name, value in fixed.items():
+            object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise StructureError(f"dt = {self.dt!r}: a positive number.")
         if self.gauge not in self.GAUGES:

@@ -68,6 +68,7 @@ class TransferFunction(Model):
         fields = {
             "a": a.reshape(0, offset.size, offset.size) if offset.size > 1 and not a.size else a,
             "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
+            "nonlinearities": self.nonlinearities,
             "nk": tuple(int(delay) for delay in self.nk),
             "offset": offset,
             "c": finite(self.c, "c"),
