@@ -97,19 +97,10 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) 
 
 
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
-    """Refuse integers that float64 cannot hold; warn about signs of saturation and of wrap-around.
+    """Refuse integers (N, channels) beyond 2**53, which float64 cannot hold; see `check_finite`.
 
-    Args:
-        array: (N, channels) of an integer type.
-        labels: one text per channel for the message.
-        first: index of the first sample in the whole record, for chunked sources.
-        limits: look for saturation and wrap-around too.
-
-    Raises:
-        DataError: a magnitude above 2**53, named by channel and sample.
-
-    Warns:
-        DataWarning: samples at the limits of the type, or steps above three quarters of its range.
+    With `limits` samples at the limits of the type, and steps above three quarters of its range, are warned about
+    (`DataWarning`): signs of saturation and of wrap-around.
     """
     info = np.iinfo(array.dtype)
     for column, label in zip(array.T, labels):

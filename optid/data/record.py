@@ -303,12 +303,9 @@ class Data(Ports):
         return self._with(transform=Transform.identity(self.m, self.l))
 
     def mapped(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
-        """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y).
+        """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y), and other fields by `changes`.
 
-        Args:
-            of_u: function from (N, m) to (n, m); must not change its argument.
-            of_y: function from (N, l) to (n, l); must not change its argument.
-            changes: further fields to replace, such as dt or transform.
+        The functions must not change their arguments.
         """
         experiments = tuple(Experiment(_frozen(of_u(e.u)), _frozen(of_y(e.y)), e.start) for e in self.experiments)
         return self._with(experiments=experiments, **changes)

@@ -27,14 +27,9 @@ def in_units_of(model: Any, data: Data) -> Data:
 
 
 def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
-    """Return the record of every experiment, and whether the inputs were one-dimensional.
+    """Return the record of every experiment, and whether the inputs were one-dimensional; errors as `in_units_of`.
 
-    Args:
-        model: the model.
-        data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
-
-    Raises:
-        DataError: other channels or another sampling time than the model's.
+    The data are Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
     """
     if isinstance(data, Data):
         raw, many = in_units_of(model, data), data.n_experiments > 1

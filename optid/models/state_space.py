@@ -225,14 +225,7 @@ class StateSpace(Model):
     # -- forms that predict the same -----------------------------------------------------------------------------
 
     def transformed(self, T: ArrayLike) -> Self:
-        """Return the model in the states T x; predictions do not change.
-
-        Args:
-            T: (n, n), invertible.
-
-        Raises:
-            StructureError: T of another shape, or singular.
-        """
+        """Return the model in the states T x; predictions do not change. T (n, n) must be invertible."""
         turn, n = np.atleast_2d(np.asarray(T, dtype=float)), self.nx
         turn = turn.reshape(0, 0) if n == 0 and turn.size == 0 else turn
         if turn.shape != (n, n) or not np.all(np.isfinite(turn)):
@@ -255,14 +248,8 @@ class StateSpace(Model):
     def injected(self, gain: ArrayLike) -> Self:
         """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
 
-        P1 and P3 do not change; P2 does, since it feeds back the measured output. With gain = -L the injection is
-        absorbed into A.
-
-        Args:
-            gain: (n, l).
-
-        Raises:
-            StructureError: a gain of another shape.
+        P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
+        injection is absorbed into A.
         """
         moved = np.asarray(gain, dtype=float)
         if moved.shape != self.L.shape:
