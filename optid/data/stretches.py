@@ -50,17 +50,7 @@ def between_gaps(data: Data, shortest: int) -> Data:
 
 
 def with_whole_inputs(data: Data, shortest: int) -> Data:
-    """Return a record in which no input is missing: the stretches between the gaps as experiments of their own.
-
-    A record without such a gap is returned as it is; otherwise a `DataWarning` says what remains.
-
-    Args:
-        data: the record.
-        shortest: as in `between_gaps`.
-
-    Raises:
-        DataError: no stretch is long enough.
-    """
+    """Return a record in which no input is missing: as it is, or cut by `between_gaps`, which a `DataWarning` tells."""
     gaps = [~np.isfinite(e.u) for e in data.experiments]
     lost = np.sum([gap.sum(axis=0) for gap in gaps], axis=0)
     if not lost.any():
