@@ -11,8 +11,6 @@ from urllib.parse import urlsplit
 
 from optid.errors import ClusterError
 
-DISTRIBUTED = 'pip install "optid[distributed]"'
-
 REACH = 3.0
 """Seconds to reach the machine of a scheduler."""
 
@@ -50,7 +48,7 @@ def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[An
     try:
         from distributed import Client
     except ImportError:
-        raise ClusterError(f"a scheduler needs dask and distributed: {DISTRIBUTED}") from None
+        raise ClusterError('a scheduler needs dask and distributed: pip install "optid[distributed]"') from None
     if isinstance(scheduler, Client):
         if scheduler.asynchronous:
             raise ClusterError("an asynchronous Client cannot be waited for here: open Client(address).")

@@ -18,15 +18,8 @@ from optid.models.state_space import StateSpace
 class HammersteinSS(StateSpace):
     """A state-space model that predicts and simulates records; its arguments are those of `StateSpace`."""
 
-    def equation(self, digits: int = 4) -> str:
-        """Write the model as equations: one per state up to four states, in matrices with the poles beyond."""
-        return text.state_equations(self, digits)
-
-    def coefficients(self) -> list[tuple[str, float]]:
-        """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
-        return text.matrix_entries(self)
-
     SIMULATORS = simulation.SIMULATORS
+    equation, coefficients = text.state_equations, text.matrix_entries
 
     @property
     def _state_shape(self) -> tuple[int]:

@@ -160,9 +160,7 @@ class HammersteinTF(TransferFunction):
                 state[:lag] += np.outer(f[n - lag :], row)
         return state
 
-    def to_dlti(self, output: int | str = 0, input: int | str = 0) -> Any:
-        """Return the linear part of the plant from one f to one output as a `scipy.signal.dlti`."""
-        return export.to_dlti(self, output, input)
+    to_dlti = export.to_dlti
 
 
 KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

@@ -315,13 +315,7 @@ class Model(Ports):
 
     # -- other tools and files -----------------------------------------------------------------------------------
 
-    def to_control(self) -> Any:
-        """Return the linear part as a python-control system; see `optid.models.export.to_control`."""
-        return export.to_control(self)
-
-    def to_casadi(self) -> Any:
-        """Return the free run without noise as a `casadi.Function`; see `optid.models.export.to_casadi`."""
-        return export.to_casadi(self)
+    to_control, to_casadi = export.to_control, export.to_casadi
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""

@@ -32,12 +32,12 @@ def polynomial(coefficients: Iterable[float], digits: int = 4) -> str:
 
 
 def state_equations(model: Any, digits: int = 4) -> str:
-    """Write the equations with coefficients of so many significant digits; see `HammersteinSS.equation`."""
+    """Write a state-space model as equations: one per state up to four states, in matrices beyond."""
     return _equations(model, digits) if model.nx <= READABLE else _summary(model)
 
 
 def matrix_entries(model: Any) -> list[tuple[str, float]]:
-    """Names and values of all matrices, one line each; see `HammersteinSS.coefficients`."""
+    """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
     functions, fed = _names(model)
     states = [f"x{i + 1}" for i in range(model.nx)]
     columns = {
