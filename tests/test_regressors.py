@@ -13,7 +13,8 @@ from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangul
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.statistics import Layout, accumulate, collect, factorise, residuals
-from optid.statistics.sums import Sums, make_block, stretches
+from optid.statistics.blocks import Frame, make_block, stretches
+from optid.statistics.sums import Sums
 
 BASES = (Triangular(1), Triangular(5), Triangular(3, outside="extrapolate"), Trigonometric(3), Polynomial(3),
          BSpline(4), PiecewiseConstant(3), Linear())
@@ -195,7 +196,7 @@ def test_both_ways_of_summing_agree(bases):
     data = random_data(np.random.default_rng(1), [300], len(bases), 2, share=0.05)
     layout = layout_of(data, bases, 2, [3] * len(bases), [1] * len(bases))
     (experiment,) = data.experiments
-    both = [Sums(layout, direct) for direct in (False, True)]
+    both = [Sums(Frame.of(layout), direct) for direct in (False, True)]
     for sums in both:
         sums._direct_is_cheaper = sums._is_small = lambda *_: False
         for u, y in stretches([(experiment.u, experiment.y)], layout.first_row, 100):

@@ -18,8 +18,8 @@ from optid.arrays import Array
 from optid.data.reading.chunks import Chunk
 from optid.data.reading.parts import Part
 from optid.models.layout import Layout
-from optid.statistics.blocks import Stretch, blocks_of, check_channels, length_of_stretches, too_short
-from optid.statistics.sums import Total, make_block, stretches
+from optid.statistics.blocks import blocks_of, check_lengths, cut, make_block
+from optid.statistics.sums import Total
 
 Ends = tuple[Array, Array]
 
@@ -57,10 +57,7 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
     Raises:
         RankError: an experiment shorter than the lags.
     """
-    check_channels(stream, layout)
-    for i, count in enumerate(stream.lengths):
-        if count <= layout.first_row:
-            raise too_short(f"experiment {i + 1}: " if len(stream.lengths) > 1 else "", count, layout)
+    check_lengths(stream.lengths, layout)
     return stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, layout, start), threads).total
 
 
@@ -75,9 +72,9 @@ def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: Part, 
             head, tail = _first(head, (u, y), reach), _last(tail, (u, y), reach)
             yield u, y
 
-    total, length = start(), length_of_stretches(layout, chunk)
-    for i, arrays in enumerate(stretches(watched(), reach, length)):
-        for block in blocks_of(Stretch(arrays, f"{part.label}, ", i * length), layout, chunk):
+    total = start()
+    for stretch in cut(watched(), f"{part.label}, ", layout, chunk):
+        for block in blocks_of(stretch, layout, chunk):
             total.add(block)
     return Run(total, part.experiment, part.experiment, head, tail)
 

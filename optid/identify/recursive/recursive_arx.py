@@ -30,9 +30,8 @@ from optid.models import HammersteinARX
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
-from optid.statistics.blocks import check_inside
+from optid.statistics.blocks import check_inside, used_rows
 from optid.statistics.factors import dependent_column
-from optid.statistics.sums import rows_present
 from optid.structures.whitening import invert_triangular
 
 CHUNK = 4096  # samples whose basis functions are evaluated at a time
@@ -202,7 +201,7 @@ class RecursiveARX(SavedState):
             part = slice(start, start + CHUNK)
             past_u, past_y = np.concatenate([self.past_u, u[part]]), np.concatenate([self.past_y, y[part]])
             count, marked = len(past_y) - reach, int(marks[part].sum())
-            used = rows_present(past_u, past_y, layout) & (weights[part] > 0)
+            used = used_rows(past_u, past_y, layout) & (weights[part] > 0)
             signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
             self.rows = recursion_kernel.absorb(
                 self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
