@@ -26,6 +26,9 @@ WIDE = 128
 SMALL = 3e7
 """Products in a sum of dense rows up to which loading compiled loops (half a second) does not pay."""
 
+TINY = 5e6
+"""Products in a sum of dense rows up to which nothing is faster."""
+
 SAFE = 1e3
 """Energy subtracted from a column over energy left: beyond it more than three digits would be lost."""
 
@@ -137,8 +140,9 @@ class Sums(Total):
         """Add the valid rows of a block."""
         super().add(block)
         used = np.flatnonzero(block.valid)
-        small = self._is_small(used.size) and any(group.local for group in block.groups)
-        if block.weights is not None or self.direct or small or self._direct_is_cheaper(block, used.size):
+        small = SMALL if any(group.local for group in block.groups) else TINY
+        if (block.weights is not None or self.direct or self._is_small(used.size, small)
+                or self._direct_is_cheaper(block, used.size)):
             self._add_rows(block, used, np.ones(used.size) if block.weights is None else block.weights[used])
         else:
             self._add_by_difference(block)
@@ -182,8 +186,8 @@ class Sums(Total):
         np.fill_diagonal(symmetric, np.diag(gram))
         return symmetric
 
-    def _is_small(self, rows: int) -> bool:
-        return rows * self.frame.n**2 <= SMALL
+    def _is_small(self, rows: int, products: float) -> bool:
+        return rows * self.frame.n**2 <= products
 
     def _direct_is_cheaper(self, block: Block, used: int) -> bool:
         widths = [group.weights.shape[1] for group in block.groups]
@@ -204,7 +208,7 @@ class Sums(Total):
     def _add_rows(self, block: Block, rows: NDArray[np.intp], scale: Array) -> None:
         n = self.frame.n
         entries = 1 + sum(group.weights.shape[1] * len(lags) for group, lags in zip(block.groups, self.frame.lags))
-        sparse = 3 * entries**2 < n**2 and not self._is_small(rows.size)
+        sparse = 3 * entries**2 < n**2 and not self._is_small(rows.size, SMALL)
         for start in range(0, rows.size, FORMED):
             part, weights = rows[start : start + FORMED], scale[start : start + FORMED]
             if sparse:

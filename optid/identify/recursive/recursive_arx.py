@@ -23,7 +23,7 @@ from optid.data.channels import channel_units, check_distinct, listed, sampling_
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, past_coefficients, theta_matrices
+from optid.identify.recursive.estimates import Trace, past_coefficients, theta_matrices
 from optid.identify.recursive.intake import as_block, prior_factor, row_weights
 from optid.identify.recursive.saved_state import SavedState
 from optid.models import HammersteinARX
@@ -32,6 +32,7 @@ from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
 from optid.statistics.blocks import check_inside, used_rows
 from optid.statistics.factors import dependent_column
+from optid.structures.lifted_regression import leading_pairs, lifted_problem, positions
 from optid.structures.whitening import invert_triangular
 
 CHUNK = 4096  # samples whose basis functions are evaluated at a time
@@ -279,8 +280,8 @@ class RecursiveARX(SavedState):
         if split not in SPLITS:
             raise StructureError(f"split={split!r}: use one of {', '.join(map(repr, SPLITS))}.")
         layout, theta = self.layout, self.theta
-        grams = block_grams(self.root, layout) if split == "whitened" else [None] * layout.m
-        pairs = [leading_pair(matrix, gram, b, layout.l) for matrix, gram, b in zip(self.matrices, grams, layout.nb)]
+        core = lifted_problem(self.statistics, positions(layout)).core
+        pairs = leading_pairs(core, theta_matrices(theta, layout), split == "whitened")
         return HammersteinARX(
             a=past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
