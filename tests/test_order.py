@@ -248,8 +248,8 @@ def test_lags_equal_dense_least_squares():
 def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     u = inputs(model, 400)
     data = Data(u, by_hand(model, u, noise=0.1 * np.random.default_rng(5).normal(size=(400, model.l))), dt=model.dt)
-    statistics, columns = collect(data, model.layout), lifted_regression.positions(model.layout)
-    problem = lifted_regression.lifted_problem(statistics, columns, weights=residual_weights(statistics))
+    statistics, places = collect(data, model.layout), lifted_regression.positions(model.layout)
+    problem = lifted_regression.lifted_problem(statistics, places, weights=residual_weights(statistics))
     n = model.memory
     columns = [-data.y[n - i : -i] for i in range(1, model.na + 1)]
     for c, f in enumerate(model.nonlinearities):
@@ -260,7 +260,7 @@ def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     residual = data.y[n:] - phi @ theta
     free = np.linalg.solve(problem.root, problem.target)
     linear = [*range(model.na * model.l), -1]
-    assert free[columns][linear] == pytest.approx(theta[linear], abs=1e-8)
+    assert free[places][linear] == pytest.approx(theta[linear], abs=1e-8)
     assert problem.remainder == pytest.approx(np.sum(residual**2 / (1.0 if model.l == 1 else np.mean(residual**2, 0))))
 
 
