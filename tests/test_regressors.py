@@ -179,18 +179,6 @@ def test_short_record_starts_no_thread(monkeypatch):
         collect(data, layout, chunk=100, threads=2)
 
 
-@pytest.mark.parametrize("outside", ["clamp", "extrapolate"])
-def test_compiled_hats_equal_the_others(outside):
-    u = np.random.default_rng(21).uniform(-1.3, 1.3, 20_000)
-    u[::7], u[:8] = np.nan, (-1, 1, 0, 0.25, np.nextafter(1, 0), np.nextafter(-1, 0), 1e30, -50)
-    basis = Triangular(8, outside=outside).fitted(-1, 1)
-    first, weights = basis.local(u)
-    pieces = [basis.local(piece) for piece in np.split(u, 20)]
-    assert first.dtype == pieces[0][0].dtype
-    np.testing.assert_array_equal(first, np.concatenate([piece[0] for piece in pieces]))
-    np.testing.assert_allclose(weights, np.concatenate([piece[1] for piece in pieces]), rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize("bases", [(Triangular(4),), (Polynomial(3),), (Triangular(4), Trigonometric(2))])
 def test_both_ways_of_summing_agree(bases):
     data = random_data(np.random.default_rng(1), [300], len(bases), 2, share=0.05)

@@ -21,7 +21,7 @@ class Basis:
     """A family of P functions eta(u) without the constant, on an interval of the input.
 
     A frozen dataclass that inherits from it has the fields `interval` and `outside`, and supplies `full_size`,
-    `_evaluate`, `_derivative` and `_quadrature`, and better shape matrices where it has them.
+    `_derivative`, `_quadrature` and, where functions vanish, `_evaluate`, and better shape matrices where it has them.
 
     Attributes:
         interval: (lower, upper) in units of the input; None until `fitted`.
@@ -196,28 +196,24 @@ class Basis:
 
     def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
         """Evaluate the complete family as `local` does, at finite x to which the rule for outside was applied."""
-        raise NotImplementedError
+        return np.zeros(x.size, np.int32), self._derivative(x, 0)
 
     def _derivative(self, x: Array, order: int) -> Array:
-        """Evaluate the derivatives of eta of order 1 or 2 at finite x, (N, P)."""
+        """Evaluate the derivatives of eta of order 1, 2 (and 0, where no function vanishes) at finite x, (N, P)."""
         raise NotImplementedError
 
     def _quadrature(self) -> tuple[Array, int]:
         """Ends (c + 1,) of the cells, and Gauss-Legendre points in each, by which `penalty` integrates."""
         raise NotImplementedError
 
-    def _clipped(self, u: Array) -> Array:
-        """Apply the rule for values outside the interval; NaN stays NaN."""
+    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """Apply the rule for outside, put the lower end (or 0) where a sample is missing, and mark those, if any."""
         if self.outside == "error" and (out := self.is_outside(u)).any():
             k, (lo, hi) = int(np.argmax(out)), span(self)
             raise DataError(f"Sample {k} of the input is {u[k]:g}, outside the interval [{lo:g}, {hi:g}] of the basis "
                             f"({int(out.sum())} such samples). Use data inside it, or outside='clamp' or "
                             "'extrapolate'.")
-        return u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
-
-    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
-        """Clip u, put the lower end (or 0) where a sample is missing, and mark them (None: no sample is missing)."""
-        x = self._clipped(u)
+        x = u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
         missing = np.isnan(x)
         if not missing.any():
             return x, None
