@@ -89,8 +89,8 @@ class Signals:
         """Return the sum over time, (size,)."""
         if not self.local:
             return np.ones(len(self.weights)) @ self.weights
-        return sum((np.bincount(self.first + i, weights, self.size) for i, weights in enumerate(self.weights.T)),
-                   np.zeros(self.size))
+        parts = [np.bincount(self.first + i, weights, self.size) for i, weights in enumerate(self.weights.T)]
+        return np.sum(parts, axis=0)
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Block:
 
     def sparse_rows(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.int32], Array]:
         """List the entries of some rows that may differ from zero: columns (K, z), increasing, and values."""
-        found = [(np.full((rows.size, 1), self.frame.constant, dtype=np.int32), np.ones((rows.size, 1)))]
+        found: list[Any] = [(np.full((rows.size, 1), self.frame.constant, dtype=np.int32), np.ones((rows.size, 1)))]
         for group, where, at in self.entries(rows):
             width = np.arange(group.weights.shape[1], dtype=np.int32)
             found.append((where[0] + group.first[at, None] + width, group.weights[at]))
@@ -177,7 +177,8 @@ def rows_present(missing: Sequence[NDArray[np.bool_]], lags: Sequence[range], re
 
 def used_rows(u: Array, y: Array, layout: Layout) -> NDArray[np.bool_]:
     """Mark the rows (R,) of a layout in which every sample of u (reach + R, m) and y (reach + R, l) is present."""
-    return rows_present([np.isnan(y).any(axis=1), *np.isnan(u).T], layout.group_lags, layout.first_row)
+    missing = [np.logical_or.reduce(np.isnan(y), axis=1), *np.isnan(u).T]
+    return rows_present(missing, layout.group_lags, layout.first_row)
 
 
 def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Block:
@@ -190,7 +191,8 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     groups = [Signals.dense(outputs)]
     for c, basis in enumerate(layout.bases):
         channel = np.pad(u[:, c], reach, constant_values=np.nan)  # a missing sample evaluates to zeros
-        first, values = (np.ascontiguousarray(part) for part in basis.local(channel))
+        first, values = basis.local(channel)
+        first, values = np.ascontiguousarray(first), np.ascontiguousarray(values)
         if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
             raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
         groups.append(Signals(first, values, basis.full_size))
@@ -246,7 +248,7 @@ def records(data: Any, layout: Layout, weights: Sequence[Array] | None
     if weights is not None and len(weights) != len(names):
         raise DataError(f"{len(weights)} arrays of weights for {len(names)} experiments: give one each.")
     for i, (name, experiment) in enumerate(zip(names, data.experiments)):
-        own = () if weights is None else (_checked_weights(weights[i], len(experiment.y), name),)
+        own = () if weights is None else (row_weights(weights[i], len(experiment.y), name),)
         yield name, [(experiment.u, experiment.y, *own)]
 
 
@@ -260,14 +262,21 @@ def check_lengths(lengths: Sequence[int], layout: Layout) -> list[str]:
     return names
 
 
-def _checked_weights(weights: Any, count: int, name: str) -> Array:
-    weights = np.asarray(weights, dtype=float)
-    if weights.shape != (count,):
-        raise DataError(f"{name}weights have shape {weights.shape}; one per sample is needed, ({count},).")
+def row_weights(weights: Any, count: int, name: str = "") -> Array:
+    """Return the weights of rows as (count,), from one number or one per sample.
+
+    Raises:
+        DataError: wrong shape, or a weight that is negative or not finite.
+    """
+    given = np.asarray(weights, dtype=float)
+    if given.shape not in ((), (count,)):
+        raise DataError(f"{name}weights have shape {given.shape}: one number, or one for each of the {count} samples.")
+    weights = np.array(np.broadcast_to(given, count))
     bad = ~(np.isfinite(weights) & (weights >= 0))
     if bad.any():
         k = int(np.argmax(bad))
-        raise DataError(f"{name}weight of sample {k} is {weights[k]}: weights are finite and not negative.")
+        raise DataError(f"{name}weight of sample {k} is {weights[k]}: weights must be finite and not negative; 0 "
+                        "leaves a row out.")
     return weights
 
 

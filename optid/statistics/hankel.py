@@ -201,7 +201,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
 
 def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) -> Block:
     """Evaluate the signals of one stretch (T, c)."""
-    missing = np.isnan(raw).any(axis=1) if np.isnan(raw.sum()) else np.zeros(len(raw), dtype=bool)
+    missing = np.logical_or.reduce(np.isnan(raw), axis=1)
     padded = np.zeros((len(raw) + 2 * frame.reach, centre.size))
     inner = padded[frame.reach : frame.reach + len(raw)]
     for start in range(0, len(raw), chunk):

@@ -6,6 +6,7 @@ The unknowns are ``z = [vec a; offset; vec Theta_1; ...]``, ``Theta_c = mu_c vec
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from optid.arrays import Array
@@ -15,10 +16,10 @@ from optid.structures.rank_one import Core, RankOne
 from optid.structures.whitening import leading_pair
 
 
-def positions(layout: Layout) -> Array:
+def positions(layout: Layout) -> NDArray[np.intp]:
     """Return the position (n_columns, l) in z of the coefficient of every column of the regressor in every output."""
     ny, past = layout.l, layout.na * layout.l
-    found = np.empty((layout.n_columns, ny), dtype=int)
+    found = np.empty((layout.n_columns, ny), dtype=np.intp)
     found[:past] = np.arange(past * ny).reshape(past, ny)
     found[-1] = past * ny + np.arange(ny)
     for c in range(layout.m):
@@ -28,7 +29,7 @@ def positions(layout: Layout) -> Array:
     return found
 
 
-def lifted_problem(statistics: Statistics, columns: Array, ridge: float = 0.0, curvature: float = 0.0,
+def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: float = 0.0, curvature: float = 0.0,
                    scales: Sequence[float] = (), weights: Array | float = 1.0) -> RankOne:
     """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
 
