@@ -21,8 +21,6 @@ from optid.models.layout import Layout
 from optid.statistics.blocks import blocks_of, check_lengths, cut, make_block
 from optid.statistics.sums import Total
 
-Ends = tuple[Array, Array]
-
 
 @dataclass(frozen=True, eq=False)
 class Run:
@@ -32,15 +30,15 @@ class Run:
         total: sums over the rows inside.
         first: experiment in which the run begins.
         last: experiment in which it ends.
-        head: u and y of the first samples of its first experiment, as many as the lags reach back, or all there are.
-        tail: u and y of the last samples of its last experiment likewise.
+        head: the first samples [u | y] of its first experiment, as many as the lags reach back, or all there are.
+        tail: the last samples [u | y] of its last experiment likewise.
     """
 
     total: Total
     first: int
     last: int
-    head: Ends
-    tail: Ends
+    head: Array
+    tail: Array
 
 
 def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int
@@ -63,13 +61,13 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
 
 def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
     reach = layout.first_row
-    nothing = np.empty((0, layout.m)), np.empty((0, layout.l))
-    head, tail = nothing, nothing
+    head = tail = np.empty((0, layout.m + layout.l))
 
     def watched() -> Iterable[Sequence[Array]]:
         nonlocal head, tail
         for u, y, _ in chunks:
-            head, tail = _first(head, (u, y), reach), _last(tail, (u, y), reach)
+            head = _first(head, np.hstack([u[:reach], y[:reach]]), reach)
+            tail = _last(tail, np.hstack([_end(u, reach), _end(y, reach)]), reach)
             yield u, y
 
     total = start()
@@ -87,9 +85,9 @@ def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> 
         total.merge(run.total)
         head, tail = whole.head, run.tail
         if run.first == whole.last:
-            u, y = (np.concatenate(pair) for pair in zip(whole.tail, run.head))
-            if len(u) > reach:
-                total.add(make_block(u, y, None, layout))
+            rows = np.concatenate([whole.tail, run.head])
+            if len(rows) > reach:
+                total.add(make_block(rows[:, : layout.m], rows[:, layout.m :], None, layout))
             if whole.first == whole.last:
                 head = _first(head, run.head, reach)
             if run.first == run.last:
@@ -98,13 +96,13 @@ def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> 
     return whole
 
 
-def _first(before: Ends, behind: Ends, count: int) -> Ends:
-    u, y = (np.concatenate([a, b[:count]])[:count] for a, b in zip(before, behind))
-    return u, y
+def _first(before: Array, behind: Array, count: int) -> Array:
+    return np.concatenate([before, behind])[:count]
 
 
-def _last(before: Ends, behind: Ends, count: int) -> Ends:
-    # copies: a view would keep the whole chunk in memory
-    joints = (np.concatenate([a, b[max(len(b) - count, 0) :]]) for a, b in zip(before, behind))
-    u, y = (joint[max(len(joint) - count, 0) :] for joint in joints)
-    return u, y
+def _last(before: Array, behind: Array, count: int) -> Array:
+    return _end(np.concatenate([before, behind]), count)
+
+
+def _end(samples: Array, count: int) -> Array:
+    return samples[max(len(samples) - count, 0) :]
