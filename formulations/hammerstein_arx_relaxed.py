@@ -21,7 +21,7 @@ from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.identify.gauges import check_gauge, in_gauge
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.least_squares import LeastSquaresStructure
@@ -121,7 +121,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str, weig
         scale=problem.problem.scale, unit=problem.unit, compressed=problem, **form).subject_to(*builders)
 
 
-def _rank_one_model(problem: EquationError, core: Core, gauge: str, svd: str, values: Values) -> HammersteinARX:
+def _rank_one_model(problem: EquationError, core: Core, gauge: str, svd: str, values: Values) -> HammersteinTF:
     """Return the model of the leading singular pair of every Theta."""
     pairs = [in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.layout.inputs[c])
              for c, (mu, b) in enumerate(leading_pairs(core, problem.matrices(values), svd == "whitened"))]

@@ -19,7 +19,7 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.arguments import per_channel, whole_number
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
@@ -128,7 +128,7 @@ class EquationError:
         return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
-              gauge: str, flip: bool = True) -> HammersteinARX:
+              gauge: str, flip: bool = True) -> HammersteinTF:
         """Build the model in the units of the record from one (mu, b) per input, b of shape `b_shape`.
 
         Args:
@@ -143,7 +143,7 @@ class EquationError:
         if ny > 1:
             a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
         signs = [leading_sign(np.asarray(b)) if flip else 1.0 for b in bs]
-        model = HammersteinARX(
+        model = HammersteinTF(
             a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),

@@ -26,7 +26,7 @@ from optid.errors import DataError, RankError, StructureError
 from optid.identify.recursive.estimates import Trace, past_coefficients, theta_matrices
 from optid.identify.recursive.intake import as_block, forgetting_factor, prior_factor
 from optid.identify.recursive.saved_state import SavedState
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
@@ -261,13 +261,13 @@ class RecursiveARX(SavedState):
         """
         return theta_matrices(self.theta, self.layout)
 
-    def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinARX:
+    def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinTF:
         """Split off the rank-one factors of the present estimate.
 
         Args:
             split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or
                 "plain" (SVD of Theta, as in the dissertation).
-            gauge: "norm", "gain" or "b0", as in `HammersteinARX.regauge`.
+            gauge: "norm", "gain" or "b0", as in `HammersteinTF.regauge`.
 
         Raises:
             RankError: as `theta`.
@@ -278,7 +278,7 @@ class RecursiveARX(SavedState):
         layout, theta = self.layout, self.theta
         core = lifted_problem(self.statistics, positions(layout)).core
         pairs = leading_pairs(core, theta_matrices(theta, layout), split == "whitened")
-        return HammersteinARX(
+        return HammersteinTF(
             a=past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
