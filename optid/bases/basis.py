@@ -125,11 +125,7 @@ class Basis:
     def values(self, u: ArrayLike) -> Array:
         """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN; errors as `local`."""
         u = samples(u)
-        first, weights = self.local(u)
-        complete = weights
-        if weights.shape[1] < self.full_size:
-            complete = np.zeros((u.size, self.full_size))
-            np.put_along_axis(complete, first[:, None] + np.arange(weights.shape[1]), weights, axis=1)
+        complete = spread(*self.local(u), self.full_size)
         complete[np.isnan(u)] = np.nan
         return self._reduced(complete)
 
@@ -222,6 +218,15 @@ class Basis:
     def _reduced(self, complete: Array) -> Array:
         """Multiply the complete family by the contrast: remove the column that is redundant."""
         return complete if self.dropped is None else np.delete(complete, self.dropped, axis=1)
+
+
+def spread(first: NDArray[np.int32], weights: Array, size: int) -> Array:
+    """Return all values (N, size) of a family from those that do not vanish, as `Basis.local` returns them."""
+    if weights.shape[1] == size:
+        return weights
+    values = np.zeros((len(weights), size))
+    np.put_along_axis(values, first[:, None] + np.arange(weights.shape[1]), weights, axis=1)
+    return values
 
 
 def samples(u: ArrayLike) -> Array:

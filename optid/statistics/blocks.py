@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.bases.basis import spread
 from optid.errors import DataError, RankError, StructureError
 from optid.models.layout import Layout
 
@@ -77,14 +78,6 @@ class Signals:
         """Whether some functions vanish at every sample."""
         return self.weights.shape[1] < self.size
 
-    def values(self, at: NDArray[np.intp]) -> Array:
-        """Return all values at some samples, (K, size)."""
-        if not self.local:
-            return self.weights[at]
-        values = np.zeros((at.size, self.size))
-        np.put_along_axis(values, self.first[at, None] + np.arange(self.weights.shape[1]), self.weights[at], axis=1)
-        return values
-
     def total(self) -> Array:
         """Return the sum over time, (size,)."""
         if not self.local:
@@ -122,7 +115,7 @@ class Block:
         """Form some rows, (K, n)."""
         formed = np.empty((rows.size, self.frame.n))
         for group, where, at in self.entries(rows):
-            formed[:, where[0] : where[-1] + 1] = group.values(at)
+            formed[:, where[0] : where[-1] + 1] = spread(group.first[at], group.weights[at], group.size)
         formed[:, self.frame.constant] = 1.0
         return formed
 
