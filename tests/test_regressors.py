@@ -184,14 +184,14 @@ def test_both_ways_of_summing_agree(bases):
     data = random_data(np.random.default_rng(1), [300], len(bases), 2, share=0.05)
     layout = layout_of(data, bases, 2, [3] * len(bases), [1] * len(bases))
     (experiment,) = data.experiments
-    both = [Sums(Frame.of(layout), direct) for direct in (False, True)]
-    for sums in both:
-        sums._direct_is_cheaper = sums._is_small = lambda *_: False
+    both = [Sums(Frame.of(layout)), Sums(Frame.of(layout))]
+    for sums, direct in zip(both, (False, True)):
+        sums._direct_is_cheaper, sums._is_small = lambda *_, direct=direct: direct, lambda *_: False
         for u, y in stretches([(experiment.u, experiment.y)], layout.first_row, 100):
             sums.add(make_block(u, y, None, layout))
     grams = [sums.complete() for sums in both]
     np.testing.assert_allclose(grams[0], grams[1], atol=1e-11)
-    assert both[0]._removed.any() and not both[1]._removed.any()
+    assert both[0]._stretched and not both[1]._stretched
 
 
 def test_outlier_beside_a_missing_sample_costs_no_digits():

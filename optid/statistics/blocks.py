@@ -14,7 +14,10 @@ from optid.errors import DataError, RankError, StructureError
 from optid.models.layout import Layout
 
 CHUNK = 32768
-"""Samples evaluated at a time: their basis functions stay in the processor's cache."""
+"""Samples summed up at a time: their basis functions stay in the processor's cache."""
+
+PIECE = 4096
+"""Samples evaluated at a time: so do the intermediate results."""
 
 BLOCKS = 4
 """Chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record."""
@@ -77,13 +80,6 @@ class Signals:
     def local(self) -> bool:
         """Whether some functions vanish at every sample."""
         return self.weights.shape[1] < self.size
-
-    def total(self) -> Array:
-        """Return the sum over time, (size,)."""
-        if not self.local:
-            return np.ones(len(self.weights)) @ self.weights
-        parts = [np.bincount(self.first + i, weights, self.size) for i, weights in enumerate(self.weights.T)]
-        return np.sum(parts, axis=0)
 
 
 @dataclass(frozen=True)
@@ -183,9 +179,12 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     outputs[reach : reach + len(y)] = np.where(np.isnan(y), 0.0, y)
     groups = [Signals.dense(outputs)]
     for c, basis in enumerate(layout.bases):
-        channel = np.pad(u[:, c], reach, constant_values=np.nan)  # a missing sample evaluates to zeros
-        first, values = basis.local(channel)
-        first, values = np.ascontiguousarray(first), np.ascontiguousarray(values)
+        first, values = np.zeros(len(outputs), dtype=np.int32), np.zeros((0, 0))
+        for start in range(0, len(u), PIECE):
+            piece = slice(reach + start, reach + min(start + PIECE, len(u)))
+            found, weighted = basis.local(u[start : start + PIECE, c])
+            values = values if start else np.zeros((len(outputs), weighted.shape[1]))
+            first[piece], values[piece] = found, weighted
         if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
             raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
         groups.append(Signals(first, values, basis.full_size))

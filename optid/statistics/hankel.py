@@ -188,11 +188,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
 
     candidates = sum(len(record) - rows + 1 for record in records)
     if method != "qr":
-        sums = total(Sums(frame))
-        gram = sums.complete()
-        if sums.cancelled(gram):
-            gram = total(Sums(frame, direct=True)).complete()
-        found = HankelStatistics(rows, names, middle, gram, candidates)
+        found = HankelStatistics(rows, names, middle, total(Sums(frame)).complete(), candidates)
         if method == "gram" or found.condition <= CONDITION_LIMIT:
             return found
     root = total(Factor(frame.n)).root

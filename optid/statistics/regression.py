@@ -31,7 +31,7 @@ CONDITION_LIMIT = 1e7
 LEAST_REMAINDER = 1e-6
 """Share of an output that least squares leaves, below which its difference of sums has too few digits left."""
 
-RETAINED = 1 << 23
+RETAINED = 1 << 24
 """Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
 long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
 
@@ -182,11 +182,7 @@ def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] |
     """
     threads = available_threads(threads)
     sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout)))
-    complete = sums.complete()
-    if sums.cancelled(complete):
-        sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout), direct=True))
-        complete = sums.complete()
-    gram = layout.contrasted(layout.contrasted(complete).T)
+    gram = layout.contrasted(layout.contrasted(sums.complete()).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 

@@ -127,11 +127,10 @@ class Factor(Total):
 class Sums(Total):
     """The Gram matrix of the rows."""
 
-    def __init__(self, frame: Frame, direct: bool = False) -> None:
-        """Start from no rows; direct adds the valid rows themselves, so that none is subtracted."""
-        self.frame, self.direct = frame, direct
+    def __init__(self, frame: Frame) -> None:
+        """Start from no rows."""
+        self.frame = frame
         self._gram = np.zeros((frame.n, frame.n))  # upper triangle
-        self._removed = np.zeros(frame.n)  # energy of the rows that were subtracted
         self._products: dict[tuple[int, int], Array] = {}
         self._totals = [np.zeros(columns.shape[1]) for columns in frame.columns]
         self._stretched = 0  # rows, with those around the ends, that were added by lag difference
@@ -139,30 +138,23 @@ class Sums(Total):
     def add(self, block: Block) -> None:
         """Add the valid rows of a block."""
         super().add(block)
-        used = np.flatnonzero(block.valid)
-        small = SMALL if any(group.local for group in block.groups) else TINY
-        if (block.weights is not None or self.direct or self._is_small(used.size, small)
-                or self._direct_is_cheaper(block, used.size)):
-            self._add_rows(block, used, np.ones(used.size) if block.weights is None else block.weights[used])
-        else:
-            self._add_by_difference(block)
-            others = np.flatnonzero(~block.valid)
-            self._add_rows(block, others, np.full(others.size, -1.0))
+        others = np.flatnonzero(~block.valid)
+        if not self._direct_is_cheaper(block, block.valid.size - others.size):
+            removed = self._of_rows(block, others)
+            if self._add_by_difference(block, np.diag(removed)):
+                self._gram -= removed
+                return
+        self._gram += self._of_rows(block, np.flatnonzero(block.valid))
 
     def merge(self, other: Self) -> None:
         """Add the sums of other blocks."""
         super().merge(other)
         self._gram += other._gram
-        self._removed += other._removed
         for pair, products in other._products.items():
             self._products[pair] = self._products.get(pair, 0.0) + products
         for total, part in zip(self._totals, other._totals):
             total += part
         self._stretched += other._stretched
-
-    def cancelled(self, complete: Array) -> bool:
-        """Say whether the subtraction of rows cost digits; the sums should then be taken again with direct=True."""
-        return bool((self._removed > SAFE * np.maximum(np.diag(complete), 0.0)).any())
 
     def complete(self) -> Array:
         """Return the Gram matrix (n, n), symmetric."""
@@ -190,35 +182,45 @@ class Sums(Total):
         return rows * self.frame.n**2 <= products
 
     def _direct_is_cheaper(self, block: Block, used: int) -> bool:
+        small = SMALL if any(group.local for group in block.groups) else TINY
+        if block.weights is not None or self._is_small(used, small):
+            return True
         widths = [group.weights.shape[1] for group in block.groups]
         row = sum(width * len(lags) for width, lags in zip(widths, self.frame.lags)) ** 2 / 2
         step = sum(widths[g] * widths[h] * len(self.frame.differences(g, h))
                    for g, h in combinations_with_replacement(range(len(widths)), 2))
         return used * row < block.valid.size * step + (block.valid.size - used) * row
 
-    def _add_by_difference(self, block: Block) -> None:
-        for pair in combinations_with_replacement(range(len(block.groups)), 2):
-            g, h = (block.groups[i] for i in pair)
-            products = lagged_products(g, h, self.frame.differences(*pair), self.frame.reach)
+    def _add_by_difference(self, block: Block, removed: Array) -> bool:
+        """Add all rows of a block, unless so much energy is to be removed from a column that it would cost digits."""
+        pairs = combinations_with_replacement(range(len(block.groups)), 2)
+        reach, energy = self.frame.reach, np.full(self.frame.n, np.inf)
+        found = {(g, h): lagged_products(block.groups[g], block.groups[h], self.frame.differences(g, h), reach)
+                 for g, h in pairs}
+        for g, columns in enumerate(self.frame.columns):
+            energy[columns] = np.diag(found[g, g][:, 0])
+        if np.any(removed > SAFE * (energy - removed)):
+            return False
+        for pair, products in found.items():
             self._products[pair] = self._products.get(pair, 0.0) + products
+        constant = Signals.dense(np.ones((block.valid.size + reach, 1)))
         for total, group in zip(self._totals, block.groups):
-            total += group.total()
+            total += lagged_products(group, constant, range(1), reach)[:, 0, 0]
         self._stretched += block.valid.size
+        return True
 
-    def _add_rows(self, block: Block, rows: NDArray[np.intp], scale: Array) -> None:
-        n = self.frame.n
+    def _of_rows(self, block: Block, rows: NDArray[np.intp]) -> Array:
+        """Return the upper triangle, at least, of the weighted sum over some rows."""
+        gram, n = np.zeros_like(self._gram), self.frame.n
         entries = 1 + sum(group.weights.shape[1] * len(lags) for group, lags in zip(block.groups, self.frame.lags))
         sparse = 3 * entries**2 < n**2 and not self._is_small(rows.size, SMALL)
-        for start in range(0, rows.size, FORMED):
-            part, weights = rows[start : start + FORMED], scale[start : start + FORMED]
+        for part in np.split(rows, range(FORMED, rows.size, FORMED)):
+            weights = np.ones(part.size) if block.weights is None else block.weights[part]
             if sparse:
                 from optid.statistics import kernels
 
-                columns, values = block.sparse_rows(part)
-                kernels.add_outer(columns, values, weights, self._gram)
-                energy = np.bincount(columns.ravel(), (values**2 * weights[:, None]).ravel(), n)
+                kernels.add_outer(*block.sparse_rows(part), weights, gram)
             else:
                 formed = block.dense_rows(part)
-                self._gram += formed.T @ (formed * weights[:, None])
-                energy = weights @ formed**2
-            self._removed += np.maximum(-energy, 0.0)
+                gram += formed.T @ (formed * weights[:, None])
+        return gram
