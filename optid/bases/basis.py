@@ -77,10 +77,8 @@ class Basis:
         if not (np.isfinite(lo) and np.isfinite(hi)):
             raise DataError(f"The range of the input is [{lo}, {hi}]: it needs finite samples.")
         if hi <= lo:
-            raise DataError(
-                f"The input is constant at {lo:g}: a nonlinearity cannot be identified from it. "
-                "Use a record in which the input moves, or give the basis its interval."
-            )
+            raise DataError(f"The input is constant at {lo:g}: a nonlinearity cannot be identified from it. Use a "
+                            "record in which the input moves, or give the basis its interval.")
         return replace(cast(Any, self), interval=(float(lo), float(hi)))
 
     def mapped(self, scale: float, offset: float) -> tuple["Basis", Array, Array]:
@@ -240,7 +238,6 @@ def samples(u: ArrayLike) -> Array:
 def span(basis: Basis) -> tuple[float, float]:
     """Return the interval of a basis, or refuse when it has none yet."""
     if basis.interval is None:
-        raise StructureError(
-            f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give interval=(lower, upper)."
-        )
+        raise StructureError(f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give "
+                             "interval=(lower, upper).")
     return basis.interval

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
 from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
@@ -124,11 +124,9 @@ class HankelStatistics:
         if self.windows < needed:
             lost = self.candidates - self.windows
             missing = f" (missing samples cost {lost} of {self.candidates})" if lost else ""
-            raise RankError(
-                f"{self.windows} complete windows of {self.rows} samples{missing} for {self.rows} block rows of "
-                f"{self.d} signals: at least {needed} are needed. Use a longer record, fewer block rows or fewer basis "
-                "functions."
-            )
+            raise RankError(f"{self.windows} complete windows of {self.rows} samples{missing} for {self.rows} block "
+                            f"rows of {self.d} signals: at least {needed} are needed. Use a longer record, fewer block "
+                            "rows or fewer basis functions.")
 
 
 def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None = None, *,
@@ -152,8 +150,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         StructureError: rows < 1, an unknown method.
         RankError: an experiment shorter than the block rows, or no complete window at all.
     """
-    if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 1:
-        raise StructureError(f"block rows: a whole number from 1 is needed; got {rows!r}.")
+    rows = check_integer(rows, "block rows")
     if method not in ("auto", "gram", "qr"):
         raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
     records = [np.asarray(record, dtype=float) for record in records]
@@ -161,10 +158,8 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         if record.ndim != 2:
             raise DataError(f"experiment {i + 1}: an array (N, channels) is needed; got shape {record.shape}.")
         if len(record) < rows:
-            raise RankError(
-                f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it out or use "
-                "fewer block rows."
-            )
+            raise RankError(f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it "
+                            "out or use fewer block rows.")
     runs = [run for record in records for run in complete_runs(record, rows)]
     if not runs:
         raise RankError(f"no window of {rows} samples is complete: every one touches a missing sample. Use fewer block "
@@ -223,6 +218,4 @@ def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArra
     """Name the first of some positions whose row of the Hankel matrix depends on those before it, or None."""
     order = np.asarray(order, dtype=np.intp)
     column = dependent_column(statistics.triangle(order), order.size, statistics.method)
-    if column is None:
-        return None
-    return statistics.name(int(order[column]))
+    return None if column is None else statistics.name(int(order[column]))
