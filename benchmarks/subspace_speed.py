@@ -29,8 +29,9 @@ from scipy.signal import dlsim
 from optid import Data, Polynomial, Triangular, fit
 from optid.identify.subspace.projection import project, realise
 from optid.statistics.expansion import expand
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
 from optid.statistics.rq import rq
+from optid.statistics.sums import windows_of
 
 PRINTED = "69.8841 14.9963 3.6675 1.9677 0.3000 0.2078 0.1651 0.1373 0.1133 0.1059 0.0856 0.0784 0.0733 0.0678 0.0571"
 A = np.array([[0.7, 0.35, 0, 0], [-0.35, 0.7, 0.1, 0], [0, 0, 0.5, 0.2], [0, 0, 0, -0.4]])

@@ -19,7 +19,7 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.identify.gauges import check_gauge, in_gauge, scale_fixed
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.program.expressions import flat
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
@@ -82,7 +82,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> P
         scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
     signed = gauge == "norm" and _has_signed_factors(program, {one.id for one in factors.values()})
 
-    def recover(values: Values) -> HammersteinARX:
+    def recover(values: Values) -> HammersteinTF:
         return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,
                              flip=gauge == "norm" and not signed)
 

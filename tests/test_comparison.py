@@ -16,7 +16,7 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.validation import compare_models, fit_by_horizon, fit_percent, validate
 from optid.identify.validation.correlations import between_outputs
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 
 
@@ -33,8 +33,8 @@ def record(model, count=400, seed=1, noise=0.1):
     return Data(u, by_hand(model, u, noise=e), dt=model.dt, name="rig")
 
 
-def worse(model: HammersteinARX) -> HammersteinARX:
-    return HammersteinARX(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
+def worse(model: HammersteinTF) -> HammersteinTF:
+    return HammersteinTF(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
 
 
 def feedback_model() -> HammersteinSS:
@@ -119,7 +119,7 @@ def test_the_three_simulators_of_a_model_with_feedback():
 def test_models_are_compared_over_the_samples_that_all_predict():
     model = siso()
     data = record(model)
-    short = HammersteinARX([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
+    short = HammersteinTF([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
     found = compare_models({"true": model, "poor": worse(model), "late": short}, data, horizon=2)
     common = np.isnan(short.predict(data))
     for i, one in enumerate((model, worse(model), short)):
@@ -140,7 +140,7 @@ def test_models_without_names_are_named_by_what_they_are():
 
 def test_a_model_that_runs_away_is_compared_by_what_it_predicts():
     model, data = siso(), record(siso())
-    unstable = HammersteinARX([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
+    unstable = HammersteinTF([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
     u = np.vstack([data.u] * 5)
     long = Data(u, np.vstack([data.y] * 5), dt=model.dt)
     found = compare_models({"true": model, "wild": unstable}, long)

@@ -14,13 +14,13 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
+from optid.models import HammersteinTF, Nonlinearity, roots
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
 
 def two_inputs():
-    return HammersteinARX([-1.2, 0.5], ([1.0, 0.4], [0.3, -0.2, 0.1]),
+    return HammersteinTF([-1.2, 0.5], ([1.0, 0.4], [0.3, -0.2, 0.1]),
                           (nonlinearity(Triangular(5), 1), nonlinearity(Polynomial(3), 2)), (0, 2), 0.4, dt=0.1)
 
 
@@ -219,7 +219,7 @@ def test_words():
     titles = {name: model.title for name, model in MODELS.items()}
     assert titles["oe"] == "Hammerstein output-error model" and titles["armax"] == "Hammerstein ARMAX model"
     assert titles["bj"] == titles["ma"] == titles["ar"] == "Hammerstein Box-Jenkins model"
-    linear = HammersteinARX([-0.5], ([1.0],), (Nonlinearity(Linear(), [1.0]),), (1,), 0.0)
+    linear = HammersteinTF([-0.5], ([1.0],), (Nonlinearity(Linear(), [1.0]),), (1,), 0.0)
     assert replace(linear, d=()).title == "Linear output-error model"
     assert replace(linear, d=()).equation() == "x(k) = 0.5 x(k-1) + 1 u(k-1)\ny(k) = x(k) + e(k)"
     armax = replace(linear, c=[0.2], d=[-0.5])

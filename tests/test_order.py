@@ -16,13 +16,15 @@ from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order import order_test, rank_test, scan_lags
-from optid.identify.order.lags import weighted_problem
+from optid.identify.order.lags import residual_weights
 from optid.identify.order.signals import block_rows_for, with_simulated_outputs
 from optid.identify.order.states import state_criteria
 from optid.plants import EXAMPLE1, TWO_MODES
 from optid.statistics import collect
 from optid.statistics.expansion import expand
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
+from optid.statistics.sums import windows_of
+from optid.structures import lifted_regression
 
 benchmark = scripts.benchmark("order")
 
@@ -246,7 +248,8 @@ def test_lags_equal_dense_least_squares():
 def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     u = inputs(model, 400)
     data = Data(u, by_hand(model, u, noise=0.1 * np.random.default_rng(5).normal(size=(400, model.l))), dt=model.dt)
-    problem = weighted_problem(collect(data, model.layout))
+    statistics, places = collect(data, model.layout), lifted_regression.positions(model.layout)
+    problem = lifted_regression.lifted_problem(statistics, places, weights=residual_weights(statistics))
     n = model.memory
     columns = [-data.y[n - i : -i] for i in range(1, model.na + 1)]
     for c, f in enumerate(model.nonlinearities):
@@ -256,9 +259,8 @@ def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     theta = np.linalg.lstsq(phi, data.y[n:])[0]
     residual = data.y[n:] - phi @ theta
     free = np.linalg.solve(problem.root, problem.target)
-    linear = model.na * model.l + 1
-    past = np.vstack([theta[: model.na * model.l], theta[-1:]])
-    assert free[: linear * model.l].reshape(model.l, linear).T == pytest.approx(past, abs=1e-8)
+    linear = [*range(model.na * model.l), -1]
+    assert free[places][linear] == pytest.approx(theta[linear], abs=1e-8)
     assert problem.remainder == pytest.approx(np.sum(residual**2 / (1.0 if model.l == 1 else np.mean(residual**2, 0))))
 
 

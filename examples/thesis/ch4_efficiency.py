@@ -11,8 +11,9 @@ import numpy as np
 
 from optid import plants
 from optid.identify.design.expansion import expansion_of
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
 from optid.statistics.rq import rq
+from optid.statistics.sums import windows_of
 
 ROWS = 6
 

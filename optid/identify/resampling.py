@@ -23,7 +23,7 @@ from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
 from optid.identify.tangent import Quantity
 from optid.identify.uncertainty import Uncertainty, aligned
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.models.recursions import autoregression
 
 FAILED = 0.1  # share of refits without a point above which the user is told
@@ -39,8 +39,8 @@ class Refits:
         kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
     """
 
-    reference: HammersteinARX
-    models: tuple[HammersteinARX, ...] = field(repr=False)
+    reference: HammersteinTF
+    models: tuple[HammersteinTF, ...] = field(repr=False)
     kind: Literal["percentile", "basic"]
 
     @property
@@ -70,7 +70,7 @@ class Bootstrap:
 
     percentile: Uncertainty
     basic: Uncertainty
-    models: tuple[HammersteinARX, ...] = field(repr=False)
+    models: tuple[HammersteinTF, ...] = field(repr=False)
     failed: int
 
 
@@ -140,7 +140,7 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
         yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
 
 
-def _residuals(model: HammersteinARX, data: Data) -> Array:
+def _residuals(model: HammersteinTF, data: Data) -> Array:
     """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
     rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
     rows = rows[~np.isnan(rows).any(axis=1)]
@@ -149,7 +149,7 @@ def _residuals(model: HammersteinARX, data: Data) -> Array:
     return (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - parameters / l, 1.0))
 
 
-def _simulated(model: HammersteinARX, u: Array, y: Array, errors: Array) -> Array:
+def _simulated(model: HammersteinTF, u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.largest_lag
     u, start = interpolated(u), interpolated(y)[:n]

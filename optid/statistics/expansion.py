@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.bases.basis import Basis
 from optid.errors import DataError, DataWarning, RankError
-from optid.statistics.factors import add_to_root
+from optid.statistics.hankel import hankel_statistics
 
 SMALLEST = 1e-6
 """Part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding."""
@@ -229,17 +229,11 @@ def expand(records: Sequence[Array], inputs: Sequence[Basis], feedback: Sequence
 
 
 def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: Sequence[str]) -> Feedback:
-    l, q = len(names), basis.size  # noqa: E741
-    root, count = np.zeros((1 + l + q, 1 + l + q)), 0
-    for record in outputs:
-        y = record[~np.isnan(record).any(axis=1)]
-        count += len(y)
-        for start in range(0, len(y), 8192):
-            part = y[start : start + 8192]
-            rows = np.concatenate([np.ones((len(part), 1)), part, basis.values(part[:, output])], axis=1)
-            root = add_to_root(root, rows)
-    if not count:
+    l = len(names)  # noqa: E741
+    if all(np.isnan(y).any(axis=1).all() for y in outputs):
         raise DataError("no sample has all outputs: the feedback functions cannot be formed.")
+    statistics = hankel_statistics(outputs, 1, lambda y: np.hstack([y, basis.values(y[:, output])]), method="qr")
+    root, count = statistics.root, statistics.windows
     slopes = np.linalg.lstsq(root[: 1 + l, : 1 + l], root[: 1 + l, 1 + l :], rcond=None)[0]  # (1 + l, Q)
     rest = root[:, 1 + l :] - root[:, : 1 + l] @ slopes
     spread = np.linalg.norm(root[1:, 1 + l :])
@@ -251,8 +245,7 @@ def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: 
         warnings.warn(_nearly_linear(basis, names[output], share) + " What it adds will be uncertain.", DataWarning,
                       stacklevel=4)
     _, values, right = np.linalg.svd(rest)
-    sizes = np.linalg.norm(root[1:, 1 + l :])
-    kept = values > SMALLEST * sizes
+    kept = values > SMALLEST * spread
     vectors = right[: values.size][kept].T / (values[kept] / np.sqrt(count))
     reduced = slopes @ vectors
     return Feedback(output, basis, vectors, reduced[0], reduced[1:].T, share)

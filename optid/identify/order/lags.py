@@ -16,7 +16,7 @@ from optid.data.record import Data
 from optid.errors import RankError, StructureError
 from optid.identify.order.states import criteria
 from optid.statistics import Layout, Statistics, accumulate, collect
-from optid.structures.rank_one import RankOne
+from optid.structures.lifted_regression import lifted_problem, positions
 
 ROWS_PER_COLUMN = 3
 CLOSE = 0.1
@@ -165,7 +165,8 @@ def _contraction(statistics: Statistics) -> Array:
     layout = statistics.layout
     shapes = [np.ones(1)] * layout.m
     if any(basis.size > 1 for basis in layout.bases):
-        shapes = list(minimise(weighted_problem(statistics), count=3).point.mus)
+        problem = lifted_problem(statistics, positions(layout), weights=residual_weights(statistics))
+        shapes = list(minimise(problem, count=3).point.mus)
     past, lags = layout.na * layout.l, layout.nb[0]
     change = np.zeros((layout.n_columns + layout.l, past + layout.m * lags + 1 + layout.l))
     change[:past, :past] = np.eye(past)
@@ -176,39 +177,13 @@ def _contraction(statistics: Statistics) -> Array:
     return change
 
 
-def weighted_problem(statistics: Statistics) -> RankOne:
-    """Write the regression of all outputs as one rank-one problem, each output in units of its residual.
-
-    Unknowns: the linear coefficients of each output (past outputs, constant), then Theta_c (P_c, nb_c l), outputs
-    outermost.
-    """
-    layout, root = statistics.layout, statistics.root
-    n, outputs = layout.n_columns, layout.l
-    past = np.arange(layout.na * outputs)
-    linear = past.size + 1
-    sizes = [nb * basis.size for nb, basis in zip(layout.nb, layout.bases)]
-    total = outputs * (linear + sum(sizes))
-    system = np.zeros((outputs * n, total + 1))
-    remainder = 0.0
-    for o in range(outputs):
-        rest = float(np.sum(root[n:, n + o] ** 2))
-        energy = float(np.sum(root[:, n + o] ** 2))
-        weight = 1.0 if outputs == 1 else 1 / np.sqrt(max(rest / statistics.rows, 1e-24 * energy, 1e-300))
-        where = np.empty(n, dtype=int)
-        where[past], where[layout.offset] = o * linear + past, (o + 1) * linear - 1
-        start = outputs * linear
-        for c, size in enumerate(sizes):
-            where[layout.block(c)] = start + o * size + np.arange(size)
-            start += outputs * size
-        rows = slice(o * n, (o + 1) * n)
-        system[rows, where] = weight * root[:n, :n]
-        system[rows, -1] = weight * root[:n, n + o]
-        remainder += weight**2 * rest
-    triangle: Array = np.asarray(np.linalg.qr(system, mode="r"))
-    blocks = tuple((basis.size, nb * outputs) for nb, basis in zip(layout.nb, layout.bases))
-    if len(triangle) > total:
-        remainder += float(triangle[total, total] ** 2)
-    return RankOne(triangle[:total, :total], triangle[:total, total], remainder, blocks, outputs * linear)
+def residual_weights(statistics: Statistics) -> Array:
+    """Return what puts every output (l,) into units of its residual; one where there is one output."""
+    n, root = statistics.layout.n_columns, statistics.root
+    rest, energy = np.sum(root[n:, n:] ** 2, axis=0), np.sum(root[:, n:] ** 2, axis=0)
+    if rest.size == 1:
+        return np.ones(1)
+    return 1 / np.sqrt(np.maximum(np.maximum(rest / statistics.rows, 1e-24 * energy), 1e-300))
 
 
 def _put(values: tuple[int, ...], c: int, value: int) -> tuple[int, ...]:

@@ -13,7 +13,6 @@ from optid.arrays import Array
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
-from optid.identify.equation_error.compression import lifted_problem, positions
 from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
@@ -24,6 +23,7 @@ from optid.statistics.regression import collect
 from optid.statistics.sensitivities import instruments
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
+from optid.structures.lifted_regression import lifted_problem, positions
 
 PASSES = 8
 """Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""

@@ -115,7 +115,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
     Args:
         model: the model.
         data: the record; detrended or scaled data are taken back to raw units first.
-        x0: initial state of the simulation, as in `HammersteinARX.simulate`.
+        x0: initial state of the simulation, as in `HammersteinTF.simulate`.
         lags: largest lag of the residual tests; fewer when the record is shorter than four times that.
         horizon: how many samples ahead to predict, besides one; see `fit_by_horizon` for a whole curve.
 
