@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
 from optid.certificate.simulation_bound import simulation_bound

@@ -8,8 +8,7 @@ from scipy.optimize import minimize
 
 import optid
 import optid.identify.subspace.shift
-from formulations.constraints.pole_regions import damped, disc, sector, strip
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import damped, disc, sector, stable, strip
 from formulations.shift import constrained_shift
 from optid.backends import Answer, find
 from optid.certificate.infeasibility import explain

@@ -11,8 +11,8 @@ from state_systems import linear as linear_system
 
 import optid
 from formulations.constraints import shape
+from formulations.constraints.poles import stable
 from formulations.constraints.rule import Rule
-from formulations.constraints.stability import stable
 from formulations.state_space import hammerstein_ss as exact
 from formulations.state_space import ss as linear
 from optid.bases import Linear, Polynomial, Triangular, UserFunctions
