@@ -24,11 +24,11 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import completed, preliminary
+from optid.bases import Bases, FeedbackBases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
-from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.low_rank import Structured, choose_weight, order_of, rank_of, structure
 from optid.identify.subspace.observability import Observability, prepared
 from optid.identify.subspace.plan import Plan, in_record_units, planned

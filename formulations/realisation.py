@@ -46,7 +46,7 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
         units: from those of the step to those of the record, in which the constraints speak.
         constraints: builders, about the coefficients.
     """
-    problem, form = realisation.step.problem, realisation.step.form
+    problem, form = realisation.problem, realisation.form
     shape = form.n if form.experiments == 1 else (form.n, form.experiments)
     linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
                                                       if form.offset else {})
@@ -78,12 +78,12 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
 def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]
           ) -> View:
     """Return what constraints may speak about; Theta_i is (P, n + l) or, without feedthrough, (P, n)."""
-    form = realisation.step.form
-    x, n, l = form.expansion, form.n, form.l  # noqa: E741
+    form, x, n = realisation.form, realisation.form.expansion, realisation.form.n
     expressions = variables | {realisation.names(i)[2]: theta for i, theta in enumerate(thetas)}
     inner = [theta[:, :n].T for theta in thetas]
-    direct = [theta[:, n:].T if b > n else np.zeros((l, p)) for theta, (p, b) in zip(thetas, form.blocks)]
-    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct[: x.m])
+    direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
+              for theta, direct in zip(thetas, form.feedthrough)]
+    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct)
     if x.q:
         expressions["Ez"] = cp.hstack(inner[x.m :])
     if all(isinstance(basis, Linear) for basis in x.inputs):

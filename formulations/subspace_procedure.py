@@ -22,9 +22,8 @@ from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.prediction_error.state_errors import state_model
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
-from optid.identify.subspace.observer import ObserverProblem
 from optid.identify.subspace.plan import Plan
-from optid.identify.subspace.realisation import Factors, Realisation
+from optid.identify.subspace.realisation import Realisation, Values
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
@@ -56,7 +55,7 @@ def completed(plan: Plan, found: Observability) -> Procedure:
     Returns:
         The evidence, with figures added.
     """
-    (a, _, gamma), l, figures = found.pair(), plan.data.l, dict(found.figures)  # noqa: E741
+    a, gamma, l, figures = found.least_squares(), found.scaled, plan.data.l, dict(found.figures)  # noqa: E741
     doubt, rules = "", plan.about("poles")
     if rules or plan.stability == "auto" and spectral_radius(a) >= 1:
         shift = yield from constrained_shift(gamma[:-l], gamma[l:], rules or (stable(INSIDE),))
@@ -70,12 +69,12 @@ def completed(plan: Plan, found: Observability) -> Procedure:
                               "unstable without its feedback.", DataWarning, stacklevel=2)
         a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
     step = found.step(a)
-    realisation = Realisation(step, plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
-    program = realisation_programme(realisation, plan.name, plan.units, plan.about("coefficients"))
+    step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
+    program = realisation_programme(step, plan.name, plan.units, plan.about("coefficients"))
     solution: Solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
-    model = _model(plan, step, realisation.factors(solution.values))
+    model = _model(plan, step, solution.values)
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
     return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
@@ -89,8 +88,7 @@ def preliminary(found: Observability) -> HammersteinSS:
         RankError: the record does not determine it.
     """
     step = found.step(found.contracted())
-    realisation = Realisation(step, False)
-    return _model(found.plan, step, realisation.factors(realisation.start()))
+    return _model(found.plan, step, step.start())
 
 
 def _estimated(found: Observability) -> HammersteinSS:
@@ -102,14 +100,14 @@ def _with_noise(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[s
     return model, {"noise model": remark} if remark else {}
 
 
-def _model(plan: Plan, step: ObserverProblem, factors: Factors) -> HammersteinSS:
-    form = step.form
+def _model(plan: Plan, step: Realisation, values: Values) -> HammersteinSS:
+    form, factors = step.form, step.factors(values)
     model = state_model(form.expansion, plan.data, (form.a, factors.B, form.c, factors.D), factors.mus, factors.nus,
                         factors.E, offset=factors.offset)
     return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
 
 
-def _bound(plan: Plan, step: ObserverProblem, solution: Solution, unit: float, block_rows: int) -> Bound:
+def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:
     """Return the Hankel bound of the objective in units of the record; none where no proof was asked for."""
     said = "the (A, C) step minimises no criterion of the whole model"
     if solution.bound is None:

@@ -15,10 +15,11 @@ from optid.bases import Linear, Polynomial, Triangular, fitted_bases
 from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.identify.equation_error.compression import lifted_problem
+from optid.identify.equation_error.compression import positions as columns_of
 from optid.identify.order import order_test, rank_test, scan_lags
-from optid.identify.order.lags import weighted_problem
-from optid.identify.order.signals import block_rows_for, with_simulated_outputs
 from optid.identify.order.states import state_criteria
+from optid.identify.order.study import block_rows_for, with_simulated_outputs
 from optid.plants import EXAMPLE1, TWO_MODES
 from optid.statistics import collect
 from optid.statistics.expansion import expand
@@ -43,8 +44,7 @@ def positions(statistics, alpha, m, d):
 
 
 def linear(data):
-    return expand([np.hstack([e.u, e.y]) for e in data.experiments], fitted_bases(data, Linear()), [], data.inputs,
-                  data.outputs)
+    return expand(data, Linear())
 
 
 def records(data):
@@ -150,7 +150,7 @@ def test_nonlinear_inputs_and_feedback():
 
 def test_simulated_outputs_follow_the_inputs_alone():
     data = record(3000, noise=0.5)
-    signals = expand(records(data), fitted_bases(data, Linear()), [Polynomial(3).fitted(-9, 9)], ("u",), ("y",))
+    signals = expand(data, Linear(), Polynomial(3).fitted(-9, 9))
     (extended,), wider = with_simulated_outputs(records(data), signals, 8)
     clean = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], data.u[:, 0])
     assert np.isnan(extended[:15, 2]).all() and wider.simulated
@@ -246,7 +246,8 @@ def test_lags_equal_dense_least_squares():
 def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     u = inputs(model, 400)
     data = Data(u, by_hand(model, u, noise=0.1 * np.random.default_rng(5).normal(size=(400, model.l))), dt=model.dt)
-    problem = weighted_problem(collect(data, model.layout))
+    where = columns_of(model.layout)
+    problem = lifted_problem(collect(data, model.layout), where)
     n = model.memory
     columns = [-data.y[n - i : -i] for i in range(1, model.na + 1)]
     for c, f in enumerate(model.nonlinearities):
@@ -256,10 +257,9 @@ def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     theta = np.linalg.lstsq(phi, data.y[n:])[0]
     residual = data.y[n:] - phi @ theta
     free = np.linalg.solve(problem.root, problem.target)
-    linear = model.na * model.l + 1
-    past = np.vstack([theta[: model.na * model.l], theta[-1:]])
-    assert free[: linear * model.l].reshape(model.l, linear).T == pytest.approx(past, abs=1e-8)
-    assert problem.remainder == pytest.approx(np.sum(residual**2 / (1.0 if model.l == 1 else np.mean(residual**2, 0))))
+    past = model.na * model.l
+    assert free[where[[*range(past), -1]]] == pytest.approx(np.vstack([theta[:past], theta[-1:]]), abs=1e-8)
+    assert problem.remainder == pytest.approx(np.sum(residual**2))
 
 
 @pytest.mark.parametrize("nonlinear", [False, True])
@@ -323,8 +323,8 @@ def test_short_records_say_what_they_cannot():
     ({"nx": 0}, StructureError, "nx=0"),
     ({"holdout": 1.0}, StructureError, "holdout"),
     ({"level": 0.0}, StructureError, "level=0.0"),
-    ({"na": -1}, StructureError, "na: a whole number from 0"),
-    ({"nb": 0}, StructureError, "nb: a whole number from 1"),
+    ({"na": -1}, StructureError, "na=-1 must be an integer >= 0"),
+    ({"nb": 0}, StructureError, "nb=0 must be a positive integer"),
     ({"feedback_basis": ["polynomial:2"] * 2}, StructureError, "2 feedback bases for 1 outputs"),
     ({"block_rows": 150}, RankError, "complete windows"),
     ({"block_rows": 400}, RankError, "Experiment 1 has 800 samples"),

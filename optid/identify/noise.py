@@ -229,7 +229,7 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         try:
-            observers.append(_observer_gain(A, C, ratio))
+            observers.append(observer_gain(A, C, ratio))
         except StructureError:
             continue
     found = sorted(map(measured, observers), key=itemgetter(0))
@@ -247,10 +247,10 @@ def _observer(model: "HammersteinSS") -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
         return np.zeros((model.nx, model.l))
-    return _observer_gain(model.A, model.C, 0.1)
+    return observer_gain(model.A, model.C, 0.1)
 
 
-def _observer_gain(A: Array, C: Array, ratio: float) -> Array:
+def observer_gain(A: Array, C: Array, ratio: float) -> Array:
     """Return the gain for equal noise in all states, so many times that at the outputs in units of C."""
     size = np.linalg.norm(C, axis=1)
     return np.array(kalman_gain(A, C, ratio * np.eye(len(A)), np.diag(np.where(size > 0, size, 1.0) ** 2)).K)

@@ -10,9 +10,9 @@ import numpy as np
 
 from optid import signals
 from optid.arrays import Array, check_integer
+from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
-from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.design.promises import Promise, promised
 from optid.identify.design.response import FrequencyResponse, frequency_response
 from optid.identify.design.rules import FEW_LEVELS

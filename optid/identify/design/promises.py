@@ -1,16 +1,20 @@
 """What an excitation promises of the record that will be taken with it."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.bases import Bases, FeedbackBases
 from optid.data.channels import count_levels
 from optid.data.record import Data
-from optid.identify.design.expansion import Bases, FeedbackBases, expanded_condition, expansion_of
+from optid.errors import DataWarning
 from optid.identify.design.response import FrequencyResponse
 from optid.identify.design.rules import Check, check_condition, check_feedback, check_levels, check_lines
 from optid.signals import crest_factor
+from optid.statistics.expansion import Expansion, expand
+from optid.statistics.hankel import hankel_statistics
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,9 @@ def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[floa
     """
     y = predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
-    expansion = expansion_of(record, basis, feedback_basis)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # functions of outputs that are nearly linear: `check_feedback`
+        expansion = expand(record, basis, feedback_basis)
     condition = expanded_condition(record, expansion, rows)
     checks = [check_levels(name, u[:, c], expansion.inputs[c], few) for c, name in enumerate(like.inputs)]
     checks += [check_lines(name, [u[:, c]], expansion.inputs[c], rows) for c, name in enumerate(like.inputs)]
@@ -108,3 +114,23 @@ def predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> A
     lines = np.concatenate([np.zeros((1, like.l)), response + noise[0] + 1j * noise[1]])
     mean = np.nanmean(np.concatenate([e.y for e in like.experiments]), axis=0)
     return mean + np.fft.irfft(lines, n, axis=0)
+
+
+def expanded_condition(data: Data, expansion: Expansion, rows: int) -> float:
+    """Return the condition number of all windows of the expanded signals about their means, columns scaled.
+
+    Args:
+        data: the record.
+        expansion: of it.
+        rows: block rows, the samples of a window.
+
+    Returns:
+        An estimate in the 1-norm; inf when the windows are singular.
+
+    Raises:
+        RankError: no complete window.
+    """
+    count = expansion.p + expansion.q
+    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    return hankel_statistics(records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
+                             centre="mean").condition

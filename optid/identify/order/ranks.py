@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
-from optid.statistics.hankel import HankelStatistics
+from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 LEVEL = 0.01
@@ -89,8 +90,7 @@ class RankTest:
     @property
     def ratios(self) -> Array:
         """s_i / s_{i+1} for i = 1 ... r - 1, singular values below the floor raised to it."""
-        raised = np.maximum(self.singular_values, max(self.floor, np.finfo(float).tiny))
-        return raised[:-1] / raised[1:]
+        return ratios_of(self.singular_values, self.floor)
 
     @property
     def ratio_order(self) -> int:
@@ -98,7 +98,7 @@ class RankTest:
         size = self.singular_values.size
         if self.singular_values[0] <= self.floor or size < 2:
             return 0
-        return int(np.argmax(self.ratios[: max(1, min(size - 2, size // 2))])) + 1
+        return largest_gap(self.singular_values, min(size - 2, size // 2), self.floor)
 
     @property
     def reason(self) -> str:
@@ -110,6 +110,42 @@ class RankTest:
             return f"{n}: every smaller order is rejected and the block rows show no larger one; use more block rows"
         before = f", order {n - 1} is rejected (p = {self.p_values[n - 1]:.1g})" if n else ""
         return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
+
+
+def ratios_of(values: Array, floor: float) -> Array:
+    """Return s_i / s_(i+1) of singular values (r,), largest first, those below the floor raised to it: (r - 1,)."""
+    raised = np.maximum(values, max(floor, np.finfo(float).tiny))
+    return raised[:-1] / raised[1:]
+
+
+def largest_gap(values: Array, most: int, floor: float) -> int:
+    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. most (SLICOT IB01OD with its default tolerance)."""
+    return int(np.argmax(ratios_of(values, floor)[: max(1, most)])) + 1
+
+
+def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, instruments: str = "simulated",
+               offset: bool = True, level: float | None = None, statistics: HankelStatistics | None = None) -> RankTest:
+    """Test the ranks of the projected outputs; several outputs count relative to their sizes.
+
+    Args:
+        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs.
+        expansion: the signals.
+        alpha: future block rows; the past has as many, and so has the reach of the serial correlation.
+        instruments: as in `Expansion.positions`; noise of any colour leaves past and future inputs valid, and functions
+            of outputs simulated from them.
+        offset: whether a constant is among instruments and regressors.
+        level: as in `rank_test`.
+        statistics: of windows of 3 alpha samples, where they exist already.
+
+    Raises:
+        RankError: too short a record, or instruments that do not reach the regressors.
+    """
+    if statistics is None:
+        statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
+                                       centre="mean" if offset else None)
+    z, phi, y = expansion.positions(statistics.at, instruments, alpha, offset)
+    scale = np.tile(statistics.sizes(expansion.y, offset), alpha) if expansion.l > 1 else None
+    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
 
 
 def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: Positions, outputs: Positions, *,

@@ -7,22 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
-from optid.identify.order.signals import order_test
+from optid.identify.noise import observer_gain
+from optid.identify.order.ranks import largest_gap, order_test
 from optid.identify.subspace.imputation import count_windows, impute
 from optid.identify.subspace.instruments import simulate_clipped
-from optid.identify.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
+from optid.identify.subspace.observer import observer_problem
 from optid.identify.subspace.plan import BEST, Plan
-from optid.identify.subspace.projection import (
-    WEIGHTINGS,
-    Projection,
-    check_order,
-    largest_gap,
-    project,
-    scaled_pair,
-    weakest_feedback,
-)
+from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
+from optid.identify.subspace.realisation import ObserverForm, Realisation
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.statistics.channels import check_channels
@@ -59,17 +53,22 @@ class Observability:
     scale: Array
     figures: dict[str, Any] = field(default_factory=dict)
 
-    def pair(self) -> tuple[Array, Array, Array]:
-        """Return (A, C) by least squares, and gamma of the outputs divided by their sizes."""
-        return scaled_pair(self.gamma, self.scale)
+    @property
+    def scaled(self) -> Array:
+        """Gamma of the outputs divided by their sizes: least squares on it weighs all outputs alike."""
+        return self.gamma / np.tile(self.scale, len(self.gamma) // len(self.scale))[:, None]
+
+    def least_squares(self) -> Array:
+        """Return A (n, n) by least squares."""
+        return realise(self.scaled, len(self.scale))[0]
 
     def contracted(self) -> Array:
         """Return A by least squares, contracted where it is unstable: for simulations and comparisons."""
-        a = self.pair()[0]
+        a = self.least_squares()
         radius = spectral_radius(a)
         return a if radius < 1 else a * (INSIDE / radius)
 
-    def step(self, a: Array, *, instruments: bool = True) -> ObserverProblem:
+    def step(self, a: Array, *, instruments: bool = True) -> Realisation:
         """Compress the least squares for B, D, E, offset and x0 with a given A.
 
         Args:
@@ -79,7 +78,7 @@ class Observability:
         """
         plan, c = self.plan, self.gamma[: len(self.scale)].copy()
         closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
-        gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
+        gain = observer_gain(a, c, 1.0) if closed else np.zeros((len(a), len(c)))
         form = ObserverForm(a, c, gain, self.expansion, len(self.records), plan.direct(), plan.offset, 1 / self.scale)
         coloured = instruments and self.expansion.simulated and not plan.instruments.endswith("past")
         return observer_problem(self.records, form, instruments=coloured,
@@ -97,16 +96,13 @@ def prepared(plan: Plan) -> tuple[Expansion, int]:
         StructureError: an order that the block rows cannot carry.
         DataError: a constant channel.
     """
-    expansion, given = plan.expansion(), plan.block_rows
+    expansion, nx = plan.expansion(), plan.order
     check_channels(plan.records, plan.data.inputs, plan.data.outputs)
-    if given is None:
-        alpha = expansion.block_rows(plan.records, plan.order)
-    elif isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 2:
-        raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order.")
-    else:
-        alpha = int(given)
-    if plan.order is not None:
-        check_order(plan.order, alpha, plan.data.l)
+    alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
+             else check_integer(plan.block_rows, "block_rows", 2))
+    if nx is not None and alpha <= nx:
+        raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are needed; use "
+                             f"block_rows={nx + 1} or more, or nx={alpha - 1} or less.")
     return expansion, alpha
 
 
@@ -124,18 +120,18 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
         DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
     """
     expansion, alpha = prepared(plan)
-    windows, imputed = _Windows(plan, plan.records, expansion, alpha, plan.instruments), {}
+    windows, imputed = _Windows(plan, plan.records, expansion, alpha), {}
     if _lacks_windows(plan, expansion, alpha):
-        imputation = impute(plan.data, lambda filled: _estimated(replace(windows, records=filled), preliminary))
-        windows, imputed = replace(windows, records=imputation.records), {"missing outputs": str(imputation)}
-        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {imputation}. The "
+        filled, how = impute(plan.data, lambda records: _estimated(replace(windows, records=records), preliminary))
+        windows, imputed = replace(windows, records=filled), {"missing outputs": how}
+        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {how}. The "
                       "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
     windows = windows.instrumented()
     projection, expansion = windows.projected(), windows.expansion
     nx, reason = windows.order(projection)
     figures: dict[str, Any] = {
         "order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-        "windows": projection.statistics.windows, **imputed, "instruments": windows.instruments}
+        "windows": projection.statistics.windows, **imputed, "instruments": windows.plan.instruments}
     if plan.weighting == BEST:
         projection = windows.best_weighting(projection, nx)
         figures["weighting"] = f"{projection.weighting}: the smallest error on the record"
@@ -172,22 +168,21 @@ def _estimated(windows: "_Windows", preliminary: Preliminary) -> HammersteinSS:
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
         if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
             plan = replace(plan, instruments=f"{plan.instruments}+past")
-        return preliminary(replace(windows, plan=plan, instruments=plan.instruments).instrumented().ordered())
+        return preliminary(replace(windows, plan=plan).instrumented().ordered())
 
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Signals in windows of 2 alpha samples, and the instruments for them."""
+    """Signals in windows of 2 alpha samples."""
 
     plan: Plan
     records: list[Array]
     expansion: Expansion
     alpha: int
-    instruments: str
 
     def projected(self) -> Projection:
         plan = self.plan
-        return project(self.records, self.expansion, self.alpha, instruments=self.instruments, offset=plan.offset,
+        return project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
                        form=plan.form, tolerance=plan.tolerance,
                        weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
 
@@ -209,21 +204,22 @@ class _Windows:
         if not plan.instruments.startswith("simulated"):
             return self
         if not self.expansion.q:
-            return replace(self, instruments=plan.instruments.replace("simulated", "inputs"))
-        windows = replace(self, instruments="inputs+past")
+            return replace(self, plan=replace(plan, instruments=plan.instruments.replace("simulated", "inputs")))
+        windows = replace(self, plan=replace(plan, instruments="inputs+past"))
         for i in range(plan.iterations):
             try:
                 found = windows.ordered()
             except RankError:
                 if i:
                     raise
-                found = replace(self, expansion=self.expansion.without_feedback(), instruments="inputs").ordered()
+                found = replace(self, plan=replace(plan, instruments="inputs"),
+                                expansion=self.expansion.without_feedback()).ordered()
             a = found.contracted()
             step = found.step(a)
             bu, du, ez, d, _ = step.matrices(step.least_squares())
             outputs = simulate_clipped(raw, found.expansion, a, step.form.c, bu, du, ez, d)
             windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
-                              expansion=self.expansion.with_simulated(), instruments=plan.instruments)
+                              expansion=self.expansion.with_simulated())
         return windows
 
     def best_weighting(self, projection: Projection, nx: int) -> Projection:
@@ -238,7 +234,7 @@ class _Windows:
             weighted = replace(projection, weighting=word)
             found = self.observability(weighted, nx)
             error = found.step(found.contracted(), instruments=False).problem.remainder
-            tried.append((spectral_radius(found.pair()[0]) >= 1, error, weighted))
+            tried.append((spectral_radius(found.least_squares()) >= 1, error, weighted))
         return min(tried, key=lambda one: one[:2])[2]
 
     def order(self, projection: Projection) -> tuple[int, str]:
@@ -249,12 +245,13 @@ class _Windows:
             nx, reason = rank, f"{rank}: the singular values after it are rounding"
         elif self.plan.nx == "auto":
             try:
-                nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.instruments,
+                nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.plan.instruments,
                                         offset=self.plan.offset).choice
             except RankError:  # singular regressors, or a record too short for the distribution
                 nx = None
         if nx is None:
-            nx = largest_gap(values, min(self.alpha - 1, values.size // 2))
+            floor = 10 * values.size * np.finfo(float).eps * values[0]  # the rounding of the decomposition
+            nx = largest_gap(values, min(self.alpha - 1, values.size // 2), floor)
             following = values[nx] if nx < values.size else 0.0
             reason = f"{nx}: the largest gap of the singular values, {values[nx - 1]:.3g} before {following:.3g}"
         if nx > rank:

@@ -10,16 +10,14 @@ of samples has its own initial state; those of all but the first run of an exper
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.stretches import runs_of
 from optid.errors import RankError
-from optid.statistics.expansion import Expansion
+from optid.identify.subspace.realisation import ObserverForm, Realisation
 from optid.statistics.factors import add_to_root, conditioning, root_of_gram
 from optid.statistics.hankel import CONDITION_LIMIT
 from optid.statistics.responses import adjoint_responses
@@ -35,146 +33,8 @@ HELD = 1 << 22
 """Numbers held at once at most: models with many functions and states take shorter chunks."""
 
 
-@dataclass(frozen=True, eq=False)
-class ObserverForm:
-    """What is known and how the unknowns are laid out.
-
-    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
-    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
-
-    Attributes:
-        a: (n, n).
-        c: (l, n).
-        gain: (n, l) observer gain L.
-        expansion: the signals.
-        experiments: number of experiments.
-        feedthrough: whether every input acts on the outputs at once.
-        offset: whether there is a constant d.
-        weights: (l,) by which the residuals are multiplied.
-    """
-
-    a: Array
-    c: Array
-    gain: Array
-    expansion: Expansion
-    experiments: int
-    feedthrough: tuple[bool, ...]
-    offset: bool
-    weights: Array
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return len(self.a)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.c)
-
-    @property
-    def linear(self) -> int:
-        """Number of unknowns outside the blocks: initial states and offset."""
-        return self.experiments * self.n + self.l * self.offset
-
-    @property
-    def blocks(self) -> tuple[tuple[int, int], ...]:
-        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
-        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
-        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
-
-    def block(self, i: int) -> slice:
-        """Positions of vec Theta_i in z."""
-        sizes = [p * b for p, b in self.blocks]
-        start = self.linear + sum(sizes[:i])
-        return slice(start, start + sizes[i])
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.linear + sum(p * b for p, b in self.blocks)
-
-    @property
-    def channels(self) -> list[str]:
-        """Names of the channels in words, those of the feedback last."""
-        x = self.expansion
-        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
-
-    @cached_property
-    def columns(self) -> NDArray[np.intp]:
-        """Where the unknowns z stand in [x0 of all experiments | d | D row by row | B and E column by column]."""
-        n, l, p = self.n, self.l, self.expansion.p  # noqa: E741
-        found, start = [np.arange(self.linear)], 0
-        for functions, entries in self.blocks:
-            position = start + np.arange(functions)[:, None]
-            inner = self.linear + l * p + position * n + np.arange(n)
-            found.append(np.hstack([inner, self.linear + np.arange(entries - n) * p + position]).ravel(order="F"))
-            start += functions
-        return np.concatenate(found)
-
-    def names(self) -> list[str]:
-        """Name the unknowns in words for messages."""
-        named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
-        named += ["the offset"] * (self.l * self.offset)
-        for channel, (p, b) in zip(self.channels, self.blocks):
-            named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
-        return named
-
-
-@dataclass(frozen=True, eq=False)
-class ObserverProblem:
-    """The compressed step.
-
-    Attributes:
-        form: the layout.
-        problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
-        rows: equations used.
-        instrumented: whether the normal equations are those of instruments.
-    """
-
-    form: ObserverForm
-    problem: RankOne
-    rows: int
-    instrumented: bool = False
-
-    def least_squares(self) -> Array:
-        """Return the unrestricted minimiser z.
-
-        Raises:
-            RankError: the record does not determine it; names the first unknown that is lost.
-        """
-        root, norms = self.problem.root, np.linalg.norm(self.problem.root, axis=0)
-        lost = np.abs(np.diag(root)) <= 1e-10 * np.where(norms > 0, norms, 1.0)
-        if lost.any():
-            raise RankError(f"The record does not determine {self.form.names()[int(np.argmax(lost))]}: the regressors "
-                            "before it explain its effect. Use a longer or richer record, fewer functions, a lower "
-                            "order, or leave the channel out.")
-        return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
-
-    def ratios(self) -> dict[str, float]:
-        """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
-        z, found = self.least_squares(), {}
-        for i, (name, shape) in enumerate(zip(self.form.channels, self.form.blocks)):
-            if min(shape) > 1:
-                values = np.linalg.svd(z[self.form.block(i)].reshape(shape, order="F"), compute_uv=False)
-                name = name if i >= self.form.expansion.m else f"channel {name}"
-                found[f"second over first singular value, {name}"] = float(values[1] / values[0])
-        return found
-
-    def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
-        form, x = self.form, self.form.expansion
-        direct, inner = form.linear, form.linear + form.l * x.p
-        found = np.zeros(inner + form.n * (x.p + x.q))
-        found[form.columns] = z
-        effects, states = found[inner:].reshape(-1, form.n).T, form.experiments * form.n
-        offset = found[states:direct] if form.offset else np.zeros(form.l)
-        return (effects[:, : x.p], found[direct:inner].reshape(form.l, x.p), effects[:, x.p :], offset,
-                found[:states].reshape(form.experiments, form.n))
-
-
 def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
-                     targets: Sequence[Array] | None = None) -> ObserverProblem:
+                     targets: Sequence[Array] | None = None) -> Realisation:
     """Compress the step.
 
     Args:
@@ -217,7 +77,7 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, *, instrument
     size = form.size
     remainder = float(triangle[size, size] ** 2) if len(triangle) > size else 0.0
     problem = RankOne(triangle[:size, :size], triangle[:size, size], remainder, form.blocks, form.linear, energy)
-    return ObserverProblem(form, problem, rows, bool(extra))
+    return Realisation(form, problem, rows, bool(extra))
 
 
 class _Regressors:
@@ -294,17 +154,3 @@ class _Regressors:
             rows[:, direct:inner] -= np.einsum("kji,io->koj", out[:, 1 : 1 + p], form.gain).reshape(count, -1)
             rows[:, -1] -= np.einsum("kji,ij->k", out[:, past + 1 :], form.gain)
         return rows
-
-
-def observer_gain(a: Array, c: Array, noise: float = 1.0) -> Array:
-    """Return the steady Kalman gain (n, l) for unit process noise in balanced coordinates: A - L C is stable.
-
-    Args:
-        a: (n, n).
-        c: (l, n).
-        noise: variance of the measurement noise relative to the mean energy of the rows of C.
-    """
-    from optid.models.kalman import kalman_gain
-
-    level = noise * float(np.mean(np.sum(c**2, axis=1)))
-    return kalman_gain(a, c, np.eye(len(a)), level * np.eye(len(c))).K

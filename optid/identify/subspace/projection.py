@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import DataWarning, StructureError
+from optid.errors import DataWarning
+from optid.identify.arguments import one_of
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import RQ, rq
@@ -27,7 +28,6 @@ class Projection:
     Attributes:
         statistics: moments of the windows of 2 block_rows samples.
         blocks: the RQ decomposition.
-        instruments: word of the instruments.
         scale: (l,) standard deviations of the outputs; one output is left as it is.
         weighting: of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not
             lost), "cva" (the inverse root of the covariance of the future outputs with the regressors removed, so that
@@ -37,7 +37,6 @@ class Projection:
 
     statistics: HankelStatistics
     blocks: RQ
-    instruments: str
     scale: Array
     weighting: str = WEIGHTINGS[0]
 
@@ -94,8 +93,7 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
         StructureError: unknown words.
         RankError: records that are too short, or do not excite the regressors.
     """
-    if instruments not in INSTRUMENTS:
-        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
+    one_of("instruments", instruments, INSTRUMENTS)
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     statistics.check()
@@ -105,51 +103,12 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
-    return Projection(statistics, blocks, instruments, scale, weighting)
+    return Projection(statistics, blocks, scale, weighting)
 
 
 def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
     """Return (A, C) from Gamma (rows l, n) by least squares on its shift invariance."""
     return np.asarray(np.linalg.lstsq(gamma[:-l], gamma[l:], rcond=None)[0], dtype=float), gamma[:l].copy()
-
-
-def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
-    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
-
-    Args:
-        gamma: (rows l, n) in units of the outputs.
-        scale: (l,) sizes of the outputs.
-    """
-    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
-    return realise(scaled, len(scale))[0], gamma[: len(scale)].copy(), scaled
-
-
-def largest_gap(values: Array, largest: int) -> int:
-    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
-
-    Values below the rounding of the decomposition count as that rounding.
-
-    Args:
-        values: singular values, largest first.
-        largest: highest order to consider.
-    """
-    floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
-    ratios = floor[:-1] / floor[1:]
-    return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
-
-
-def check_order(nx: int, block_rows: int, outputs: int) -> None:
-    """Refuse an order that the block rows cannot carry.
-
-    Raises:
-        StructureError: with the largest order possible.
-    """
-    if block_rows <= nx:
-        raise StructureError(f"{block_rows} block rows for order {nx}: more block rows than states are needed; use "
-                             f"block_rows={nx + 1} or more, or nx={block_rows - 1} or less.")
-    if nx > (block_rows - 1) * outputs:
-        raise StructureError(f"order {nx} with {block_rows} block rows and {outputs} outputs: at most "
-                             f"{(block_rows - 1) * outputs}.")
 
 
 def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:

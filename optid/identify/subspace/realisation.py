@@ -1,19 +1,109 @@
-"""The unknowns of the step for B, D, E, offset and x0 by name: where a search starts, and how its answer is read."""
+"""The step for (B, D, E, offset, x0) with A and C known: its unknowns, where a search starts, how its answer is read.
+
+`optid.identify.subspace.observer` compresses a record into it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases import Linear
-from optid.identify.subspace.observer import ObserverProblem
+from optid.errors import RankError
+from optid.statistics.expansion import Expansion
 from optid.structures.bilinear import starts
-from optid.structures.rank_one import reduce
+from optid.structures.rank_one import RankOne, matrices, reduce
 from optid.structures.whitening import leading_pair
 
 Values = Mapping[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverForm:
+    """What is known and how the unknowns are laid out.
+
+    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
+    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
+
+    Attributes:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) observer gain L.
+        expansion: the signals.
+        experiments: number of experiments.
+        feedthrough: whether every input acts on the outputs at once.
+        offset: whether there is a constant d.
+        weights: (l,) by which the residuals are multiplied.
+    """
+
+    a: Array
+    c: Array
+    gain: Array
+    expansion: Expansion
+    experiments: int
+    feedthrough: tuple[bool, ...]
+    offset: bool
+    weights: Array
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.c)
+
+    @property
+    def linear(self) -> int:
+        """Number of unknowns outside the blocks: initial states and offset."""
+        return self.experiments * self.n + self.l * self.offset
+
+    @property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
+        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
+        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
+
+    def thetas(self, z: Array) -> list[Array]:
+        """Return the matrices Theta_i of the unknowns z."""
+        return matrices(z[self.linear :], self.blocks)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.columns)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels in words, those of the feedback last."""
+        x = self.expansion
+        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """Where the unknowns z stand in [x0 of all experiments | d | D row by row | B and E column by column]."""
+        n, l, p = self.n, self.l, self.expansion.p  # noqa: E741
+        found, start = [np.arange(self.linear)], 0
+        for functions, entries in self.blocks:
+            position = start + np.arange(functions)[:, None]
+            inner = self.linear + l * p + position * n + np.arange(n)
+            found.append(np.hstack([inner, self.linear + np.arange(entries - n) * p + position]).ravel(order="F"))
+            start += functions
+        return np.concatenate(found)
+
+    def names(self) -> list[str]:
+        """Name the unknowns in words for messages."""
+        named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
+        named += ["the offset"] * (self.l * self.offset)
+        for channel, (p, b) in zip(self.channels, self.blocks):
+            named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
+        return named
 
 
 class Factors(NamedTuple):
@@ -38,19 +128,59 @@ class Factors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Realisation:
-    """The step in named unknowns: one pair of factors per channel, or one matrix.
+    """The compressed step, in named unknowns: one pair of factors per channel, or one matrix.
 
     Attributes:
-        step: the compressed least squares.
+        form: the layout.
+        problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
+        rows: equations used.
+        instrumented: whether the normal equations are those of instruments.
         factored: whether channels are rank one in the programme itself.
     """
 
-    step: ObserverProblem
-    factored: bool
+    form: ObserverForm
+    problem: RankOne
+    rows: int
+    instrumented: bool = False
+    factored: bool = False
+
+    def least_squares(self) -> Array:
+        """Return the unrestricted minimiser z.
+
+        Raises:
+            RankError: the record does not determine it; names the first unknown that is lost.
+        """
+        root, norms = self.problem.root, np.linalg.norm(self.problem.root, axis=0)
+        lost = np.abs(np.diag(root)) <= 1e-10 * np.where(norms > 0, norms, 1.0)
+        if lost.any():
+            raise RankError(f"The record does not determine {self.form.names()[int(np.argmax(lost))]}: the regressors "
+                            "before it explain its effect. Use a longer or richer record, fewer functions, a lower "
+                            "order, or leave the channel out.")
+        return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
+
+    def ratios(self) -> dict[str, float]:
+        """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
+        found = {}
+        for i, (name, theta) in enumerate(zip(self.form.channels, self.form.thetas(self.least_squares()))):
+            if min(theta.shape) > 1:
+                values = np.linalg.svd(theta, compute_uv=False)
+                name = name if i >= self.form.expansion.m else f"channel {name}"
+                found[f"second over first singular value, {name}"] = float(values[1] / values[0])
+        return found
+
+    def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
+        form, x, states = self.form, self.form.expansion, self.form.experiments * self.form.n
+        thetas = form.thetas(z)
+        effects = np.hstack([theta[:, : form.n].T for theta in thetas])
+        direct = [theta[:, form.n :].T if direct else np.zeros((form.l, len(theta)))
+                  for theta, direct in zip(thetas, form.feedthrough)]
+        offset = z[states : form.linear] if form.offset else np.zeros(form.l)
+        return effects[:, : x.p], np.hstack(direct), effects[:, x.p :], offset, z[:states].reshape(-1, form.n)
 
     def names(self, i: int) -> tuple[str, str, str]:
         """Names of the two factors and of the matrix of channel i: ``mu[valve]``, ``mu feedback[level]``."""
-        x = self.step.form.expansion
+        x = self.form.expansion
         if i < x.m:
             kind, several, channel = "", x.m > 1, x.input_names[i]
         else:
@@ -64,20 +194,18 @@ class Realisation:
         Raises:
             RankError: naming what the record does not determine.
         """
-        step, form = self.step, self.step.form
-        z = step.least_squares()
-        point = None
+        form, z, point = self.form, self.least_squares(), None
         if self.factored:
-            core = reduce(step.problem)
+            core = reduce(self.problem)
             point = core.point(*starts(core, count=1)[0])
-        linear = z[: step.problem.linear] if point is None else point.w
+        linear = z[: form.linear] if point is None else point.w
         states = form.n * form.experiments
         x0 = linear[:states] if form.experiments == 1 else linear[:states].reshape(form.n, form.experiments, order="F")
         found = {"x0": np.array(x0)} | ({"offset": np.array(linear[states:])} if form.offset else {})
-        for i, (p, b) in enumerate(form.blocks):
+        for i, (value, (p, b)) in enumerate(zip(form.thetas(z), form.blocks)):
             mu, entries, theta = self.names(i)
             if point is None:
-                found[theta] = z[form.block(i)].reshape((p, b), order="F")
+                found[theta] = value
             else:
                 empty = not np.any(point.bs[i])
                 found[mu] = np.zeros(p) if empty else point.mus[i]
@@ -86,15 +214,14 @@ class Realisation:
 
     def factors(self, values: Values) -> Factors:
         """Read a point; a matrix is split in the Kronecker metric of the least squares."""
-        form, pairs, core = self.step.form, [], None
-        x = form.expansion
+        form, x, pairs, core = self.form, self.form.expansion, [], None
         for i, shape in enumerate(form.blocks):
             first, second, whole = self.names(i)
             if first in values:
                 mu, b = np.asarray(values[first]), np.asarray(values[second])
             else:
                 theta = np.reshape(values[whole], shape)
-                core = core or reduce(self.step.problem)
+                core = core or reduce(self.problem)
                 if i in core.kept:
                     place = core.kept.index(i)
                     mu, b = leading_pair(theta, core.whitening.factors_mu[place], core.whitening.factors_b[place])
