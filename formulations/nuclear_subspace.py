@@ -29,7 +29,7 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
-from optid.identify.subspace.low_rank import Structured, choose_weight, order_of, rank_of, structure
+from optid.identify.subspace.low_rank import Structured, choose_weight, structure
 from optid.identify.subspace.observability import Observability, prepared
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.program.program import Program, Values
@@ -118,8 +118,7 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
     vectors, sizes = structured.decomposed(solution.values)
-    rank = rank_of(sizes, structured.floor)
-    nx = plan.order or order_of(sizes, alpha - 1, structured.floor)
+    rank, nx = structured.rank(sizes), plan.order or structured.order(sizes)
     if nx > rank:
         return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "
                                                  "use a larger weight or a smaller order")

@@ -12,12 +12,12 @@ from formulations.nuclear_subspace import certify, nuclear_programme
 from optid.backends import Answer, Settings, find
 from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
-from optid.identify.subspace.low_rank import held_out_fit, order_of, structure
+from optid.identify.subspace.low_rank import Structured, held_out_fit, structure
 from optid.identify.subspace.observability import prepared
 from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
 from optid.solving.solve import solve
-from optid.structures.nuclear_norm import NuclearNormStructure
+from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
 
 A = np.array([[0.8, 0.4], [-0.4, 0.8]])
 B, C = np.array([[1.0, 0.2], [0.5, -0.7]]), np.array([[1.0, 0.3], [-0.2, 0.8]])
@@ -205,8 +205,10 @@ def test_contradicting_regions_are_named():
 
 
 def test_the_order_is_the_number_of_singular_values_that_count():
-    assert order_of(np.array([10.0, 5.0, 0.02, 0.009, 0.0]), 9) == 3
-    assert order_of(np.full(30, 1.0), 40) == 10 and order_of(np.full(30, 1.0), 4) == 4
+    found = [Structured(NuclearProblem(np.zeros((50, 1)), np.arange(10), rows), np.zeros(1), np.ones(1), 1.0)
+             for rows in (10, 40, 5)]
+    assert found[0].order(np.array([10.0, 5.0, 0.02, 0.009, 0.0])) == 3
+    assert found[1].order(np.full(30, 1.0)) == 10 and found[2].order(np.full(30, 1.0)) == 4
 
 
 def test_scales_and_offsets_of_the_channels_do_not_matter():

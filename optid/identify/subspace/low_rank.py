@@ -21,8 +21,7 @@ from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_star
 
 Values = Mapping[str, Array]
 
-RANK = 1e-3  # singular values below this part of the largest are none
-NOTHING = 1e-5  # of the largest singular value of the measured outputs' matrix
+RANK, NOTHING = 1e-3, 1e-5  # singular values below this part of the largest, of that of measured outputs, are none
 LARGEST = 10  # order at most where it is chosen
 SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposition costs
 
@@ -43,10 +42,13 @@ class Structured:
     scale: Array
     size: float
 
-    @property
-    def floor(self) -> float:
-        """Singular values below it are none: a weight so small that nothing is left of the matrix has rank zero."""
-        return NOTHING * self.size
+    def rank(self, sizes: Array) -> int:
+        """Return how many singular values count; with a weight so small that nothing is left of the matrix, none."""
+        return int(np.sum((sizes > RANK * sizes[0]) & (sizes > NOTHING * self.size)))
+
+    def order(self, sizes: Array) -> int:
+        """Return the rank, one at least, `LARGEST` and what the block rows can carry at most."""
+        return int(np.clip(self.rank(sizes), 1, min(LARGEST, self.problem.rows - 1)))
 
     def penalty(self, weight: float) -> float:
         """Return lambda for a weight: the inverse noise variance times the size per output sample."""
@@ -95,10 +97,9 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
         preliminary: returns the least-squares model of an observability matrix.
     """
     part, rest = plan.data.split(1 - hold_out)
-    train = replace(plan, data=part)
-    expansion, alpha = prepared(replace(train, block_rows=prepared(plan)[1]))
-    structured = structure(train, expansion, alpha)
-    trials: list[tuple[float, float, int]] = []
+    train = replace(plan, data=part, block_rows=prepared(plan)[1])
+    expansion, alpha = prepared(train)
+    structured, trials = structure(train, expansion, alpha), []
     program = pose(structured)
     for weight in weights:
         program.parameters["weight"].value = structured.penalty(weight)
@@ -126,33 +127,24 @@ def order_scores(plan: Plan, expansion: Expansion, structured: Structured, value
         preliminary: as in `choose_weight`.
     """
     vectors, sizes = structured.decomposed(values)
-    most = min(rank_of(sizes, structured.floor), structured.problem.rows - 1)
-    orders = range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most)
+    most = min(structured.rank(sizes), structured.problem.rows - 1)
     found = {}
-    for nx in orders:
+    for nx in range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most):
         try:
             gamma = structured.gamma(vectors, sizes, nx, values)
             model = preliminary(Observability(plan, plan.records, expansion, gamma, structured.scale))
-            found[nx] = held_out_fit(model, rest)
+            score = held_out_fit(model, rest)
         except (RankError, DataError):  # an order this part of the record cannot carry is no candidate
             continue
-    return {nx: score for nx, score in found.items() if np.isfinite(score)}
+        if np.isfinite(score):
+            found[nx] = score
+    return found
 
 
 def held_out_fit(model: Any, data: Data) -> float:
     """Mean simulation fit in % over the outputs, initial states fitted; with feedback that of measured outputs."""
     outputs = simulated(model, data, MEASURED if model.feedback else SIMULATION)
     return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(outputs))))
-
-
-def rank_of(sizes: Array, floor: float = 0.0) -> int:
-    """Return the number of singular values above a thousandth of the largest and above a floor."""
-    return int(np.sum((sizes > RANK * sizes[0]) & (sizes > floor)))
-
-
-def order_of(sizes: Array, most: int, floor: float = 0.0) -> int:
-    """Return the rank, one at least, `LARGEST` at most."""
-    return int(np.clip(rank_of(sizes, floor), 1, min(LARGEST, most)))
 
 
 def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
