@@ -28,7 +28,6 @@ import numpy as np
 
 import optid
 from formulations.nuclear_subspace import nuclear_programme
-from formulations.subspace_procedure import preliminary
 from optid.backends import Settings, find
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
 from optid.identify.subspace.observability import prepared
@@ -74,7 +73,7 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
         clock = time.process_time()
         solution = solve(program, "admm", accuracy=1e-7)
         seconds += time.process_time() - clock
-        for n, score in order_scores(plan, expansion, structured, solution.values, test, preliminary).items():
+        for n, score in order_scores(plan, expansion, structured, solution.values, test).items():
             found[float(weight), n] = score
     return found, seconds
 

@@ -23,7 +23,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.subspace_procedure import completed, preliminary
+from formulations.subspace_procedure import identified
 from optid.bases import Bases, FeedbackBases
 from optid.data.channels import Transform
 from optid.data.record import Data
@@ -108,7 +108,7 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     trials, weight = {}, weights[0]
     if len(weights) > 1:
         pose = partial(nuclear_programme, penalty=1.0, units=plan.units)
-        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, pose, preliminary)
+        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, pose)
         plan = replace(plan, nx=nx)
     expansion, alpha = prepared(plan)
     structured = structure(plan, expansion, alpha)
@@ -130,7 +130,7 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
                "missing outputs estimated": int(np.sum(~structured.problem.known))}
     gamma = structured.gamma(vectors, sizes, nx, solution.values)
     found = Observability(plan, plan.records, expansion, gamma, structured.scale, figures)
-    evidence = yield from completed(plan, found)
+    evidence = yield from identified(plan, found)
     if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status in (Status.LOCAL, Status.OPTIMAL):
         evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
     return evidence

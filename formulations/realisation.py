@@ -25,6 +25,7 @@ import numpy as np
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.data.channels import Transform
+from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.realisation import Realisation
 from optid.program.expressions import flat
 from optid.program.program import Program
@@ -36,17 +37,9 @@ RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
 
 
-def realisation_programme(realisation: Realisation, name: str, units: Transform, constraints: Sequence[Any] = ()
-                          ) -> Program:
-    """Pose the step; ``recover`` gives `optid.identify.subspace.realisation.Factors`.
-
-    Args:
-        realisation: the least squares and its form.
-        name: name of the formulation.
-        units: from those of the step to those of the record, in which the constraints speak.
-        constraints: builders, about the coefficients.
-    """
-    problem, form = realisation.problem, realisation.form
+def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
+    """Pose the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
+    problem, form, units = realisation.problem, realisation.form, plan.units
     shape = form.n if form.experiments == 1 else (form.n, form.experiments)
     linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
                                                       if form.offset else {})
@@ -68,11 +61,11 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
     structural = {"residual": (residual == error,), **gauge}
     relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
     return Program(
-        name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
-        {**variables, "residual": residual}, realisation.start(), realisation.factors,
+        plan.name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
+        {**variables, "residual": residual}, realisation.start(), partial(realisation.model, plan.data),
         _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
         scale=problem.scale, unit=1.0 if relative else energy_unit(units),
-        structure=structure, certify=certify).subject_to(*constraints)
+        structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
 
 
 def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]

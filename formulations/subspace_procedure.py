@@ -20,18 +20,21 @@ from optid.certificate.simulation_bound import simulation_bound
 from optid.data.record import Data
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
-from optid.identify.prediction_error.state_errors import state_model
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
 from optid.identify.subspace.plan import Plan
-from optid.identify.subspace.realisation import Realisation, Values
+from optid.identify.subspace.realisation import Realisation
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 
 
-def identified(plan: Plan) -> Procedure:
+def identified(plan: Plan, found: Observability | None = None) -> Procedure:
     """Run the steps of a plan.
+
+    Args:
+        plan: what was asked for.
+        found: the observability matrix, with what was measured before; None for that of projections.
 
     Yields:
         The programmes of the steps under constraints and of the step in B, D, E and x0.
@@ -39,22 +42,7 @@ def identified(plan: Plan) -> Procedure:
     Returns:
         The model with singular values, condition of R11 and further figures.
     """
-    return (yield from completed(plan, estimate_observability(plan, _estimated)))
-
-
-def completed(plan: Plan, found: Observability) -> Procedure:
-    """Run the steps after the observability matrix.
-
-    Args:
-        plan: what was asked for.
-        found: the observability matrix, with what was measured before.
-
-    Yields:
-        The programmes of the steps.
-
-    Returns:
-        The evidence, with figures added.
-    """
+    found = estimate_observability(plan) if found is None else found
     a, gamma, l, figures = found.least_squares(), found.scaled, plan.data.l, dict(found.figures)  # noqa: E741
     doubt, rules = "", plan.about("poles")
     if rules or plan.stability == "auto" and spectral_radius(a) >= 1:
@@ -70,41 +58,20 @@ def completed(plan: Plan, found: Observability) -> Procedure:
         a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
     step = found.step(a)
     step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
-    program = realisation_programme(step, plan.name, plan.units, plan.about("coefficients"))
+    program = realisation_programme(step, plan)
     solution: Solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
-    model = _model(plan, step, solution.values)
+    model = program.recover(solution.values)
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
     return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
                     status, reason, figures | step.ratios(), partial(_with_noise, model, plan.data))
 
 
-def preliminary(found: Observability) -> HammersteinSS:
-    """Return the least-squares model of an observability matrix, for comparisons: no constraints, A contracted.
-
-    Raises:
-        RankError: the record does not determine it.
-    """
-    step = found.step(found.contracted())
-    return _model(found.plan, step, step.start())
-
-
-def _estimated(found: Observability) -> HammersteinSS:
-    return with_noise_or_reason(preliminary(found), found.plan.data)[0]
-
-
 def _with_noise(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, Any]]:
     model, remark = with_noise_or_reason(model, data)
     return model, {"noise model": remark} if remark else {}
-
-
-def _model(plan: Plan, step: Realisation, values: Values) -> HammersteinSS:
-    form, factors = step.form, step.factors(values)
-    model = state_model(form.expansion, plan.data, (form.a, factors.B, form.c, factors.D), factors.mus, factors.nus,
-                        factors.E, offset=factors.offset)
-    return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
 
 
 def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:

@@ -9,7 +9,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.subspace.observability import Observability, Preliminary, prepared
+from optid.identify.subspace.observability import Observability, prepared
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
 from optid.identify.validation import fit_percent
@@ -85,8 +85,8 @@ class Structured:
         return np.vstack(blocks)
 
 
-def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program],
-                  preliminary: Preliminary) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
+def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program]
+                  ) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
     """Return the weight, and where it is free the order, whose model simulates the parts held out best, and figures.
 
     Args:
@@ -94,7 +94,6 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
         weights: those to try.
         hold_out: part of every experiment that is held out.
         pose: returns the programme of a structured problem, with a parameter "weight".
-        preliminary: returns the least-squares model of an observability matrix.
     """
     part, rest = plan.data.split(1 - hold_out)
     train = replace(plan, data=part, block_rows=prepared(plan)[1])
@@ -106,7 +105,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
         solution = yield program
         if solution.has_point:
             program = replace(program, start={name: solution.values[name] for name in program.start})
-            scores = order_scores(train, expansion, structured, solution.values, rest, preliminary)
+            scores = order_scores(train, expansion, structured, solution.values, rest)
             trials += [(score, weight, nx) for nx, score in scores.items()]
     if not trials:
         return weights[-1], plan.nx, {"weights tried": len(weights)}
@@ -114,8 +113,8 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
     return weight, nx, {"weights tried": len(weights), "simulation fit on the part held out in %": score}
 
 
-def order_scores(plan: Plan, expansion: Expansion, structured: Structured, values: Values, rest: Data,
-                 preliminary: Preliminary) -> dict[int, float]:
+def order_scores(plan: Plan, expansion: Expansion, structured: Structured, values: Values, rest: Data
+                 ) -> dict[int, float]:
     """Return the simulation fit in % on another record of the model of every order that a point allows.
 
     Args:
@@ -124,7 +123,6 @@ def order_scores(plan: Plan, expansion: Expansion, structured: Structured, value
         structured: the problem.
         values: a point of its programme.
         rest: the other record.
-        preliminary: as in `choose_weight`.
     """
     vectors, sizes = structured.decomposed(values)
     most = min(structured.rank(sizes), structured.problem.rows - 1)
@@ -132,7 +130,7 @@ def order_scores(plan: Plan, expansion: Expansion, structured: Structured, value
     for nx in range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most):
         try:
             gamma = structured.gamma(vectors, sizes, nx, values)
-            model = preliminary(Observability(plan, plan.records, expansion, gamma, structured.scale))
+            model = Observability(plan, plan.records, expansion, gamma, structured.scale).model()
             score = held_out_fit(model, rest)
         except (RankError, DataError):  # an order this part of the record cannot carry is no candidate
             continue

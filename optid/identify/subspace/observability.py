@@ -1,7 +1,6 @@
 """The observability matrix of a record: order, weighting, missing outputs and simulated instruments."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
-from optid.identify.noise import observer_gain
+from optid.identify.noise import observer_gain, with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
 from optid.identify.subspace.imputation import count_windows, impute
 from optid.identify.subspace.instruments import simulate_clipped
@@ -84,9 +83,14 @@ class Observability:
         return observer_problem(self.records, form, instruments=coloured,
                                 targets=[record[:, plan.data.m :] for record in plan.records])
 
+    def model(self) -> HammersteinSS:
+        """Return the least-squares model, for comparisons: no constraints, A contracted.
 
-Preliminary = Callable[[Observability], HammersteinSS]
-"""Returns the least-squares model with its noise model, without constraints."""
+        Raises:
+            RankError: the record does not determine it.
+        """
+        step = self.step(self.contracted())
+        return step.model(self.plan.data, step.start())
 
 
 def prepared(plan: Plan) -> tuple[Expansion, int]:
@@ -106,12 +110,8 @@ def prepared(plan: Plan) -> tuple[Expansion, int]:
     return expansion, alpha
 
 
-def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observability:
+def estimate_observability(plan: Plan) -> Observability:
     """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
-
-    Args:
-        plan: what is asked for.
-        preliminary: of a record with estimated outputs.
 
     Raises:
         RankError: the record does not determine the model.
@@ -122,7 +122,7 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
     expansion, alpha = prepared(plan)
     windows, imputed = _Windows(plan, plan.records, expansion, alpha), {}
     if _lacks_windows(plan, expansion, alpha):
-        filled, how = impute(plan.data, lambda records: _estimated(replace(windows, records=records), preliminary))
+        filled, how = impute(plan.data, lambda records: _preliminary(replace(windows, records=records)))
         windows, imputed = replace(windows, records=filled), {"missing outputs": how}
         warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {how}. The "
                       "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
@@ -161,14 +161,15 @@ def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
     return complete < INTACT * candidates and complete < SCARCE * 2 * alpha * (expansion.p + expansion.q + expansion.l)
 
 
-def _estimated(windows: "_Windows", preliminary: Preliminary) -> HammersteinSS:
-    """Return the preliminary model of records whose missing outputs are estimated."""
+def _preliminary(windows: "_Windows") -> HammersteinSS:
+    """Return the model, with its noise model, of records whose missing outputs are estimated."""
     plan = windows.plan
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
         if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
             plan = replace(plan, instruments=f"{plan.instruments}+past")
-        return preliminary(replace(windows, plan=plan).instrumented().ordered())
+        found = replace(windows, plan=plan).instrumented().ordered()
+        return with_noise_or_reason(found.model(), plan.data)[0]
 
 
 @dataclass(frozen=True, eq=False)

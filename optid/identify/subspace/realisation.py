@@ -3,17 +3,19 @@
 `optid.identify.subspace.observer` compresses a record into it.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases import Linear
+from optid.data.channels import model_meta
+from optid.data.record import Data
 from optid.errors import RankError
+from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import Expansion
 from optid.structures.bilinear import starts
 from optid.structures.rank_one import RankOne, matrices, reduce
@@ -106,26 +108,6 @@ class ObserverForm:
         return named
 
 
-class Factors(NamedTuple):
-    """What the step answers.
-
-    Attributes:
-        B: (n, m).
-        D: (l, m).
-        E: (n, s), one column per feedback family.
-        mus: coefficients of the nonlinearity of every input.
-        nus: coefficients of every feedback family in its orthonormal coordinates.
-        offset: (l,).
-    """
-
-    B: Array
-    D: Array
-    E: Array
-    mus: list[Array]
-    nus: list[Array]
-    offset: Array
-
-
 @dataclass(frozen=True, eq=False)
 class Realisation:
     """The compressed step, in named unknowns: one pair of factors per channel, or one matrix.
@@ -212,8 +194,8 @@ class Realisation:
                 found[entries] = np.full(b, 1 / np.sqrt(b)) if empty else point.bs[i]
         return found
 
-    def factors(self, values: Values) -> Factors:
-        """Read a point; a matrix is split in the Kronecker metric of the least squares."""
+    def model(self, data: Data, values: Values) -> HammersteinSS:
+        """Return the model of a point; a matrix is split in the Kronecker metric of the least squares."""
         form, x, pairs, core = self.form, self.form.expansion, [], None
         for i, shape in enumerate(form.blocks):
             first, second, whole = self.names(i)
@@ -231,9 +213,10 @@ class Realisation:
         n, l, m = form.n, form.l, x.m  # noqa: E741
         mus, bs = [mu for mu, _ in pairs], [b for _, b in pairs]
         direct = [b[n:] if len(b) > n else np.zeros(l) for b in bs[:m]]
-        return Factors(np.column_stack([b[:n] for b in bs[:m]]), np.column_stack(direct),
-                       np.column_stack([np.zeros((n, 0)), *bs[m:]]), mus[:m], mus[m:],
-                       np.asarray(values["offset"]) if form.offset else np.zeros(l))
+        matrices = form.a, np.column_stack([b[:n] for b in bs[:m]]), form.c, np.column_stack(direct)
+        found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]),
+                            offset=np.asarray(values["offset"]) if form.offset else np.zeros(l))
+        return replace(found, gauge="norm") if any(basis.size > 1 for basis in x.inputs) else found
 
 
 def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
@@ -245,3 +228,28 @@ def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
         return np.zeros_like(mu), np.full(len(b), 1 / np.sqrt(len(b)))
     length *= float(np.sign(b[int(np.argmax(np.abs(b)))]))
     return mu * length, b / length
+
+
+def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
+                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
+    """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
+
+    Args:
+        expansion: the signals of the fit.
+        data: the record, for names, units and sampling time.
+        matrices: A (n, n), B (n, m), C (l, n) and D (l, m).
+        mus: coefficients of the nonlinearity of every input.
+        nus: coefficients of every feedback family in its orthonormal coordinates.
+        e: (n, s), one column per family.
+        K: (n, l), zero where None.
+        offset: (l,) of the output, zero where None.
+    """
+    families = expansion.feedback
+    parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
+    injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
+    A, B, C, D = matrices
+    return HammersteinSS(
+        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
+        nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
+        feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
+        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))
