@@ -11,7 +11,7 @@ from optid.bases import feedback_bases
 from optid.cli.app import app
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.identify.design import design, frequency_response
-from optid.identify.design.promises import expanded_condition
+from optid.identify.design.excitation import expanded_condition
 from optid.identify.design.rules import check_feedback
 from optid.statistics.expansion import expand
 

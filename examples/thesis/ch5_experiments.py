@@ -12,7 +12,7 @@ from common import feedback_error
 
 import optid
 from optid import plants
-from optid.identify.design.promises import expanded_condition
+from optid.identify.design.excitation import expanded_condition
 from optid.identify.design.rules import check_lines
 from optid.statistics.expansion import expand
 
