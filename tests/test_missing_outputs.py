@@ -10,7 +10,7 @@ import scripts
 import optid
 from optid.data.record import Data
 from optid.errors import DataWarning, RankError
-from optid.identify.subspace.imputation import ROUNDS, count_windows, impute
+from optid.identify.subspace.imputation import ROUNDS, impute
 from optid.identify.validation import fit_percent
 from optid.registry import registered
 
@@ -114,14 +114,6 @@ def test_the_criterion_takes_the_samples_present_only(name):
     # the weights are the standard deviations over the windows; feedback of a missing output is that of its estimate
     assert fit.solution.objective == pytest.approx(np.nansum(errors**2), rel=0.05)
     assert fit.solution.objective == pytest.approx(0.8 * 2 * 2000 * np.nanmean(errors**2), rel=0.1)
-
-
-def test_complete_windows_are_counted():
-    rng = np.random.default_rng(0)
-    record = rng.normal(size=(60, 3))
-    record[[5, 6, 30], [0, 2, 1]] = np.nan
-    wide = np.lib.stride_tricks.sliding_window_view(record, 7, axis=0).reshape(54, -1)
-    assert count_windows([record, record[:4]], 7) == (int((~np.isnan(wide).any(axis=1)).sum()), 54)
 
 
 def test_the_true_model_is_a_fixed_point():

@@ -8,7 +8,7 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.innovations import innovation_form
 from optid.identify.noise import observer_gain
-from optid.identify.subspace.instruments import simulate_clipped
+from optid.identify.subspace.observability import simulate_clipped
 from optid.identify.subspace.observer import observer_problem
 from optid.identify.subspace.realisation import ObserverForm
 from optid.statistics.expansion import expand

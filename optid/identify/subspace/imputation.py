@@ -13,9 +13,8 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.data.stretches import interpolated, runs_of
+from optid.data.stretches import interpolated
 from optid.errors import DataError, RankError
-from optid.identify.subspace.instruments import clipping_range
 from optid.models.hammerstein_ss import HammersteinSS
 
 ROUNDS = 12
@@ -24,15 +23,15 @@ ROUNDS = 12
 SETTLED = 1e-3
 """Change of the estimates (root mean square, in standard deviations of their outputs) below which no model follows."""
 
+BEYOND = 0.2
+"""Estimated outputs are clipped to the range of the record, wider by this share of it on either side."""
 
-def count_windows(records: Sequence[Array], rows: int) -> tuple[int, int]:
-    """Return the number of windows of so many samples in which nothing is missing, and of all windows."""
-    complete = whole = 0
-    for record in records:
-        whole += max(len(record) - rows + 1, 0)
-        lengths = np.diff(runs_of(~np.isnan(record).any(axis=1)), axis=1)
-        complete += int(np.sum(np.maximum(lengths - rows + 1, 0)))
-    return complete, whole
+
+def clipping_range(outputs: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the limits (l,) of simulated outputs: those of outputs (N, l) on record, and `BEYOND`."""
+    low = np.nanmin([np.nanmin(y, axis=0) for y in outputs], axis=0)
+    high = np.nanmax([np.nanmax(y, axis=0) for y in outputs], axis=0)
+    return low - BEYOND * (high - low), high + BEYOND * (high - low)
 
 
 def _predicted(model: HammersteinSS, data: Data, filled: Sequence[Array]) -> list[Array]:

@@ -1,6 +1,7 @@
 """The observability matrix of a record: order, weighting, missing outputs and simulated instruments."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,8 +11,7 @@ from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.noise import observer_gain, with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
-from optid.identify.subspace.imputation import count_windows, impute
-from optid.identify.subspace.instruments import simulate_clipped
+from optid.identify.subspace.imputation import clipping_range, impute
 from optid.identify.subspace.observer import observer_problem
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
@@ -20,6 +20,7 @@ from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.statistics.channels import check_channels
 from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import complete_runs
 
 WEAK = 0.1
 """Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
@@ -27,6 +28,10 @@ WEAK = 0.1
 SCARCE, INTACT = 20, 0.8
 """Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 smaller share than this of all windows."""
+
+GRID, CHUNK = 2001, 8192
+"""Points at which feedback functions are tabulated for simulated instruments, which need not be exact, and samples
+expanded at a time."""
 
 INSIDE = 0.999
 """Modulus to which the poles of an unstable estimate are brought."""
@@ -157,8 +162,9 @@ def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
     gaps = any(plan.data.missing[name] for name in plan.data.outputs)
     if not gaps or plan.block_rows is not None and not plan.imputes:
         return False
-    complete, candidates = count_windows(plan.records, 2 * alpha)
-    return complete < INTACT * candidates and complete < SCARCE * 2 * alpha * (expansion.p + expansion.q + expansion.l)
+    rows, runs = 2 * alpha, [run for record in plan.records for run in complete_runs(record, 2 * alpha)]
+    complete, candidates = (sum(max(len(part) - rows + 1, 0) for part in parts) for parts in (runs, plan.records))
+    return complete < INTACT * candidates and complete < SCARCE * rows * (expansion.p + expansion.q + expansion.l)
 
 
 def _preliminary(windows: "_Windows") -> HammersteinSS:
@@ -259,3 +265,44 @@ class _Windows:
             raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more "
                             "block rows or a richer input.")
         return nx, reason
+
+
+def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
+                     ez: Array, d: Array) -> list[Array]:
+    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
+
+    The functions of a missing input count as zero.
+
+    Args:
+        records: raw channels [u | y], one per experiment.
+        expansion: the signals; its feedback functions may be empty.
+        a: (n, n).
+        c: (l, n).
+        bu: (n, p).
+        du: (l, p).
+        ez: (n, q).
+        d: (l,) offset.
+    """
+    from optid.statistics.subspace_kernels import clipped_run
+
+    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
+    low, high = clipping_range([record[:, m : m + l] for record in records])
+    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
+    start = 0
+    for family in expansion.feedback:
+        e = ez[:, start : start + family.size]
+        grid = np.linspace(low[family.output], high[family.output], GRID)
+        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
+        start += family.size
+    simulated = []
+    open_loop = expansion.without_feedback()
+    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
+    for record in records:
+        out, x = np.empty((len(record), l)), np.zeros(n)
+        for first in range(0, len(record), CHUNK):
+            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
+            eta = np.where(np.isnan(eta), 0.0, eta)
+            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
+                        out[first : first + CHUNK])
+        simulated.append(out)
+    return simulated
