@@ -31,12 +31,16 @@ class Structured:
     """The structured problem of a record, in outputs of mean zero and unit variance.
 
     Attributes:
+        plan: what was asked for.
+        expansion: the signals.
         problem: the numbers.
         centre: (l,) subtracted from the outputs.
         scale: (l,) by which they were divided.
         size: largest singular value of the matrix of the measured outputs.
     """
 
+    plan: Plan
+    expansion: Expansion
     problem: NuclearProblem
     centre: Array
     scale: Array
@@ -63,11 +67,13 @@ class Structured:
             left = np.linalg.solve(problem.left, left)
         return left * np.tile(self.scale, problem.rows)[:, None], sizes
 
-    def gamma(self, vectors: Array, sizes: Array, nx: int, values: Values) -> Array:
-        """Return the observability matrix (rows l, nx) of (A, C) in coordinates with states of about unit size.
+    def observability(self, values: Values, parts: tuple[Array, Array], nx: int) -> Observability:
+        """Return the observability matrix of a decomposed point, in coordinates with states of about unit size."""
+        gamma = self._gamma(values, *parts, nx)
+        return Observability(self.plan, self.plan.records, self.expansion, gamma, self.scale)
 
-        What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T.
-        """
+    def _gamma(self, values: Values, vectors: Array, sizes: Array, nx: int) -> Array:
+        """What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T."""
         found = vectors[:, :nx] * np.sqrt(sizes[:nx]) / self.problem.shape[1] ** 0.25
         predictor, l = self.problem.predictor, self.problem.l  # noqa: E741
         if predictor is None:
@@ -96,16 +102,14 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
         pose: returns the programme of a structured problem, with a parameter "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
-    train = replace(plan, data=part, block_rows=prepared(plan)[1])
-    expansion, alpha = prepared(train)
-    structured, trials = structure(train, expansion, alpha), []
+    structured, trials = structure(replace(plan, data=part, block_rows=prepared(plan)[1])), []
     program = pose(structured)
     for weight in weights:
         program.parameters["weight"].value = structured.penalty(weight)
         solution = yield program
         if solution.has_point:
             program = replace(program, start={name: solution.values[name] for name in program.start})
-            scores = order_scores(train, expansion, structured, solution.values, rest)
+            scores = order_scores(structured, solution.values, rest)
             trials += [(score, weight, nx) for nx, score in scores.items()]
     if not trials:
         return weights[-1], plan.nx, {"weights tried": len(weights)}
@@ -113,25 +117,19 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
     return weight, nx, {"weights tried": len(weights), "simulation fit on the part held out in %": score}
 
 
-def order_scores(plan: Plan, expansion: Expansion, structured: Structured, values: Values, rest: Data
-                 ) -> dict[int, float]:
-    """Return the simulation fit in % on another record of the model of every order that a point allows.
+def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
+    """Return the simulation fit in % on another record of the model of every order that was asked for and has a rank.
 
     Args:
-        plan: what was asked for; with an order, that one alone.
-        expansion: the signals of its record.
         structured: the problem.
         values: a point of its programme.
         rest: the other record.
     """
-    vectors, sizes = structured.decomposed(values)
-    most = min(structured.rank(sizes), structured.problem.rows - 1)
-    found = {}
-    for nx in range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most):
+    order, parts, found = structured.plan.order, structured.decomposed(values), {}
+    most = min(structured.rank(parts[1]), structured.problem.rows - 1)
+    for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
         try:
-            gamma = structured.gamma(vectors, sizes, nx, values)
-            model = Observability(plan, plan.records, expansion, gamma, structured.scale).model()
-            score = held_out_fit(model, rest)
+            score = held_out_fit(structured.observability(values, parts, nx).model(), rest)
         except (RankError, DataError):  # an order this part of the record cannot carry is no candidate
             continue
         if np.isfinite(score):
@@ -145,18 +143,14 @@ def held_out_fit(model: Any, data: Data) -> float:
     return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(outputs))))
 
 
-def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
-    """Build the structured problem of a record.
-
-    Args:
-        plan: what was asked for; its instruments word is the form.
-        expansion: the signals.
-        alpha: number of block rows.
+def structure(plan: Plan) -> Structured:
+    """Build the structured problem of the record of a plan, whose instruments word is the form.
 
     Raises:
         StructureError: feedback in a form other than "predictor", or a record too long.
         RankError: too few usable windows.
     """
+    expansion, alpha = prepared(plan)
     l, form = expansion.l, plan.instruments  # noqa: E741
     if form != "predictor" and expansion.q:
         raise StructureError(f"form={form!r} projects on the complement of the inputs, which outputs that are fed back "
@@ -192,7 +186,7 @@ def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
         known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known
         problem = _weighted(problem, known, np.nan_to_num(np.hstack([signals, outputs])) if past else None)
     measured = problem.matrix(problem.data, problem.explained(problem.hankel(problem.data)))
-    return Structured(problem, centre, scale, float(np.linalg.norm(measured, 2)))
+    return Structured(plan, expansion, problem, centre, scale, float(np.linalg.norm(measured, 2)))
 
 
 def _weighted(problem: NuclearProblem, known: Array, instruments: Array | None) -> NuclearProblem:
