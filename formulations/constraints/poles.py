@@ -81,13 +81,7 @@ def wedge_side(angle: float, level: float) -> Side:
 
 
 def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
-    """Return a rule that keeps all poles in the intersection of several sides.
-
-    Args:
-        name: name under which it is reported.
-        sides: already shrunk by `MARGIN`.
-        text: the region in words, for refusals.
-    """
+    """Return a rule that keeps all poles in the intersection of several sides, which are shrunk by `MARGIN` already."""
 
     def build(view: View) -> Any:
         return lmi(view, sides, name)
@@ -105,11 +99,7 @@ def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
 
 
 def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
-    """Return the inequalities in the P and Q of a shift step.
-
-    Raises:
-        StructureError: the formulation has no such step.
-    """
+    """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`)."""
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available")

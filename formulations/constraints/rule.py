@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from optid.errors import StructureError
 from optid.program.view import View
 
@@ -48,9 +50,9 @@ def sign_of(argument: str, word: str, positive: str, negative: str) -> float:
     return 1.0 if word == positive else -1.0
 
 
-def check_bounds(word: str, low: float | None, high: float | None, *, apart: bool = False) -> None:
+def check_bounds(word: str, low: Any, high: Any, *, apart: bool = False) -> None:
     """Refuse missing or crossing bounds, and equal ones where they must lie apart (`StructureError`)."""
     if low is None and high is None:
         raise StructureError(f"{word} needs low= and/or high=")
-    if low is not None and high is not None and (low > high or apart and not low < high):
+    if low is not None and high is not None and (np.any(low > high) or apart and not low < high):
         raise StructureError(f"{word} needs low {'<' if apart else '<='} high; got {low!r}, {high!r}")

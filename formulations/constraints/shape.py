@@ -137,14 +137,7 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
     us, ys = np.atleast_1d(np.asarray(u, dtype=float)), np.atleast_1d(np.asarray(y, dtype=float))
     if us.shape != ys.shape:
         raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
-
-    def build(view: View) -> Any:
-        basis, theta, size = view.basis(channel), view.static(channel, output), view.static_scale
-        curve = basis.values(us) @ theta + view.static_offset(output)
-        points = Limit(curve == cp.multiply(ys, size), size, None, step=_range_of(basis, theta, size), words=RANGE)
-        return [points, *_settles(view)]
-
-    return Rule(label("through", channel, output), build)
+    return _static("through", ys, ys, channel, output, lambda basis: basis.values(us), offset=True)
 
 
 def gain(value: float | None = None, low: float | None = None, high: float | None = None, at: float | None = None,
@@ -271,8 +264,9 @@ def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -
                 lambda view: [limit(view.basis(one), view.function(one)) for one in _inputs(view, channel)])
 
 
-def _static(word: str, low: float | None, high: float | None, channel: str | None, output: str | None,
+def _static(word: str, low: Any, high: Any, channel: str | None, output: str | None,
             rows: Callable[[Any], np.ndarray], *, offset: bool) -> Rule:
+    """Bounds on rows of the static characteristic; arrays give every row its own."""
     check_bounds(word, low, high)
 
     def build(view: View) -> Any:
@@ -282,12 +276,13 @@ def _static(word: str, low: float | None, high: float | None, channel: str | Non
             curve = curve + view.static_offset(output)
         meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
                                    "words": RANGE if offset else f"{RANGE} over the width of its interval"}
-        if low == high:
-            return [Limit(curve - low * size == 0, size, "value", **meaning), *_settles(view)]
+        if np.all(low == high):
+            equal = curve - cp.multiply(low, size) == 0
+            return [Limit(equal, size, None if np.ndim(low) else "value", **meaning), *_settles(view)]
         return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
             [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + _settles(view)
 
-    return Rule(label(word, channel), build)
+    return Rule(label(word, channel, output), build)
 
 
 def _settles(view: View) -> list[Any]:

@@ -189,9 +189,9 @@ class _Windows:
 
     def projected(self) -> Projection:
         plan = self.plan
-        return project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
-                       form=plan.form, tolerance=plan.tolerance,
-                       weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
+        found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
+                        form=plan.form, tolerance=plan.tolerance)
+        return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
     def ordered(self) -> Observability:
         """Return the observability matrix in the weighting that was asked for."""

@@ -95,15 +95,9 @@ class Plan:
 
 def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
             ) -> Plan:
-    """Plan a method on a record taken to its own units (`optid.program.units`), see `in_record_units`.
+    """Plan a method on a record in memory, taken to its own units (`optid.program.units`); see `in_record_units`.
 
-    Args:
-        name: of the formulation.
-        data: the record, in memory.
-        basis: of the inputs.
-        feedback_basis: of the outputs, None without feedback.
-        offset: whether the model has a constant; without one nothing is centred.
-        settings: further fields of the plan.
+    Without an offset nothing is centred. The settings are further fields of the plan.
     """
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")

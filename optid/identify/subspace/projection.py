@@ -76,18 +76,11 @@ class Projection:
 
 
 def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool = True,
-            form: str = "projection", tolerance: float | None = None, weighting: str = "moesp") -> Projection:
-    """Take the statistics and decompose.
+            form: str = "projection", tolerance: float | None = None) -> Projection:
+    """Take the statistics of raw channels [u | y] or [u | y | simulated y] per experiment, and decompose.
 
-    Args:
-        records: raw channels [u | y] or [u | y | simulated y] per experiment.
-        expansion: the signals.
-        block_rows: of the future; the past has as many.
-        instruments: as in `Expansion.positions`.
-        offset: whether the system has a constant.
-        form: "projection" or "correlation".
-        tolerance: of the pseudo-inverse; None asks for regular regressors.
-        weighting: of the projected outputs.
+    Instruments are words as in `Expansion.positions`, ``form`` and ``tolerance`` as in `optid.statistics.rq.rq`; the
+    past has as many block rows as the future.
 
     Raises:
         StructureError: unknown words.
@@ -103,7 +96,7 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
-    return Projection(statistics, blocks, scale, weighting)
+    return Projection(statistics, blocks, scale)
 
 
 def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
