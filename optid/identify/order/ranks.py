@@ -47,7 +47,7 @@ class RankTest:
         floor: singular values up to here are rounding.
         level: probability with which a true order is to be rejected.
         windows: number j of windows.
-        largest: largest order that the shift of the block rows can show, or None.
+        largest: largest order that the shift of the block rows can show.
     """
 
     singular_values: Array
@@ -58,14 +58,13 @@ class RankTest:
     floor: float
     level: float
     windows: int
-    largest: int | None = None
+    largest: int
 
     @property
     def order(self) -> int:
         """The smallest order that is not rejected; the largest possible one where all are."""
         accepted = np.flatnonzero((self.statistics <= self.thresholds) | (self.singular_values <= self.floor))
-        chosen = int(accepted[0]) if accepted.size else self.singular_values.size
-        return chosen if self.largest is None else min(chosen, self.largest)
+        return min(int(accepted[0]) if accepted.size else self.singular_values.size, self.largest)
 
     @property
     def choice(self) -> tuple[int, str]:
@@ -82,10 +81,8 @@ class RankTest:
     @property
     def exhausted(self) -> bool:
         """Whether every order that the block rows can show was rejected."""
-        limit = self.singular_values.size if self.largest is None else self.largest
-        return self.order == limit and not (
-            limit < self.singular_values.size and self.statistics[limit] <= self.thresholds[limit]
-        )
+        n = self.largest
+        return self.order == n and not (n < self.singular_values.size and self.statistics[n] <= self.thresholds[n])
 
     @property
     def ratios(self) -> Array:
@@ -124,7 +121,7 @@ def largest_gap(values: Array, most: int, floor: float) -> int:
 
 
 def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, instruments: str = "simulated",
-               offset: bool = True, level: float | None = None, statistics: HankelStatistics | None = None) -> RankTest:
+               offset: bool = True, level: float | None = None) -> RankTest:
     """Test the ranks of the projected outputs; several outputs count relative to their sizes.
 
     Args:
@@ -135,14 +132,12 @@ def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, in
             of outputs simulated from them.
         offset: whether a constant is among instruments and regressors.
         level: as in `rank_test`.
-        statistics: of windows of 3 alpha samples, where they exist already.
 
     Raises:
         RankError: too short a record, or instruments that do not reach the regressors.
     """
-    if statistics is None:
-        statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
-                                       centre="mean" if offset else None)
+    statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
     z, phi, y = expansion.positions(statistics.at, instruments, alpha, offset)
     scale = np.tile(statistics.sizes(expansion.y, offset), alpha) if expansion.l > 1 else None
     return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
@@ -172,10 +167,9 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
 
     reach = statistics.rows - rows
     if reach < 1:
-        raise StructureError(
-            f"The windows have {statistics.rows} block rows and {rows} are used: take windows that are longer by the "
-            "number of future block rows, so that they tell the correlation between windows."
-        )
+        raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
+                             "are longer by the number of future block rows, so that they tell the correlation between "
+                             "windows.")
     z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
     width = 1 + rows * statistics.d
     if max(z.max(), phi.max(), y.max()) >= width:
@@ -185,10 +179,8 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     if not 0 < level < 1:
         raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
     if j <= 1.1 * z.size + y.size:
-        raise RankError(
-            f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a longer "
-            "record, fewer block rows or fewer basis functions."
-        )
+        raise RankError(f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a "
+                        "longer record, fewer block rows or fewer basis functions.")
     sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
     if sizes.shape != (y.size,) or not (sizes > 0).all():
         raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
@@ -210,7 +202,8 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
         g, h = variance / (2 * mean), 2 * mean**2 / variance
         thresholds[n0] = g / j * chdtri(h, level)
         p_values[n0] = chdtrc(h, tails[n0] * j / g)
-    return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
+    return RankTest(values, tails, expected, thresholds, p_values, floor, level, j,
+                    values.size if largest is None else largest)
 
 
 def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp],

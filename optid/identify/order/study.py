@@ -99,17 +99,14 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     expansion = expand(data, Linear() if basis is None else basis, feedback_basis)
     alpha = block_rows_for(records, expansion, block_rows, nx)
     notes: list[str] = []
-    shown, extended = expansion, records
-    if expansion.q:
-        extended, shown = with_simulated_outputs(records, expansion, alpha)
-    statistics = hankel_statistics(extended, 3 * alpha, shown, names=shown.names, centre="mean")
-    ranks = order_test(extended, shown, alpha, level=level, statistics=statistics)
+    ranks = order_test(*(with_simulated_outputs(records, expansion, alpha) if expansion.q else (records, expansion)),
+                       alpha, level=level)
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
-    centre = statistics.centre[: expansion.p + expansion.q + expansion.l]
-    moments = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=centre)
-               for part in (data, train, test) if part is not None]
-    states = state_criteria(moments[0], expansion, alpha, max(largest, 1), *moments[1:])
+    whole = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names, centre="mean")
+    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
+             for part in (train, test) if part is not None]
+    states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
     lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
