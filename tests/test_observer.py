@@ -77,12 +77,13 @@ def columns(form, record, experiment):
 @pytest.mark.parametrize("gain", [False, True])
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("offset", [False, True])
-def test_step_is_least_squares_on_the_recursion(gain, feedback, offset):
+def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypatch):
+    monkeypatch.setattr("optid.identify.subspace.observer.CHUNK", 20)
     records = records_of(np.random.default_rng(0), [60, 45])
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
                         (True, False), offset, np.array([1.0, 3.0]))
-    step = observer_problem(records, form, chunk=20)
+    step = observer_problem(records, form)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])

@@ -149,10 +149,8 @@ def check_feedback(name: str, share: float) -> Check:
 def check_condition(number: float) -> Check:
     """Hold the condition number of the expanded regressor (columns scaled) against what leaves half of the digits.
 
-    Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input.
-
-    Args:
-        number: condition number; inf when singular.
+    Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input. The number
+    is inf where they are singular.
     """
     return _conditioning("excitation", number, f"condition number of the expanded regressor: {number:.2g}",
                          f"the expanded regressor is poorly excited: condition number {number:.1e}; "
@@ -182,13 +180,7 @@ def longest_run(signals: Array) -> Array:
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:
-    """Whether x (N,) certainly needs more than `most` sinusoids: a quick test in the frequency domain.
-
-    Args:
-        x: signal without missing samples.
-        most: number of sinusoids.
-        tolerance: share of its variance that may remain.
-    """
+    """Whether x (N,) certainly needs more sinusoids to leave this share of its variance: a quick test by frequency."""
     centred = x - x.mean()
     energy = np.abs(np.fft.rfft(centred * np.hanning(x.size))) ** 2
     total = energy.sum()

@@ -53,12 +53,9 @@ class LagScan:
     @property
     def at_the_edge(self) -> tuple[str, ...]:
         """Which of na, nb and nk are the largest ones compared, so that larger ones may be better."""
-        best, found = self.best(), []
-        for name in ("na", "nb", "nk"):
-            values = [np.max(getattr(c, name)) for c in self.candidates]
-            if np.max(getattr(best, name)) == max(values):
-                found.append(name)
-        return tuple(found)
+        best = self.best()
+        return tuple(name for name in ("na", "nb", "nk")
+                     if np.max(getattr(best, name)) == max(np.max(getattr(c, name)) for c in self.candidates))
 
     def best(self, criterion: str = "bic") -> Lags:
         """The best by "aic", "aicc", "bic" or "fit"; of fits within 0.1 points the one with the least BIC."""
@@ -94,7 +91,10 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     change = _contraction(statistics)
     scan = _Scan(layout, statistics.root @ change, statistics.rows)
     if test is not None:
-        part = collect_part(test, layout)
+        long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
+        if not long:
+            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
+        part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
         scan = replace(scan, other=(change.T @ part.gram @ change, part.rows))
     found = [scan.judged(a, (b,) * data.m, (k,) * data.m)
              for a in range(na + 1) for k in range(nk + 1) for b in range(1, nb + 1)]
@@ -106,14 +106,6 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
             best = min(found, key=lambda c: c.bic)
         found += [scan.judged(a, best.nb, best.nk) for a in range(na + 1)]
     return LagScan(tuple(dict.fromkeys(found)), statistics.rows)
-
-
-def collect_part(data: Data, layout: Layout) -> Statistics:
-    """Take the statistics of a part that need not determine the parameters."""
-    long = [i for i, e in enumerate(data.experiments) if e.n_samples > layout.first_row]
-    if not long:
-        raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
-    return accumulate(data.select(experiments=long), layout)
 
 
 @dataclass(frozen=True, eq=False)

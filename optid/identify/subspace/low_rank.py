@@ -118,13 +118,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
 
 
 def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
-    """Return the simulation fit in % on another record of the model of every order that was asked for and has a rank.
-
-    Args:
-        structured: the problem.
-        values: a point of its programme.
-        rest: the other record.
-    """
+    """Return the simulation fit in %, on another record, of the models of a point, by order: that asked for, or all."""
     order, parts, found = structured.plan.order, structured.decomposed(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
     for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):

@@ -33,7 +33,7 @@ HELD = 1 << 22
 """Numbers held at once at most: models with many functions and states take shorter chunks."""
 
 
-def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False, chunk: int = CHUNK,
+def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False,
                      targets: Sequence[Array] | None = None) -> Realisation:
     """Compress the step.
 
@@ -42,14 +42,13 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, *, instrument
         form: what is known.
         instruments: take the feedback functions of the simulated outputs as instruments for those of the measured ones
             (two-stage least squares); the expansion must contain both. For noise that is fed back and not white.
-        chunk: samples whose regressors are formed at once.
         targets: measured outputs (N, l), one per experiment, NaN = missing, where those of the records are partly
             estimated: feedback and observer read the estimates, which are no equations.
 
     Raises:
         RankError: fewer equations than unknowns.
     """
-    regressors = _Regressors(form, instruments, chunk)
+    regressors = _Regressors(form, instruments)
     extra = regressors.extra
     total = form.experiments * form.n + regressors.common + extra  # [x0 | eta, d | zeta simulated | zeta] and y
     root, rows, energy = np.zeros((total + 1, total + 1)), 0, 0.0
@@ -83,9 +82,9 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, *, instrument
 class _Regressors:
     """Rows of the regression for one run: [x0 | d | D | B | E simulated | E] and the target."""
 
-    def __init__(self, form: ObserverForm, instruments: bool, chunk: int) -> None:
+    def __init__(self, form: ObserverForm, instruments: bool) -> None:
         self.form, x = form, form.expansion
-        self.chunk = min(chunk, max(64, HELD // (form.l * form.n * (x.p + 2 * x.q + form.l + 1))))
+        self.chunk = min(CHUNK, max(64, HELD // (form.l * form.n * (x.p + 2 * x.q + form.l + 1))))
         self.injected = bool(np.any(form.gain))
         self.y = slice(x.m, x.m + x.l)
         self.feeds = form.n * x.q

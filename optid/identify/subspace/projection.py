@@ -105,12 +105,7 @@ def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
 
 
 def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:
-    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output.
-
-    Args:
-        projection: with simulated feedback functions among its signals.
-        expansion: the signals.
-    """
+    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output."""
     statistics, shares, start = projection.statistics, [], 0
     simulated = np.concatenate([[0], statistics.at(expansion.zeta_simulated, [0])])
     for family in expansion.feedback:

@@ -18,7 +18,7 @@ from optid.errors import RankError
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import Expansion
 from optid.structures.bilinear import starts
-from optid.structures.rank_one import RankOne, matrices, reduce
+from optid.structures.rank_one import RankOne, matrices
 from optid.structures.whitening import leading_pair
 
 Values = Mapping[str, Array]
@@ -178,32 +178,25 @@ class Realisation:
         """
         form, z, point = self.form, self.least_squares(), None
         if self.factored:
-            core = reduce(self.problem)
-            point = core.point(*starts(core, count=1)[0])
+            point = self.problem.core.point(*starts(self.problem.core, count=1)[0])
         linear = z[: form.linear] if point is None else point.w
         states = form.n * form.experiments
         x0 = linear[:states] if form.experiments == 1 else linear[:states].reshape(form.n, form.experiments, order="F")
         found = {"x0": np.array(x0)} | ({"offset": np.array(linear[states:])} if form.offset else {})
-        for i, (value, (p, b)) in enumerate(zip(form.thetas(z), form.blocks)):
-            mu, entries, theta = self.names(i)
-            if point is None:
-                found[theta] = value
-            else:
-                empty = not np.any(point.bs[i])
-                found[mu] = np.zeros(p) if empty else point.mus[i]
-                found[entries] = np.full(b, 1 / np.sqrt(b)) if empty else point.bs[i]
+        for i, value in enumerate(form.thetas(z)):
+            mu, b, theta = self.names(i)
+            found |= {theta: value} if point is None else {mu: point.mus[i], b: point.bs[i]}
         return found
 
     def model(self, data: Data, values: Values) -> HammersteinSS:
         """Return the model of a point; a matrix is split in the Kronecker metric of the least squares."""
-        form, x, pairs, core = self.form, self.form.expansion, [], None
+        form, x, core, pairs = self.form, self.form.expansion, self.problem.core, []
         for i, shape in enumerate(form.blocks):
             first, second, whole = self.names(i)
             if first in values:
                 mu, b = np.asarray(values[first]), np.asarray(values[second])
             else:
                 theta = np.reshape(values[whole], shape)
-                core = core or reduce(self.problem)
                 if i in core.kept:
                     place = core.kept.index(i)
                     mu, b = leading_pair(theta, core.whitening.factors_mu[place], core.whitening.factors_b[place])
