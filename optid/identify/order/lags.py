@@ -93,7 +93,8 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     if test is not None:
         long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
         if not long:
-            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
+            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or "
+                            "nothing.")
         part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
         scan = replace(scan, other=(change.T @ part.gram @ change, part.rows))
     found = [scan.judged(a, (b,) * data.m, (k,) * data.m)
