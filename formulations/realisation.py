@@ -2,7 +2,7 @@
 
     min ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
 
-R and s are the record, compressed (`optid.identify.subspace.observer`). Two forms:
+R and s are the record, compressed (`optid.identify.subspace.realisation`). Two forms:
 
 * factored: every channel is rank one; solved and certified by the machinery of rank-one blocks. Named variables:
   ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``,

@@ -9,8 +9,7 @@ from optid.errors import RankError
 from optid.identify.innovations import innovation_form
 from optid.identify.noise import observer_gain
 from optid.identify.subspace.observability import simulate_clipped
-from optid.identify.subspace.observer import observer_problem
-from optid.identify.subspace.realisation import ObserverForm
+from optid.identify.subspace.realisation import ObserverForm, observer_problem
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])
@@ -78,7 +77,7 @@ def columns(form, record, experiment):
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("offset", [False, True])
 def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypatch):
-    monkeypatch.setattr("optid.identify.subspace.observer.CHUNK", 20)
+    monkeypatch.setattr("optid.identify.subspace.realisation.CHUNK", 20)
     records = records_of(np.random.default_rng(0), [60, 45])
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
@@ -107,7 +106,7 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
     step = observer_problem(records, form)
-    monkeypatch.setattr("optid.identify.subspace.observer.MANY", np.inf)
+    monkeypatch.setattr("optid.identify.subspace.realisation.MANY", np.inf)
     stacked = observer_problem(records, form)
     scale = np.sqrt(np.outer(np.diag(stacked.problem.H), np.diag(stacked.problem.H)))
     np.testing.assert_allclose(step.problem.H / scale, stacked.problem.H / scale, atol=1e-11)

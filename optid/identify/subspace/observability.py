@@ -12,10 +12,9 @@ from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.noise import observer_gain, with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
 from optid.identify.subspace.imputation import clipping_range, impute
-from optid.identify.subspace.observer import observer_problem
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
-from optid.identify.subspace.realisation import ObserverForm, Realisation
+from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.statistics.channels import check_channels
