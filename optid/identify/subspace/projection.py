@@ -9,12 +9,10 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataWarning
-from optid.identify.arguments import one_of
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import RQ, rq
 
-INSTRUMENTS = ("past", "inputs", "inputs+past", "simulated", "simulated+past")
 WEIGHTINGS = ("moesp", "cva", "plain")
 
 KEPT = 0.5
@@ -83,10 +81,9 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     past has as many block rows as the future.
 
     Raises:
-        StructureError: unknown words.
+        StructureError: an unknown form.
         RankError: records that are too short, or do not excite the regressors.
     """
-    one_of("instruments", instruments, INSTRUMENTS)
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     statistics.check()

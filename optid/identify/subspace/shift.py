@@ -100,9 +100,9 @@ class ShiftStep:
         return self.basis @ a @ self.change
 
 
-Programmes = tuple[Callable[..., Program], Callable[..., Program], Callable[..., Program]]
-"""The programmes of the step: (step, rules) -> joint, in P and Q = A P, its residual weighted by P; (step, P, A, rules)
--> refined, in A alone from a start, its residual unweighted; (step, A, rules) -> centred, the largest margin of P."""
+Programmes = tuple[Callable[..., Program], Callable[..., Program]]
+"""The programmes of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
+besides, in A alone from that A, its residual unweighted; (step, A, rules) -> the largest margin of P."""
 
 Shifting = Generator[Program, Solution, Shift]
 
@@ -138,8 +138,8 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
         shift = yield from _deflated(up, down, free, bound, rules, programmes)
         if shift is not None:
             return shift
-    step, (joint, refined, centred) = ShiftStep.of(up, down, free), programmes
-    solution = yield joint(step, rules)
+    step, (fitted, centred) = ShiftStep.of(up, down, free), programmes
+    solution = yield fitted(step, rules)
     if not solution.has_point or not _definite(solution.values["P"]):
         status = solution.status  # a singular P is no point
         status = Status.FAILED if status in (Status.OPTIMAL, Status.LOCAL) else status
@@ -147,7 +147,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     p, a, found = solution.values["P"], step.recover(solution.values), solution
     best = float(np.linalg.norm(up @ a - down))
     for last in [False] * (ROUNDS - 1) + [True]:
-        solution = yield refined(step, p, a, rules)
+        solution = yield fitted(step, rules, (p, a))
         if not solution.has_point:
             break
         trial = step.recover(solution.values)
