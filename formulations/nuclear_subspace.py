@@ -132,14 +132,10 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
 
 
 def nuclear_programme(structured: Structured, penalty: float) -> Program:
-    """Pose the convex programme.
+    """Pose the convex programme for a penalty lambda.
 
     Named variables: ``yhat`` (samples, l), outputs of mean zero and unit variance, and, in predictor form, ``T``, one
     column per output. The expression ``output`` is yhat in units of the data.
-
-    Args:
-        structured: the numbers.
-        penalty: lambda.
     """
     problem = structured.problem
     yhat = cp.Variable(problem.y.shape, name="yhat")

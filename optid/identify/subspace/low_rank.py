@@ -95,11 +95,8 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
                   ) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
     """Return the weight, and where it is free the order, whose model simulates the parts held out best, and figures.
 
-    Args:
-        plan: what was asked for.
-        weights: those to try.
-        hold_out: part of every experiment that is held out.
-        pose: returns the programme of a structured problem, with a parameter "weight".
+    ``hold_out`` is a fraction of every experiment; ``pose`` returns the programme of a structured problem, with a
+    parameter "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
     structured, trials = structure(replace(plan, data=part, block_rows=prepared(plan)[1])), []

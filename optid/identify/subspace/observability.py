@@ -270,17 +270,8 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
                      ez: Array, d: Array) -> list[Array]:
     """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
 
-    The functions of a missing input count as zero.
-
-    Args:
-        records: raw channels [u | y], one per experiment.
-        expansion: the signals; its feedback functions may be empty.
-        a: (n, n).
-        c: (l, n).
-        bu: (n, p).
-        du: (l, p).
-        ez: (n, q).
-        d: (l,) offset.
+    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
+    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
     """
     from optid.statistics.subspace_kernels import clipped_run
 
