@@ -32,7 +32,7 @@ __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "g
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
 RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
-SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
+SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; imposed with every rule about it
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -118,7 +118,10 @@ def value_range(low: float | None = None, high: float | None = None, channel: st
 
     Exact for `Triangular`, on a dense grid for the other bases.
     """
-    return _static("range", low, high, channel, output, _everywhere, offset=True)
+    def rows(basis: Any) -> np.ndarray:
+        return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
+
+    return _static("range", low, high, channel, output, rows, offset=True)
 
 
 def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None,
@@ -274,20 +277,16 @@ def _static(word: str, low: Any, high: Any, channel: str | None, output: str | N
         curve = rows(basis) @ theta
         if offset:
             curve = curve + view.static_offset(output)
+        settles = [Limit(size >= SETTLES, bound="settles")] if "a" in view else []
         meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
                                    "words": RANGE if offset else f"{RANGE} over the width of its interval"}
         if np.all(low == high):
             equal = curve - cp.multiply(low, size) == 0
-            return [Limit(equal, size, None if np.ndim(low) else "value", **meaning), *_settles(view)]
+            return [Limit(equal, size, None if np.ndim(low) else "value", **meaning), *settles]
         return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
-            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + _settles(view)
+            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + settles
 
     return Rule(label(word, channel, output), build)
-
-
-def _settles(view: View) -> list[Any]:
-    """Return the constraint ``1 + sum(a) > 0``, without which there is no static characteristic."""
-    return [Limit(view.static_scale >= SETTLES, bound="settles")] if "a" in view else []
 
 
 def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) -> Callable[[], float]:
@@ -301,11 +300,6 @@ def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) ->
         return 0.01 * float(np.ptp(curve)) / abs(scale) / (high - low) ** power
 
     return step
-
-
-def _everywhere(basis: Any) -> np.ndarray:
-    """Values of f at the nodes of a piecewise linear basis, which are enough, or on a dense grid."""
-    return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:

@@ -169,9 +169,8 @@ def check_instruments(number: float) -> Check:
 
 
 def _conditioning(rule: str, number: float, fine: str, poor: str) -> Check:
-    if number > WORST_CONDITION:
-        return Check(rule, "", number, WORST_CONDITION, "warning", poor)
-    return Check(rule, "", number, WORST_CONDITION, "fine", fine)
+    severity, sentence = ("warning", poor) if number > WORST_CONDITION else ("fine", fine)
+    return Check(rule, "", number, WORST_CONDITION, severity, sentence)
 
 
 def longest_run(signals: Array) -> Array:
