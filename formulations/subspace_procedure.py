@@ -9,7 +9,6 @@
 import warnings
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -17,13 +16,11 @@ from formulations.constraints.poles import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
 from optid.certificate.simulation_bound import simulation_bound
-from optid.data.record import Data
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.realisation import Realisation
-from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
@@ -66,12 +63,7 @@ def identified(plan: Plan, found: Observability | None = None) -> Procedure:
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
     return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
-                    status, reason, figures | step.ratios(), partial(_with_noise, model, plan.data))
-
-
-def _with_noise(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, Any]]:
-    model, remark = with_noise_or_reason(model, data)
-    return model, {"noise model": remark} if remark else {}
+                    status, reason, figures | step.ratios(), partial(with_noise_or_reason, model, plan.data))
 
 
 def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:

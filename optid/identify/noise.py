@@ -75,8 +75,8 @@ def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
     return replace(model, K=found.K, noise=found.covariances)
 
 
-def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
-    """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
+def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", dict[str, str]]:
+    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model.
 
     Args:
         model: a model in the units of the data.
@@ -87,13 +87,14 @@ def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["Hammerste
         regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
         found = with_noise(model, data)
     except (StructureError, DataError) as reason:
-        return model, f"none: {reason}"
+        return model, {"noise model": f"none: {reason}"}
     except np.linalg.LinAlgError:
-        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
+        return model, {"noise model": "none: the prediction errors leave the range of numbers where outputs are "
+                                      "missing"}
     spread = np.nanstd(np.concatenate(outputs), axis=0)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
-        return model, "none: the prediction errors vanish, there is no noise to model"
-    return found, ""
+        return model, {"noise model": "none: the prediction errors vanish, there is no noise to model"}
+    return found, {}
 
 
 def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
