@@ -55,7 +55,7 @@ def expanded_record(count: int, basis: str) -> tuple[np.ndarray, object]:
     _, y, _ = dlsim((A, B, C, np.zeros((2, 2)), 1), f)
     family = (Polynomial(10) if basis == "polynomial" else Triangular(10)).fitted(-1.0, 1.0)
     record = np.hstack([u, y + 0.1 * rng.standard_normal((count, 2))])
-    return record, expand([record], [family, family], [], ["u1", "u2"], ["y1", "y2"])
+    return record, expand(Data(u, record[:, 2:]), family)
 
 
 def own(record: np.ndarray, expansion, rows: int):

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from formulations.subspace_procedure import identified
+from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
-from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.plan import in_record_units, planned
 from optid.solving.solve import Procedure
 

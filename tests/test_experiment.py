@@ -7,11 +7,13 @@ from typer.testing import CliRunner
 
 import optid
 from optid import plants
+from optid.bases import feedback_bases
 from optid.cli.app import app
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.identify.design import design, frequency_response
-from optid.identify.design.expansion import expanded_condition, expansion_of, feedback_bases
+from optid.identify.design.excitation import expanded_condition
 from optid.identify.design.rules import check_feedback
+from optid.statistics.expansion import expand
 
 QUARTIC = "polynomial:4"
 B, A = [0.0, 0.3, 0.1], [1.0, -1.2, 0.5]
@@ -30,7 +32,7 @@ def true_response(f, c=0):
 
 
 def condition_of(data, basis, feedback, rows):
-    return expanded_condition(data, expansion_of(data, basis, feedback), rows)
+    return expanded_condition(data, expand(data, basis, feedback), rows)
 
 
 PENDULUM = plants.pendulum(plants.pendulum_input("chirp", 4000))
@@ -198,7 +200,8 @@ def test_a_feedback_that_is_nearly_linear_is_named(share, severity):
 def test_the_share_that_is_not_linear_is_that_of_the_record():
     small = plants.pendulum(plants.pendulum_input("levels", 2000), measurement=0, quantum=0)
     sine = optid.UserFunctions((np.sin,), ("sin",))
-    share = expansion_of(small, QUARTIC, [sine, None]).feedback[0].share
+    with pytest.warns(optid.errors.DataWarning, match="nearly linear"):
+        share = expand(small, QUARTIC, [sine, None]).feedback[0].share
     x = np.column_stack([np.ones(2000), small.y])
     g = np.sin(small.y[:, 0])
     rest = g - x @ np.linalg.lstsq(x, g, rcond=None)[0]

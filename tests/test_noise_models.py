@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import optid
-from formulations.constraints import shape, stability
+from formulations.constraints import poles, shape
 from formulations.prediction_error import armax as linear_armax
 from formulations.prediction_error import bj as linear_bj
 from formulations.prediction_error import hammerstein_armax as armax
@@ -179,7 +179,7 @@ def test_constraints_hold_and_the_optimum_is_that_of_a_penalty_free_search(kind)
 def test_stability_of_a_constrained_armax_plant():
     model = system("armax", a=np.array([-1.85, 0.87]))
     data = record(model, (300,), noise=0.5)
-    fit = optid.fit(data, armax, constraints=[stability.stable(0.85)], **ORDERS["armax"][1])
+    fit = optid.fit(data, armax, constraints=[poles.stable(0.85)], **ORDERS["armax"][1])
     assert np.max(np.abs(fit.model.poles)) <= 0.85 + 1e-6
     assert fit.solution.status is Status.LOCAL and fit.prices[0].active
 

@@ -17,8 +17,8 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order import order_test, rank_test, scan_lags
 from optid.identify.order.lags import residual_weights
-from optid.identify.order.signals import block_rows_for, with_simulated_outputs
 from optid.identify.order.states import state_criteria
+from optid.identify.order.study import block_rows_for, with_simulated_outputs
 from optid.plants import EXAMPLE1, TWO_MODES
 from optid.statistics import collect
 from optid.statistics.expansion import expand
@@ -45,8 +45,7 @@ def positions(statistics, alpha, m, d):
 
 
 def linear(data):
-    return expand([np.hstack([e.u, e.y]) for e in data.experiments], fitted_bases(data, Linear()), [], data.inputs,
-                  data.outputs)
+    return expand(data, Linear())
 
 
 def records(data):
@@ -152,7 +151,7 @@ def test_nonlinear_inputs_and_feedback():
 
 def test_simulated_outputs_follow_the_inputs_alone():
     data = record(3000, noise=0.5)
-    signals = expand(records(data), fitted_bases(data, Linear()), [Polynomial(3).fitted(-9, 9)], ("u",), ("y",))
+    signals = expand(data, Linear(), Polynomial(3).fitted(-9, 9))
     (extended,), wider = with_simulated_outputs(records(data), signals, 8)
     clean = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], data.u[:, 0])
     assert np.isnan(extended[:15, 2]).all() and wider.simulated
@@ -325,8 +324,8 @@ def test_short_records_say_what_they_cannot():
     ({"nx": 0}, StructureError, "nx=0"),
     ({"holdout": 1.0}, StructureError, "holdout"),
     ({"level": 0.0}, StructureError, "level=0.0"),
-    ({"na": -1}, StructureError, "na: a whole number from 0"),
-    ({"nb": 0}, StructureError, "nb: a whole number from 1"),
+    ({"na": -1}, StructureError, "na=-1 must be an integer >= 0"),
+    ({"nb": 0}, StructureError, "nb=0 must be a positive integer"),
     ({"feedback_basis": ["polynomial:2"] * 2}, StructureError, "2 feedback bases for 1 outputs"),
     ({"block_rows": 150}, RankError, "complete windows"),
     ({"block_rows": 400}, RankError, "Experiment 1 has 800 samples"),

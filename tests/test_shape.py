@@ -209,7 +209,7 @@ def test_two_channels_share_their_dynamics():
 @pytest.mark.parametrize("build, words", [
     (lambda: shape.monotone("sideways"), "'increasing' or 'decreasing'"),
     (lambda: shape.sign("b", "up"), "'positive' or 'negative'"),
-    (lambda: shape.slope(2, 1), "low 2 lies above high 1"),
+    (lambda: shape.slope(2, 1), "low <= high; got 2, 1"),
     (lambda: shape.slope(), "low= and/or high="),
     (lambda: shape.gain(), "needs a value"),
     (lambda: shape.dead_zone(1, 1), "low < high"),

@@ -10,7 +10,7 @@ from systems import nonlinearity
 
 import optid
 from formulations.constraints import shape
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from optid.errors import StructureError
 from optid.models import HammersteinTF
 from optid.models.roots import pulled

@@ -7,7 +7,7 @@ import pytest
 
 import optid
 from formulations.constraints import shape
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from optid.bases import UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError

@@ -75,8 +75,8 @@ def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
     return replace(model, K=found.K, noise=found.covariances)
 
 
-def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
-    """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
+def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", dict[str, str]]:
+    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model.
 
     Args:
         model: a model in the units of the data.
@@ -87,13 +87,14 @@ def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["Hammerste
         regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
         found = with_noise(model, data)
     except (StructureError, DataError) as reason:
-        return model, f"none: {reason}"
+        return model, {"noise model": f"none: {reason}"}
     except np.linalg.LinAlgError:
-        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
+        return model, {"noise model": "none: the prediction errors leave the range of numbers where outputs are "
+                                      "missing"}
     spread = np.nanstd(np.concatenate(outputs), axis=0)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
-        return model, "none: the prediction errors vanish, there is no noise to model"
-    return found, ""
+        return model, {"noise model": "none: the prediction errors vanish, there is no noise to model"}
+    return found, {}
 
 
 def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
@@ -229,7 +230,7 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         try:
-            observers.append(_observer_gain(A, C, ratio))
+            observers.append(observer_gain(A, C, ratio))
         except StructureError:
             continue
     found = sorted(map(measured, observers), key=itemgetter(0))
@@ -247,10 +248,10 @@ def _observer(model: "HammersteinSS") -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
         return np.zeros((model.nx, model.l))
-    return _observer_gain(model.A, model.C, 0.1)
+    return observer_gain(model.A, model.C, 0.1)
 
 
-def _observer_gain(A: Array, C: Array, ratio: float) -> Array:
+def observer_gain(A: Array, C: Array, ratio: float) -> Array:
     """Return the gain for equal noise in all states, so many times that at the outputs in units of C."""
     size = np.linalg.norm(C, axis=1)
     return np.array(kalman_gain(A, C, ratio * np.eye(len(A)), np.diag(np.where(size > 0, size, 1.0) ** 2)).K)

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.bases import Bases, FeedbackBases, feedback_bases, fitted_bases
 from optid.bases.basis import Basis
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.statistics.hankel import hankel_statistics
 
@@ -202,30 +204,26 @@ class Expansion:
         return replace(self, feedback=(), simulated=False)
 
 
-def expand(records: Sequence[Array], inputs: Sequence[Basis], feedback: Sequence[Basis | None],
-           input_names: Sequence[str], output_names: Sequence[str]) -> Expansion:
-    """Fit the feedback functions to a record and return its expansion.
+def expand(data: Data, basis: Bases, feedback_basis: FeedbackBases = None) -> Expansion:
+    """Fit the bases to a record and return its expansion.
 
     Args:
-        records: (N, m + l) arrays [u | y], one per experiment; NaN = missing.
-        inputs: one basis per input, with an interval.
-        feedback: one basis per output, with an interval, or None for an output that is not fed back; empty for none.
-        input_names: m names.
-        output_names: l names.
+        data: the record; NaN = missing.
+        basis: of the inputs.
+        feedback_basis: of the outputs.
 
     Raises:
+        StructureError: a wrong number of bases, or an entry that is not a basis.
         RankError: the feedback functions of an output are linear in y on this record.
-        DataError: no sample at which all outputs are present.
+        DataError: a constant channel, or no sample at which all outputs are present.
 
     Warns:
         DataWarning: they are nearly linear.
     """
-    m, l = len(input_names), len(output_names)  # noqa: E741
-    families = []
-    for output, basis in enumerate(feedback):
-        if basis is not None:
-            families.append(_orthogonalised([record[:, m : m + l] for record in records], output, basis, output_names))
-    return Expansion(tuple(inputs), tuple(families), tuple(input_names), tuple(output_names))
+    outputs = [e.y for e in data.experiments]
+    families = [_orthogonalised(outputs, output, family, data.outputs)
+                for output, family in enumerate(feedback_bases(data, feedback_basis)) if family is not None]
+    return Expansion(fitted_bases(data, basis), tuple(families), data.inputs, data.outputs)
 
 
 def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: Sequence[str]) -> Feedback:

@@ -144,7 +144,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
         return None
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     try:
-        expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
+        expansion = expand(data, layout.bases)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # as in `arx_start`
             found = project(records, expansion, expansion.block_rows(records, layout.na), instruments="past")
