@@ -57,7 +57,7 @@ def test_the_curve_is_the_fit_of_predictions_over_common_samples():
     assert np.all(np.diff(curve.fits[:, 0]) < 0) and curve.simulation[0] < curve.fits[0, 0]
     text = str(curve)
     assert f"{curve.fits[1, 0]:.2f}" in text and "simulation" in text
-    with pytest.raises(StructureError, match="horizon = 0"):
+    with pytest.raises(StructureError, match="horizon must be a positive integer"):
         fit_by_horizon(model, data, [0])
     with pytest.raises(DataError, match="100 samples ahead"):
         fit_by_horizon(model, data.window(0, 50), [100])

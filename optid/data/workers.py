@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import chain, islice
 from typing import TypeVar
 
-from optid.errors import StructureError
+from optid.arrays import check_integer
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -21,9 +21,7 @@ def available_threads(threads: int | None) -> int:
     """
     if threads is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise StructureError(f"threads={threads!r}: a positive number of threads is needed, or None for every core.")
-    return threads
+    return check_integer(threads, "threads")
 
 
 def mapped(function: Callable[[Part], Result], parts: Iterable[Part], threads: int) -> Iterator[Result]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 
@@ -18,30 +19,12 @@ def one_of(name: str, value: str, known: Sequence[str]) -> None:
         raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
 
 
-def whole_number(name: str, value: Any, low: int = 0, what: str = "") -> int:
-    """Check an order or another number of things.
-
-    Args:
-        name: of the argument.
-        value: of the argument.
-        low: least value.
-        what: its meaning, for the message.
-
-    Raises:
-        StructureError: not an integer, or below ``low``.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-        kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
-        raise StructureError(f"{name}{what and f' ({what})'} must be {kind}; got {value!r}")
-    return int(value)
-
-
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
     """Expand a scalar to one integer per input and check it."""
     values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
     if len(values) != len(inputs):
         raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
-    return tuple(whole_number(f"{name} of input {channel!r}", entry, low) for channel, entry in zip(inputs, values))
+    return tuple(check_integer(entry, f"{name} of input {channel!r}", low) for channel, entry in zip(inputs, values))
 
 
 def in_memory(data: Any, errors: str) -> Data:

@@ -255,7 +255,7 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     regressive = np.linalg.lstsq(root[:past, :past], root[:past, past:], rcond=None)[0].reshape(lags, l, l)[::-1]
     response, powers = [np.eye(l)], [C]
     for i in range(1, lags + 1):
-        response.append(sum(regressive[j].T @ response[i - 1 - j] for j in range(i)))
+        response.append(np.sum([regressive[j].T @ response[i - 1 - j] for j in range(i)], axis=0))
         powers.append(powers[-1] @ (A - gain @ C))
     unit = np.tile(spread, lags)[:, None]
     change = np.linalg.lstsq(np.vstack(powers[:-1]) / unit, np.vstack(response[1:]) / unit, rcond=None)[0]

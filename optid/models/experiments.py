@@ -83,17 +83,6 @@ def one_or_all(arrays: list[Array]) -> Any:
     return arrays[0] if len(arrays) == 1 else tuple(arrays)
 
 
-def checked_horizon(horizon: Any) -> int:
-    """Return a prediction horizon as an int.
-
-    Raises:
-        StructureError: not a positive integer.
-    """
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise StructureError(f"horizon = {horizon!r}: a positive integer number of samples.")
-    return int(horizon)
-
-
 def check_inputs(model: Channels, u: Array, label: str) -> None:
     """Refuse missing and infinite inputs, beyond which no state is known.
 

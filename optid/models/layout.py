@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases.basis import Basis
 from optid.errors import StructureError
 
@@ -48,8 +48,7 @@ class Layout:
             for order, values, smallest in (("nb", self.nb, 1), ("nk", self.nk, 0))
             for channel, value in zip(self.inputs, values)
         ]:
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
-                raise StructureError(f"{name} must be an integer >= {smallest}; got {value!r}.")
+            check_integer(value, name, smallest)
 
     @property
     def m(self) -> int:

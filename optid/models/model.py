@@ -8,13 +8,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.channels import Transform, numbered_names
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.models import files, roots
-from optid.models.experiments import Record, checked_horizon, one_or_all, records_of, states_of
+from optid.models.experiments import Record, one_or_all, records_of, states_of
 from optid.models.nonlinearity import Nonlinearity
 
 NAMES = ("inputs", "outputs", "input_units", "output_units")
@@ -167,7 +167,7 @@ class Model:
                 leave the range of numbers.
             StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
         """
-        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
+        horizon, (records, _) = check_integer(horizon, "horizon"), records_of(self, data)
         fit = isinstance(x0, str) and x0 == "fit"
         states = [None] * len(records) if fit else self._states("predict", records, x0)
         predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]

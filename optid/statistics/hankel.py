@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
@@ -159,8 +159,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         StructureError: rows < 1, an unknown method.
         RankError: an experiment shorter than the block rows, or no complete window at all.
     """
-    if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 1:
-        raise StructureError(f"block rows: a whole number from 1 is needed; got {rows!r}.")
+    check_integer(rows, "rows")
     if method not in ("auto", "gram", "qr"):
         raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
     records = [np.asarray(record, dtype=float) for record in records]

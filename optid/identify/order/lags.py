@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases.basis import Basis
 from optid.data.record import Data
-from optid.errors import RankError, StructureError
+from optid.errors import RankError
 from optid.identify.order.states import criteria
 from optid.statistics import Layout, Statistics, accumulate, collect
 from optid.structures.rank_one import RankOne
@@ -82,12 +82,11 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
         test: a part held out, judged by the coefficients of `data`; None for none.
 
     Raises:
-        StructureError: orders that are not whole numbers, na, nk >= 0 and nb >= 1.
+        StructureError: orders that are not integers, na, nk >= 0 and nb >= 1.
         RankError: too short a record, or one that does not excite the basis.
     """
     for name, value, least in (("na", na, 0), ("nb", nb, 1), ("nk", nk, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise StructureError(f"{name}: a whole number from {least} is needed; got {value!r}.")
+        check_integer(value, name, least)
     width, rows = sum(basis.size for basis in bases), data.n_samples
     while na * data.l + (nb + nk) * width + 1 > rows / ROWS_PER_COLUMN and na + nb + nk > 1:
         na, nb, nk = max(na - 1, 0), max(nb - 1, 1), max(nk - 1, 0)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import RankError, StructureError
 from optid.identify.order.ranks import RankTest, rank_test
 from optid.statistics.expansion import Expansion
@@ -21,12 +21,10 @@ def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | 
         StructureError: fewer than 2, or not more than the order asked for per output.
         RankError: an experiment shorter than three times the block rows, which is named.
     """
-    if given is not None:
-        if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < FEWEST:
-            raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order, is needed.")
-        alpha = int(given)
-    else:
+    if given is None:
         alpha = expansion.block_rows(records, nx, spans=3, per_row=PER_ROW, least=FEWEST)
+    else:
+        alpha = check_integer(given, "block_rows", FEWEST)
     if nx is not None and (alpha - 1) * expansion.l < nx:
         raise StructureError(
             f"{alpha} block rows of {expansion.l} outputs show orders up to {(alpha - 1) * expansion.l}, not {nx}: use "

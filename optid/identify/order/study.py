@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases import Linear, feedback_bases, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.record import Data
@@ -89,8 +89,8 @@ def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = N
     """
     if not 0 <= holdout < 1:
         raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}.")
-    if nx is not None and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
-        raise StructureError(f"nx={nx!r}: a whole number from 1 is needed.")
+    if nx is not None:
+        check_integer(nx, "nx")
     data = data.raw()
     records = _records(data)
     check_channels(records, data.inputs, data.outputs)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.errors import DataWarning, RankError, StructureError
+from optid.arrays import Array, check_integer
+from optid.errors import DataWarning, RankError
 from optid.identify.order.signals import order_test
 from optid.identify.subspace.imputation import count_windows, impute
 from optid.identify.subspace.instruments import simulate_clipped
@@ -101,10 +101,8 @@ def prepared(plan: Plan) -> tuple[Expansion, int]:
     check_channels(plan.records, plan.data.inputs, plan.data.outputs)
     if given is None:
         alpha = expansion.block_rows(plan.records, plan.order)
-    elif isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 2:
-        raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order.")
     else:
-        alpha = int(given)
+        alpha = check_integer(given, "block_rows", 2)
     if plan.order is not None:
         check_order(plan.order, alpha, plan.data.l)
     return expansion, alpha

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.identify.validation.correlations import (
@@ -27,7 +27,6 @@ from optid.identify.validation.predictions import (
     simulated,
 )
 from optid.identify.validation.structure import Structure, structure_test
-from optid.models.experiments import checked_horizon
 from optid.models.functions import has_feedback, static_functions
 from optid.registry import render
 
@@ -128,7 +127,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         DataWarning: the record does not look Hammerstein or does not determine a free model, the model is unstable, no
             simulation is possible, or inputs lie outside the interval of their basis; also in `Validation.notes`.
     """
-    horizon, raw = checked_horizon(horizon), data.raw()
+    horizon, raw = check_integer(horizon, "horizon"), data.raw()
     predicted = {ONE_STEP: tuple(one_step(model, raw))}
     residuals = tuple(e.y - p for e, p in zip(raw.experiments, predicted[ONE_STEP]))
     present = np.sum([np.sum(~np.isnan(r), axis=0) for r in residuals], axis=0)
