@@ -34,8 +34,8 @@ from optid.arrays import check_integer
 from optid.bases.basis import Basis
 from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel
-from optid.identify.gauges import check_gauge, scale_fixed
+from optid.identify.arguments import enough_rows, one_of, one_output, outputs_present, per_channel
+from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
@@ -156,7 +156,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     Where D is A, nd is None; of a linear model the gauge.
     """
     if gauge is not None:
-        check_gauge(gauge)
+        one_of("gauge", gauge, FIXED)
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
     orders = (check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
               per_channel("nk", nk, data.inputs, low=0))

@@ -96,7 +96,7 @@ def test_errors_equal_the_fisher_matrix_of_another_parametrisation(plain):
     half = student.ppf(0.975, len(y) - other.size) * expected[:2]
     np.testing.assert_allclose(u.a.upper - m.a, half, rtol=1e-5)
     np.testing.assert_allclose(m.a - u.a.lower, half, rtol=1e-5)
-    wider = u.at_level(0.99).a.upper - m.a
+    wider = replace(u, level=0.99).a.upper - m.a
     np.testing.assert_allclose(wider, half * student.ppf(0.995, len(y) - 8) / student.ppf(0.975, len(y) - 8), rtol=1e-6)
 
 

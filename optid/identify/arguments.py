@@ -28,15 +28,7 @@ def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], lo
 
 
 def in_memory(data: Any, errors: str) -> Data:
-    """Refuse a stream.
-
-    Args:
-        data: the record.
-        errors: the residuals that the fit minimises, for the message.
-
-    Raises:
-        StructureError: naming the remedy.
-    """
+    """Refuse a stream (`StructureError`); the message names the errors that the fit minimises."""
     if not isinstance(data, Data):
         raise StructureError(f"{errors} need the record in memory, with every sample in order: read it with optid.read "
                              "instead of a stream")
@@ -44,15 +36,11 @@ def in_memory(data: Any, errors: str) -> Data:
 
 
 def one_output(data: Any, errors: str) -> Data:
-    """Refuse streams, several outputs, and an output without samples.
+    """Refuse streams, several outputs (`StructureError`), and an output without a single sample (`DataError`).
 
     Args:
         data: the record.
-        errors: the residuals that the fit minimises, for the message.
-
-    Raises:
-        StructureError: naming the remedy.
-        DataError: an output without a single sample.
+        errors: what the fit minimises, for the message.
     """
     data = in_memory(data, errors)
     if data.l > 1:
@@ -65,16 +53,13 @@ def one_output(data: Any, errors: str) -> Data:
 
 
 def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
-    """Refuse a record with fewer than 1.1 rows per unknown.
+    """Refuse a record with fewer than 1.1 rows per unknown (`RankError`).
 
     Args:
         rows: number of them.
         what: their name.
         unknowns: their number, initial states included.
         remedy: the lags or states that a user could have fewer of, besides basis functions.
-
-    Raises:
-        RankError: naming the numbers.
     """
     needed = ROWS_PER_UNKNOWN * unknowns
     if rows < needed:

@@ -96,14 +96,9 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        from optid.identify.validation.predictions import common_fits, one_step
-
         if self.program.compressed is not None:
             return self.program.compressed.one_step_fit(self.solution.values)
-        if isinstance(self.data, Stream):
-            return np.full(len(self.data.outputs), np.nan)
-        raw = self.data.raw()
-        return common_fits(raw, [one_step(self.model, raw)])[0]
+        return self._fit("one step")
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
@@ -112,26 +107,18 @@ class Fit:
         NaN for a stream, where an input has missing samples (a simulation needs every one of them), and where the
         simulation runs away.
         """
-        return self._simulated_fit("simulation")
+        return self._fit("simulation")
 
     @cached_property
     def measured_feedback_fit(self) -> np.ndarray:
-        """Fit in % of the simulation that takes the outputs in the feedback from the record.
+        """As `simulation_fit`, with the outputs in the nonlinear feedback, if there is one, from the record."""
+        return self._fit("measured feedback" if has_feedback(self.model) else "simulation")
 
-        The same as `simulation_fit` for a model without nonlinear feedback.
-        """
-        return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
+    def _fit(self, word: str) -> np.ndarray:
+        from optid.identify.validation.predictions import prediction_fit
 
-    def _simulated_fit(self, word: str) -> np.ndarray:
-        from optid.identify.validation.predictions import common_fits, simulated
-
-        if not isinstance(self.data, Stream) and not any(self.data.missing[name] for name in self.data.inputs):
-            raw = self.data.raw()
-            try:
-                return common_fits(raw, [simulated(self.model, raw, word)])[0]
-            except DataError:  # it leaves the range of the data
-                pass
-        return np.full(len(self.data.outputs), np.nan)
+        return (np.full(len(self.data.outputs), np.nan) if isinstance(self.data, Stream) else
+                prediction_fit(self.model, self.data, word))
 
     @cached_property
     def uncertainty(self) -> Any:
@@ -185,7 +172,9 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
-    findings = _examined(data, {**defaults(pose), **arguments})
+    findings, words = [], {**defaults(pose), **arguments}
+    if isinstance(data, Data):
+        findings = examine(data, fitted_bases(data, words.get("basis", Linear())), words)
     problem = pose(data, **arguments)
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate, "prove": prove,
                 **(solver_options or {})}
@@ -247,12 +236,6 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:
     transform = getattr(data, "transform", None)
     return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
-
-
-def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
-    if isinstance(data, Stream):
-        return []
-    return examine(data, fitted_bases(data, arguments.get("basis", Linear())), arguments)
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

@@ -10,7 +10,6 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
@@ -21,40 +20,11 @@ from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
-from optid.identify.tangent import Quantity
-from optid.identify.uncertainty import Uncertainty, aligned
+from optid.identify.uncertainty import Refits, Uncertainty, aligned
 from optid.models import HammersteinARX
 from optid.models.recursions import autoregression
 
 FAILED = 0.1  # share of refits without a point above which the user is told
-
-
-@dataclass(frozen=True, eq=False)
-class Refits:
-    """Intervals from the scatter of refits.
-
-    Attributes:
-        reference: the fitted model.
-        models: the refitted models, in its gauge and with its signs.
-        kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
-    """
-
-    reference: HammersteinARX
-    models: tuple[HammersteinARX, ...] = field(repr=False)
-    kind: Literal["percentile", "basic"]
-
-    @property
-    def meaning(self) -> str:
-        """What the intervals are, in words."""
-        return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
-
-    def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
-        """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
-        value = np.ravel(np.asarray(quantity(self.reference), dtype=float))
-        deviations = np.array([np.ravel(np.asarray(quantity(model), dtype=float)) - value for model in self.models])
-        low, high = np.quantile(deviations, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-        error = np.std(deviations, axis=0, ddof=1)
-        return (error, low, high) if self.kind == "percentile" else (error, -high, -low)
 
 
 @dataclass(frozen=True, eq=False)
