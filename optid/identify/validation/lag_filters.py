@@ -71,13 +71,8 @@ class Family:
         powers = np.asarray(np.polynomial.hermite_e.hermevander(x, self.degree)[:, 1:], dtype=float)
         if self.nodes.size < 3:
             return powers
-        inside = np.clip(u, self.nodes[0], self.nodes[-1])
-        cell = np.clip(np.searchsorted(self.nodes, inside, side="right") - 1, 0, self.nodes.size - 2)
-        share = (inside - self.nodes[cell]) / (self.nodes[cell + 1] - self.nodes[cell])
-        hats = np.zeros((len(u), self.nodes.size))
-        rows = np.arange(len(u))
-        hats[rows, cell], hats[rows, cell + 1] = 1 - share, share
-        return np.hstack([powers, hats[:, 1:-1]])
+        hats = [np.interp(u, self.nodes, one) for one in np.eye(self.nodes.size)[1:-1]]
+        return np.column_stack([powers, *hats])
 
 
 def delay_of(data: Data, latest: int = LATEST) -> int:
