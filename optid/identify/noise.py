@@ -13,7 +13,6 @@ hence K and Re.
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +23,7 @@ from optid.data.stretches import between_gaps
 from optid.errors import DataError, StructureError
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
+from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     covariance_of,
     information,
@@ -34,9 +34,6 @@ from optid.models.innovation_gain import (
 )
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.statistics.hankel import complete_runs, hankel_statistics
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
 
 ROUNDING = 1e-10
 """Residuals below this share of the outputs are rounding: there is no noise to describe."""
@@ -65,7 +62,7 @@ NEARLY, ELSEWHERE = 0.1, 1.0
 which two gains are not the same optimum of it."""
 
 
-def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
+def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
     """Return the model with the gain K, A - K C stable, and the noise covariances that a record shows.
 
     Args:
@@ -86,7 +83,7 @@ def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
     return replace(model, K=observer + gain, noise=NoiseCovariances.of_innovations(observer + gain, covariance))
 
 
-def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
+def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, str]:
     """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
 
     Args:
@@ -107,13 +104,13 @@ def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["Hammerste
     return found, ""
 
 
-def residuals(model: "HammersteinSS", data: Data) -> list[Array]:
+def residuals(model: HammersteinSS, data: Data) -> list[Array]:
     """Return the one-step prediction errors (N, l) of every experiment in the units of the model, NaN = missing."""
     data = data.without_transform()
     return [e.y - p for e, p in zip(data.experiments, one_step(model, data))]
 
 
-def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
+def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
     """Return the spectral density of the noise at the outputs, H Re H* with H = I + C (zI - A)^-1 K.
 
     Args:
@@ -132,7 +129,7 @@ def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
     return np.asarray(shaped @ _innovations(model) @ np.conj(np.swapaxes(shaped, 1, 2)))
 
 
-def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Correlation]:
+def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
     """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
 
     Args:
@@ -149,7 +146,7 @@ def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Corr
     return {name: autocorrelation([r[:, o] for r in rest], name, lags) for o, name in enumerate(model.outputs)}
 
 
-def output_noise(model: "HammersteinSS") -> Array:
+def output_noise(model: HammersteinSS) -> Array:
     """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
 
     It is the mean of the spectrum; infinite where a pole on or outside the unit circle is driven by the noise.
@@ -168,7 +165,7 @@ def output_noise(model: "HammersteinSS") -> Array:
     return np.asarray(model.C @ states @ model.C.T + covariance)
 
 
-def _innovations(model: "HammersteinSS") -> Array:
+def _innovations(model: HammersteinSS) -> Array:
     if model.noise is None:
         raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
     return np.array(model.noise.innovation)
@@ -276,7 +273,7 @@ def _regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E7
     return lags
 
 
-def _observer(model: "HammersteinSS") -> Array:
+def _observer(model: HammersteinSS) -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
         return np.zeros((model.nx, model.l))

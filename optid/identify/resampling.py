@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
-from optid.identify.uncertainty import Refits, Uncertainty, aligned
+from optid.identify.uncertainty import Refits, Uncertainty, aligned, check_level
 from optid.models import HammersteinARX
 from optid.models.recursions import autoregression
 
@@ -74,8 +74,8 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
         raise StructureError(f"this fit has no model to resample: {fit.solution.reason or fit.solution.status}")
     if fit.model.structure != "arx":
         raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
-    if runs < 40 or not 0 < level < 1:
-        raise StructureError(f"runs={runs}, level={level}: at least 40 runs and a level between 0 and 1 are needed")
+    check_integer(runs, "runs", 40)
+    check_level(level)
     models, failed = [], 0
     steps = track(_records(fit, runs, seed), description="bootstrap", total=runs, transient=True,
                   console=Console(stderr=True), disable=not sys.stderr.isatty())

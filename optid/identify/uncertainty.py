@@ -192,8 +192,7 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    if not 0 < level < 1:
-        raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")
+    check_level(level)
     transform = getattr(fit.data, "transform", None)
 
     def rebuild(values: dict[str, Array]) -> Any:
@@ -210,3 +209,9 @@ def aligned(model: Any, reference: Any) -> Any:
         return model
     return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)),
                    nonlinearities=tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities)))
+
+
+def check_level(level: float) -> None:
+    """Refuse what is no probability between 0 and 1 (`StructureError`)."""
+    if not 0 < level < 1:
+        raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")
