@@ -17,8 +17,9 @@ from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_rank_one
 from optid.data.record import Data
 from optid.data.streams import Stream
+from optid.identify.arguments import one_of
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import check_gauge, in_gauge, scale_fixed
+from optid.identify.gauges import FIXED, in_gauge, scale_fixed
 from optid.models import HammersteinTF
 from optid.program.expressions import flat
 from optid.program.judging import measure_violation
@@ -55,7 +56,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         StructureError: impossible orders, unknown gauge, constraints that do not fit.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
                           nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
 

@@ -19,8 +19,9 @@ from optid.certificate.lifting import certify_nuclear
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
+from optid.identify.arguments import one_of
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import check_gauge, in_gauge
+from optid.identify.gauges import FIXED, in_gauge
 from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
@@ -56,7 +57,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
         StructureError: impossible orders, unknown gauge, nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     if not weight >= 0:
         raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, weight=float(weight)),
@@ -88,7 +89,7 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
         StructureError: impossible orders, unknown gauge or split, nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, svd=svd), convex=True,

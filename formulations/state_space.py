@@ -28,12 +28,13 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
+from optid.arrays import check_integer
 from optid.bases import Bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
-from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
+from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -115,7 +116,7 @@ def _procedure(name: str, data: Data, nx: Any, basis: Any, feedback_basis: Any, 
                constraints: Sequence[Any]) -> Procedure:
     for what, word in words.items():
         one_of(what, word, WORDS[what])
-    whole_number("iterations", iterations, 1)
+    check_integer(iterations, "iterations")
     in_memory(data, f"{words['criterion']} errors")
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and words["criterion"] == "prediction":

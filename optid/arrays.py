@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataError, DataWarning, OptidError, StructureError
 
 Array = NDArray[np.floating]
 
@@ -86,13 +86,22 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
                     "remove the fault that produced it.")
 
 
-def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) -> int:
-    """Return an integer argument as an int; refuse others and those outside the bounds (`StructureError`)."""
+def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
+                  error: type[OptidError] = StructureError) -> int:
+    """Return an integer argument as an int.
+
+    Args:
+        value: of the argument.
+        name: of the argument, for the message.
+        low: least value.
+        high: largest value; None for any.
+        error: what is raised: no integer, or one outside the bounds.
+    """
     top = value if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
-        kind = "a positive integer" if low == 1 else f"an integer >= {low}"
+        kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
         kind = kind if high is None else f"an integer from {low} to {high}"
-        raise StructureError(f"{name} must be {kind}; got {value!r}.")
+        raise error(f"{name} must be {kind}; got {value!r}.")
     return int(value)
 
 

@@ -84,7 +84,7 @@ def search(program, points=72):
 
 def regression(fit, solution=None):
     """Coefficients (columns, l) of the dense regressor in the units of the record, of a fit or of one of its steps."""
-    fit = fit if solution is None else replace(fit, solved=solution)
+    fit = fit if solution is None else replace(fit, outcome=replace(fit.outcome, solution=solution))
     values, ny, layout = fit.values, fit.data.l, fit.program.compressed.layout
     a = values.get("a", np.zeros(0))
     rows = [np.reshape(a, (ny, -1), order="F" if ny > 1 else "C").T if a.size else np.zeros((0, ny))]

@@ -74,7 +74,7 @@ def test_response_knows_where_it_knows_nothing():
 
 
 @pytest.mark.parametrize("make, error, words", [
-    (lambda: frequency_response(PENDULUM, segment=4), StructureError, "segment must be an integer >= 8; got 4"),
+    (lambda: frequency_response(PENDULUM, segment=4), StructureError, "segment must be an integer of at least 8"),
     (lambda: frequency_response(PENDULUM.window(0, 40)), DataError, "1 complete segments of 32 samples"),
     (lambda: frequency_response(optid.Data(np.column_stack([PENDULUM.u, PENDULUM.u]), PENDULUM.y)), DataError,
      "cannot be told apart"),

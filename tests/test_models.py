@@ -383,5 +383,5 @@ def test_prediction_several_steps_ahead_is_simulation_from_the_state_then(make, 
         known = k - horizon + 1  # samples before this one are known
         state = model.state(u[:known], y[:known])
         assert predicted[k] == pytest.approx(model.simulate(longer[known:], state)[k - known], abs=1e-10)
-    with pytest.raises(StructureError, match="horizon must be a positive integer; got 0"):
+    with pytest.raises(StructureError, match="horizon must be a positive integer"):
         model.predict(Data(u, y, dt=model.dt), 0)

@@ -320,7 +320,7 @@ def test_results_by_name():
     ({"na": True}, StructureError, "na"),
     ({"nb": 0}, StructureError, "nb of input 'u'"),
     ({"starts": 0}, StructureError, "starts"),
-    ({"gauge": "none"}, StructureError, "gauge must be one of"),
+    ({"gauge": "none"}, StructureError, "gauge='none': use one of norm, gain, b0"),
     ({"na": 60, "nb": 60}, RankError, "rows|samples"),
 ])
 def test_structure_that_will_not_do(changes, error, words):

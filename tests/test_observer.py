@@ -6,7 +6,6 @@ import pytest
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.innovations import innovation_form
 from optid.identify.noise import observer_gain
 from optid.identify.subspace.observability import simulate_clipped
 from optid.identify.subspace.realisation import ObserverForm, observer_problem
@@ -214,20 +213,6 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
         x = 0.3 * A @ x + 0.1 * bu @ eta[k] + ez @ expansion.feedback[0].values(y[None])[0]
     (wild,) = simulate_clipped(records, expansion, 2 * A, C, bu, du, 50 * ez, d)
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
-
-
-def test_gain_of_an_innovation_form():
-    rng = np.random.default_rng(7)
-    k, e = np.array([[0.5, 0.1], [-0.2, -0.4]]), rng.standard_normal((20000, 2)) * [1.0, 0.3]
-    gain, x, predicted = observer_gain(A, C, 1.0), np.zeros(2), np.zeros(2)
-    errors = np.empty((20000, 2))
-    for t in range(20000):
-        y = C @ x + e[t]
-        errors[t] = y - C @ predicted
-        x, predicted = A @ x + k @ e[t], A @ predicted + gain @ errors[t]
-    found, noise = innovation_form(A, C, gain, [errors[:15000], errors[15000:]])
-    np.testing.assert_allclose(found, k, atol=0.05)
-    np.testing.assert_allclose(noise.innovation, np.diag([1.0, 0.09]), atol=0.02)
 
 
 def test_block_rows_fit_the_record():

@@ -319,13 +319,13 @@ def test_short_records_say_what_they_cannot():
 
 
 @pytest.mark.parametrize("arguments, error, words", [
-    ({"block_rows": 1}, StructureError, "block_rows=1"),
+    ({"block_rows": 1}, StructureError, "block_rows must be an integer of at least 2; got 1"),
     ({"block_rows": 4, "nx": 4}, StructureError, "show orders up to 3, not 4: use block_rows=5"),
-    ({"nx": 0}, StructureError, "nx=0"),
+    ({"nx": 0}, StructureError, "nx.* must be a positive integer; got 0"),
     ({"holdout": 1.0}, StructureError, "holdout"),
     ({"level": 0.0}, StructureError, "level=0.0"),
-    ({"na": -1}, StructureError, "na=-1 must be an integer >= 0"),
-    ({"nb": 0}, StructureError, "nb=0 must be a positive integer"),
+    ({"na": -1}, StructureError, "na must be a nonnegative integer"),
+    ({"nb": 0}, StructureError, "nb must be a positive integer"),
     ({"feedback_basis": ["polynomial:2"] * 2}, StructureError, "2 feedback bases for 1 outputs"),
     ({"block_rows": 150}, RankError, "complete windows"),
     ({"block_rows": 400}, RankError, "Experiment 1 has 800 samples"),

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
 
 Outside = Literal["clamp", "extrapolate", "error"]
@@ -39,9 +39,7 @@ class Basis:
 
     def __post_init__(self) -> None:
         for name, (smallest, meaning) in self._sizes.items():
-            p = getattr(self, name)
-            if isinstance(p, bool) or not isinstance(p, (int, np.integer)) or p < smallest:
-                raise StructureError(f"The number of {meaning} must be an integer >= {smallest}; got {p!r}.")
+            check_integer(getattr(self, name), f"The number of {meaning}", smallest)
         if self.outside not in OUTSIDE:
             raise StructureError(f"outside={self.outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
         if self.interval is None:

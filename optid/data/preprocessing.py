@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.errors import DataError, nearest
 
 Changed = TypeVar("Changed", bound=Any)
@@ -67,8 +68,7 @@ def decimate(data: Changed, q: int) -> Changed:
     Raises:
         DataError: q is not a positive integer, samples are missing, or an experiment is shorter than the filter.
     """
-    if isinstance(q, bool) or not isinstance(q, int | np.integer) or q < 1:
-        raise DataError(f"decimate by {q!r}: a positive integer is needed.")
+    check_integer(q, "q", error=DataError)
     if q == 1:
         return data
     for channel, share in data.missing.items():

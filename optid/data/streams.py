@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, sampling_time
 from optid.data.reading.chunks import Channels, Chunk
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
@@ -179,12 +180,11 @@ def open_stream(
         DataError: as `read`, here or when the chunk is reached.
         ClusterError: the cluster cannot be used.
     """
-    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
-        raise DataError(f"chunk = {chunk!r}: a positive number of samples is needed.")
+    chunk = check_integer(chunk, "chunk", error=DataError)
     several = list(source) if isinstance(source, list | tuple) else [source]
     if not several:
         raise DataError("the list of sources is empty; give at least one.")
-    opened = [open_source(one, int(chunk), columns, delimiter, decimal) for one in several]
+    opened = [open_source(one, chunk, columns, delimiter, decimal) for one in several]
     ins, outs, clock = _chosen(opened, inputs, outputs, time)
     names = channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units)
     dt = None if dt is None else sampling_time(dt)

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import stdtrit
 
-from optid.arrays import Array
-from optid.errors import StructureError
+from optid.arrays import Array, check_integer
 
 DRAWS = 8192  # random draws of an interval under inequalities: their noise is about 0.7 % of its width
 SETS = 64  # sets of active rows that are tried for all points; where there are many more, each point finds its own
@@ -34,11 +33,8 @@ class LocalEstimate:
         dof: degrees of freedom of the noise estimate inside S.
         rows: (r, n) and
         slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
-        draws: number of random draws.
+        draws: number of random draws, at least 100 (`StructureError`).
         seed: their seed.
-
-    Raises:
-        StructureError: fewer than 100 draws.
     """
 
     centre: Array
@@ -50,8 +46,7 @@ class LocalEstimate:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.draws < 100:
-            raise StructureError(f"draws={self.draws}: the ends of an interval need at least 100 draws")
+        check_integer(self.draws, "draws, on which the ends of an interval rest,", 100)
 
     @cached_property
     def in_reach(self) -> np.ndarray:

@@ -60,11 +60,6 @@ class Tangent:
     noise: Array
     meaning: str
 
-    def covariance(self, quantity: Quantity) -> Array:
-        """Covariance (q, q) of a quantity, flattened, without regard to inequalities."""
-        scattered = self.slopes(quantity) @ self.local.scatter
-        return scattered @ scattered.T
-
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
         return self.local.limits(self.slopes(quantity), level)

@@ -12,13 +12,14 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from optid.arrays import check_integer
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.identify.arguments import per_channel, whole_number
+from optid.identify.arguments import per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.expressions import flat
@@ -175,7 +176,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     inputs, outputs = data.inputs, data.outputs
     nbs = per_channel("nb", nb, inputs, low=1)
     nks = per_channel("nk", nk, inputs, low=0)
-    order = whole_number("na", na, 0, "the number of past outputs")
+    order = check_integer(na, "na (the number of past outputs)", 0)
     bases = fitted_bases(data, basis)
     units = Transform.identity(len(inputs), len(outputs))
     if own:

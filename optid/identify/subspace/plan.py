@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases import Linear, UserFunctions, feedback_bases, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
@@ -58,9 +58,8 @@ class Plan:
     def __post_init__(self) -> None:
         for name, known in WORDS.items():
             one_of(name, getattr(self, name), known)
-        nx: Any = self.nx
-        if nx not in ("auto", "gap") and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
-            raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
+        if self.nx not in ("auto", "gap"):
+            check_integer(self.nx, "nx, unless 'auto' or 'gap',")
         if not self.units.y_scale:
             object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))
 
