@@ -6,7 +6,7 @@ constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapte
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -65,15 +65,19 @@ class Coordinates:
         for name, value in self.unpack(x).items():
             self.program.variables[name].value = value
 
+    @cached_property
+    def blocks(self) -> list[tuple[slice, slice, slice]]:
+        """Where vec(mu_i b_iᵀ) stands in z, and mu_i and b_i in x."""
+        found, at = [], self.form.problem.linear
+        for where, (p, q) in zip(self.form.problem.slices, self.form.problem.blocks):
+            found.append((where, slice(at, at + p), slice(at + p, at + p + q)))
+            at += p + q
+        return found
+
     def point(self, x: np.ndarray) -> Point:
         """Return x as a point of the rank-one problem."""
-        position = self.form.problem.linear
-        mus, bs = [], []
-        for p, q in self.form.problem.blocks:
-            mus.append(x[position : position + p])
-            bs.append(x[position + p : position + p + q])
-            position += p + q
-        return Point(x[: self.form.problem.linear], tuple(mus), tuple(bs))
+        return Point(x[: self.form.problem.linear], tuple(x[mu] for _, mu, _ in self.blocks),
+                     tuple(x[b] for _, _, b in self.blocks))
 
     def sizes(self, x: np.ndarray) -> dict[str, float]:
         """Natural size of every variable around x: how much of it would account for the whole record.
@@ -82,39 +86,27 @@ class Coordinates:
         """
         problem = self.form.problem
         energy = np.linalg.norm(problem.root @ self.slope_of_lift(x), axis=0)
-        reach, found, position = float(np.sqrt(problem.scale)), {}, 0
-        for name, variable in zip(self.names, self.variables):
-            largest = float(np.max(energy[position : position + variable.size]))
-            found[name] = reach / largest if largest > 0 and reach > 0 else 1.0
-            position += variable.size
-        return found
+        reach, largest = float(np.sqrt(problem.scale)), {n: float(np.max(e)) for n, e in self.unpack(energy).items()}
+        return {name: reach / one if one > 0 and reach > 0 else 1.0 for name, one in largest.items()}
 
     def slope_of_lift(self, x: np.ndarray) -> np.ndarray:
         """Jacobian (n, size) of the lifted vector z(x)."""
-        point, linear = self.point(x), self.form.problem.linear
+        linear = self.form.problem.linear
         found = np.zeros((len(self.form.problem.target), self.size))
         found[:linear, :linear] = np.eye(linear)
-        row = at = linear
-        for mu, b in zip(point.mus, point.bs):
-            p, q = mu.size, b.size
-            found[row : row + p * q, at : at + p] = np.kron(b[:, None], np.eye(p))
-            found[row : row + p * q, at + p : at + p + q] = np.kron(np.eye(q), mu[:, None])
-            row, at = row + p * q, at + p + q
+        for where, mu, b in self.blocks:
+            found[where, mu] = np.kron(x[b][:, None], np.eye(x[mu].size))
+            found[where, b] = np.kron(np.eye(x[b].size), x[mu][:, None])
         return found
 
     def curvature(self, x: np.ndarray, pull: np.ndarray) -> np.ndarray:
         """Second derivatives of ``pullᵀ z(x)``, made definite along the scale between mu and b."""
-        point = self.point(x)
         found = np.zeros((self.size, self.size))
-        row = at = self.form.problem.linear
-        for mu, b in zip(point.mus, point.bs):
-            p, q = mu.size, b.size
-            own, other = slice(at, at + p), slice(at + p, at + p + q)
-            found[own, other] = pull[row : row + p * q].reshape(p, q, order="F")
-            found[other, own] = found[own, other].T
+        for where, mu, b in self.blocks:
+            found[mu, b] = pull[where].reshape(x[mu].size, -1, order="F")
+            found[b, mu] = found[mu, b].T
             if self.form.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
-                found[other, other] += np.outer(b, b) * float(mu @ mu)
-            row, at = row + p * q, at + p + q
+                found[b, b] += np.outer(x[b], x[b]) * float(x[mu] @ x[mu])
         return found
 
 
@@ -257,16 +249,16 @@ class StepQP:
         equal = [(slope, -level) for row, slope, level in pairs if row.equality]
         below = [(slope, -level) for row, slope, level in pairs if not row.equality]
         found = solve_least_squares(matrix, target, [(pins, held), *equal], below, settings)
-        if found.x is None:
-            return Answer(found.status, found.word)
+        if not found.values:
+            return found
         duals, position = {}, len(pins)
         for row in sorted(self.rows, key=lambda row: not row.equality):  # as they were given: a stable order
             size = row.span.stop - row.span.start
             total = max(other.span.stop for other in self.rows if other.name == row.name)
-            part = self._unit**2 * found.multipliers[position : position + size] / row.unit
+            part = self._unit**2 * found.duals["rows"][position : position + size] / row.unit
             duals.setdefault(row.name, np.zeros(total))[row.span] = part
             position += size
-        return Answer(found.status, found.word, self.at.unpack(found.x * self._scale), duals, found.iterations)
+        return replace(found, values=self.at.unpack(found.values["x"] * self._scale), duals=duals)
 
     def _matrices(self) -> list[np.ndarray]:
         """Model, target and held values, then slope and level of all rows, in the units of the QP."""

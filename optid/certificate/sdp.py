@@ -75,7 +75,7 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
 
 
 def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Array],
-          linear: Linear | None) -> Relaxation | None:
+          linear: Linear) -> Relaxation | None:
     """Solve the relaxation around a point; None where the solver returns no multipliers.
 
     Args:
@@ -104,7 +104,7 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
             cut_value = cut_value + (form.T @ np.kron(z, z)) @ stacked
     slope = objective.slope / unit + _times(z / unit, k) @ extra
     multipliers = None
-    if linear is not None:
+    if len(linear.right):
         multipliers = cp.Variable(len(linear.right))
         slope = slope + linear.rows.T @ multipliers / (2 * unit)
         cut_value = cut_value + linear.slack(z)[0] @ multipliers
@@ -127,7 +127,7 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     cuts = {i: _pair_weights([np.asarray(w.value) for w in found], len(cones[i]), blocks[i][1][1])
             for i, found in pairs.items()}
     prices = np.zeros(0)
-    if linear is not None and multipliers is not None:
+    if multipliers is not None:
         prices = np.asarray(multipliers.value, float)
         prices = np.where(linear.equality, prices, np.maximum(prices, 0.0))
     return Relaxation(minors, cuts, prices, _moments(np.asarray(lifted.dual_value), z, unit))

@@ -64,38 +64,26 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     settings = Settings(accuracy, time_limit, warm, verbose, options)
 
     separate = (time_limit is not None) if isolate is None else isolate
-    clock = time.perf_counter()
-    answer = _attempt(program, back_end, settings, separate)
-    solved = time.perf_counter()
-    solution = _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
-    if chosen and solution.status is Status.FAILED and not options:
-        return _substitute(program, solution, settings, prove, separate)
-    if chosen and solution.status is Status.INACCURATE and not options:
-        return _sharpened(program, back_end, solution, settings, prove, separate)
-    return solution
 
-
-def _sharpened(program: Program, back_end: BackEnd, first: Solution, settings: Settings, prove: bool, separate: bool
-               ) -> Solution:
-    """Return what a hundredth of the tolerance gives where that satisfies our measurements, else the first answer."""
-    clock = time.perf_counter()
-    answer = _attempt(program, back_end, replace(settings, accuracy=settings.accuracy / 100), separate)
-    seconds = first.times.solve + time.perf_counter() - clock
-    again = _verdict(program, back_end, answer, first.chosen, settings, seconds, prove, separate)
-    return again if again.status in (Status.LOCAL, Status.OPTIMAL) else first
-
-
-def _substitute(program: Program, first: Solution, settings: Settings, prove: bool, separate: bool) -> Solution:
-    """Return the first usable answer of another back end of the class, or the failure of the one chosen."""
-    for back_end in fallbacks(program, first.solver):
+    def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
         clock = time.perf_counter()
         answer = _attempt(program, back_end, settings, separate)
-        seconds = time.perf_counter() - clock
-        chosen = f"{back_end.name}: in place of {first.solver}"
-        solution = _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
-        if solution.has_point and solution.status is not Status.FAILED:
-            return replace(solution, failed=first.solver)
-    return first
+        seconds = spent + time.perf_counter() - clock
+        return _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
+
+    solution = attempt(back_end, settings, chosen)
+    if not chosen or options:
+        return solution
+    if solution.status is Status.FAILED:
+        for other in fallbacks(program, back_end.name):
+            found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
+            if found.has_point and found.status is not Status.FAILED:
+                return replace(found, failed=back_end.name)
+    if solution.status is Status.INACCURATE:  # a hundredth of the tolerance may satisfy our measurements
+        sharper = replace(settings, accuracy=settings.accuracy / 100)
+        found = attempt(back_end, sharper, chosen, solution.times.solve)
+        return found if found.status in (Status.LOCAL, Status.OPTIMAL) else solution
+    return solution
 
 
 def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
@@ -239,33 +227,27 @@ def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) ->
 
 def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool
            ) -> tuple[_Judged, Bound | None]:
-    """Ask for a proof; when the attempt proposes a better start, solve again from there and keep the better point."""
+    """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
     if program.certify is None:
         return point, _convex_proof(program, point)
     bound, start = program.certify(program, point.values, point.duals)
     if start is not None and not bound.proved:
-        answer = _attempt(replace(program, start=start), back_end, settings, separate)
-        if answer.values:
-            again = _judged(program, answer)
-            lower = point.objective - 1e-10 * abs(point.objective)
-            if again.objective < lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
-                bound, _ = program.certify(program, again.values, again.duals)
-                point = again
-        program.assign(point.values)
+        point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
     if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
         wider = replace(settings, options={**back_end.thorough, **settings.options})
-        point, bound = _better(program, back_end, wider, point, bound, separate)
+        point, bound = _lowered(program, program.start, back_end, wider, point, bound, separate)
     return point, bound
 
 
-def _better(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound, separate: bool
-            ) -> tuple[_Judged, Bound]:
-    """Search further for a local optimum that lies lower, and certify it."""
-    answer = _attempt(program, back_end, settings, separate)
-    again = _judged(program, answer) if answer.values else point
-    lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-    if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9) and program.certify is not None:
-        return again, program.certify(program, again.values, again.duals)[0]
+def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound,
+             separate: bool) -> tuple[_Judged, Bound]:
+    """Solve again from a start, and certify the point found there where it lies lower."""
+    answer = _attempt(replace(program, start=start), back_end, settings, separate)
+    if answer.values and program.certify is not None:
+        again = _judged(program, answer)
+        lower = again.objective < point.objective - 1e-10 * abs(point.objective)
+        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
+            point, bound = again, program.certify(program, again.values, again.duals)[0]
     program.assign(point.values)
     return point, bound
 

@@ -1,12 +1,14 @@
 """Least squares behind a programme, with and without products of its variables."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.program.structure import Structure, relative_gradient, variable_size
-from optid.structures.rank_one import RankOne
+from optid.structures.rank_one import Point, RankOne
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,10 @@ class LeastSquaresStructure(Structure):
     problem: Any
     linear: tuple[str, ...]
     blocks: tuple[tuple[str, str], ...] = ()
+
+    def flat(self, values: Mapping[str, Any]) -> Array:
+        """Return the linear variables among named values as they follow one another in z."""
+        return np.concatenate([*(np.ravel(values[name], order="F") for name in self.linear), np.zeros(0)])
 
     def measure(self, program: Any) -> tuple[float, float]:
         """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
@@ -69,6 +75,19 @@ class RankOneStructure(LeastSquaresStructure):
     def about(self) -> str:
         """What the programme is and how large."""
         return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
+
+    def point(self, values: Mapping[str, Any]) -> Point:
+        """Read a point from named values."""
+        return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
+                     tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
+
+    def named(self, point: Point, variables: Mapping[str, Any]) -> dict[str, Array]:
+        """Name the parts of a point, in the shapes of the variables."""
+        parts = np.split(point.w, np.cumsum([variables[name].size for name in self.linear])[:-1])
+        found = dict(zip(self.linear, parts))
+        for (mu, b), *pair in zip(self.blocks, point.mus, point.bs):
+            found |= zip((mu, b), pair)
+        return {name: np.reshape(part, variables[name].shape, order="F") for name, part in found.items()}
 
 
 def rank_one_of(program: Any) -> RankOneStructure | None:
