@@ -135,7 +135,8 @@ def test_one_step_errors_lie_below_the_bound_and_are_refused():
 
 def test_certificate_of_a_fit():
     rng = np.random.default_rng(1)
-    bounds = hankel_bounds([rng.normal(size=(200, 3))], None, inputs=[0], feedback=[1], outputs=[2], largest=2)
+    bounds = hankel_bounds([rng.normal(size=(200, 3))], None, inputs=[0], feedback=[1], outputs=[2], largest=2,
+                           block_rows=(4, 8, 16))
     found = bounds.bound(1, 500.0)
     assert found.value == bounds.value(1)[0] and found.method.startswith("Hankel") and not found.proved
 
@@ -153,7 +154,7 @@ def test_exact_data_are_bounded_by_nothing():
     rng = np.random.default_rng(3)
     phi = rng.normal(size=(300, 1))
     y = simulate(*random_model(rng, 2, 1, 1), phi, np.ones(2), np.ones(2), np.ones(1))
-    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3)
+    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3, block_rows=(5, 10, 20))
     assert bounds.value(2)[0] <= 1e-9 * bounds.energy and bounds.value(1)[0] > 1e-6 * bounds.energy
     assert bounds.smallest_order(1e-9 * bounds.energy) == 2
 
@@ -161,7 +162,8 @@ def test_exact_data_are_bounded_by_nothing():
 @pytest.mark.parametrize("call, error, words", [
     (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], block_rows=(1,)), StructureError, "two block"),
     (lambda raw: hankel_bounds([raw[:30]], None, inputs=[0], outputs=[1], block_rows=(20,)), RankError, "too few"),
-    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], largest=2).value(7), StructureError, "0 to 2"),
+    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], largest=2, block_rows=(4,)).value(7),
+     StructureError, "0 to 2"),
 ])
 def test_bad_arguments(call, error, words):
     with pytest.raises(error, match=words):

@@ -16,6 +16,7 @@ import numpy as np
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
+from optid.program.expressions import flat
 from optid.program.gradients import affine_parts, flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
@@ -271,7 +272,7 @@ class StepQP:
         at = self.at
         stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
         swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
-        x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in stand_ins.values()])
+        x = cp.hstack([flat(v) for v in stand_ins.values()])
         matrices = [cp.Parameter(value.shape, value=value) for value in self._matrices()]
         r = cp.Variable(at.size)
         groups: dict[str, list] = {"model": [r == matrices[0] @ x - matrices[1]]}

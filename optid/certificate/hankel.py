@@ -22,7 +22,6 @@ from optid.program.solution import Bound
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import Expand, hankel_statistics
 
-MOST_ROWS = 60  # block rows tried where none are given
 WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
 ROUNDING = {"qr": 1e-13, "gram": 1e-15}  # of the projected energy, the second per squared condition number
 
@@ -79,7 +78,7 @@ class HankelBounds:
 
 
 def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Sequence[int], outputs: Sequence[int],
-                  feedback: Sequence[int] = (), largest: int = 10, block_rows: Sequence[int] | None = None,
+                  block_rows: Sequence[int], feedback: Sequence[int] = (), largest: int = 10,
                   weights: Array | None = None) -> HankelBounds:
     """Bound the simulation error of every model of order 0 to ``largest``.
 
@@ -90,18 +89,17 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         expand: raw channels -> signals, as in `optid.statistics.hankel.hankel_statistics`; None for the channels.
         inputs: positions of the functions of the inputs among the signals.
         outputs: positions of the outputs.
+        block_rows: the alphas to try.
         feedback: positions of the functions of the outputs that are fed back; a linear function of the outputs among
             them makes the bound zero.
         largest: largest order of interest.
-        block_rows: the alphas to try; by default up to six that the record supports.
         weights: (l,) by which the outputs are multiplied in the error.
 
     Raises:
         StructureError: a number of block rows below two.
         RankError: the record is too short for any of them.
     """
-    signals = (expand or (lambda raw: raw))(np.asarray(records[0], dtype=float)[:1]).shape[1]
-    tried = _alphas(records, signals, largest) if block_rows is None else tuple(sorted({int(a) for a in block_rows}))
+    tried = tuple(sorted({int(a) for a in block_rows}))
     if not tried or tried[0] < 2:
         raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
     scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
@@ -121,15 +119,9 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         values[position, left.size :] = np.nan
         energy = max(energy, whole)
     if np.all(np.isnan(values)):
-        raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of {signals} "
-                        "signals; use a longer record or fewer functions")
+        raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of "
+                        f"{len(inputs) + len(outputs) + len(feedback)} signals; use a longer record or fewer functions")
     return HankelBounds(tried, values, energy)
-
-
-def _alphas(records: Sequence[Array], signals: int, largest: int) -> tuple[int, ...]:
-    length = max(len(record) for record in records)
-    most = max(2, min(MOST_ROWS, length // (3 * max(signals, 1))))
-    return tuple(int(a) for a in np.unique(np.round(np.geomspace(min(largest + 2, most), most, 6))))
 
 
 def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, weights: Array, error: float,

@@ -12,8 +12,15 @@ from time import perf_counter
 
 import numpy as np
 
-from optid.certificate.ascent import ascend, rotation
-from optid.certificate.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
+from optid.certificate.minors import (
+    Block,
+    Lagrangian,
+    ascend,
+    free_mask,
+    project_minors,
+    rotation,
+    tangent_minors,
+)
 from optid.certificate.sdp import relax, relaxation_size
 from optid.certificate.shape_duals import (
     ACTIVE,

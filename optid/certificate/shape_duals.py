@@ -101,7 +101,8 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
     lengths = np.maximum(np.linalg.norm(rows, axis=1), np.finfo(float).tiny)
     weights = fit_multipliers(rows / lengths[:, None], jacobian.T @ (2 * slope), equality)[0] / lengths
     *pieces, last = np.split(weights, np.cumsum([len(part) for part in parts]))
-    nu, lam = {i: np.zeros(len(cone)) for i, cone in cones.items()}, np.zeros(len(linear.right))
+    nu: dict[int, Array] = {i: np.zeros(len(cone)) for i, cone in cones.items()}
+    lam = np.zeros(len(linear.right))
     for i, piece in zip(cones, pieces):
         nu[i][active[i]] = piece
     lam[held] = last

@@ -232,7 +232,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
         _raise_failure(outcome)
     model = outcome.model
     findings = findings + _disobeyed(model, arguments.get("constraints", ()))
-    compressed, figures = outcome.program.compressed, dict(outcome.figures)
+    compressed, figures, whole = outcome.program.compressed, dict(outcome.figures), outcome.evidence
     if compressed is not None:
         figures |= {key: getattr(compressed.statistics, key) for key in ("rows", "candidates", "condition", "method")}
     findings = findings + examine_figures(figures)
@@ -240,8 +240,9 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
                program=outcome.program, data=data,
                prices=(*price_constraints(outcome.program, outcome.solution),
                        *price_earlier_steps(outcome.constrained, outcome.program)),
-               findings=tuple(findings), measured=figures, steps=outcome.steps, procedure=outcome.procedure,
-               seconds=time.perf_counter() - started, bound=outcome.bound, extend=outcome.extend)
+               findings=tuple(findings), measured=figures, steps=outcome.steps, procedure=whole is not None,
+               seconds=time.perf_counter() - started, extend=whole.extend if whole else None,
+               bound=whole.bound if whole and callable(whole.bound) else None)
 
 
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
-from cvxpy.constraints.zero import Equality, Zero
 
 from optid.program.gradients import flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
@@ -87,7 +87,7 @@ def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> f
         member: the constraint.
         usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
     """
-    expressions = [member.expr] if isinstance(member, Equality | Zero | Inequality | NonPos) else member.args
+    expressions = [member.expr] if isinstance(member, EQUALITIES | INEQUALITIES) else member.args
     sizes = [_terms(expression, usual or {}) for expression in expressions]
     largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
     return max([size for size in sizes if size is not None], default=largest) or largest or 1.0
@@ -122,9 +122,9 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
         The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
         or None for a cone whose multipliers are not used here.
     """
-    if isinstance(member, Equality | Zero):
+    if isinstance(member, EQUALITIES):
         return [(member.expr, dual)]
-    if isinstance(member, Inequality | NonPos):
+    if isinstance(member, INEQUALITIES):
         return [(member.expr, np.maximum(dual, 0.0))]
     if isinstance(member, NonNeg):
         return [(member.args[0], -np.maximum(dual, 0.0))]
@@ -176,7 +176,7 @@ class Lagrangian:
                     return found
                 products = [flat_value(expression) * weights for expression, weights in terms]
                 found.value += float(sum(map(np.sum, products)))
-                if not isinstance(member, Equality | Zero):
+                if not isinstance(member, EQUALITIES):
                     whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
                     found.complementarity += abs(float(sum(map(np.sum, products)))) if whole else float(
                         np.sum(np.abs(products[0])))
@@ -238,15 +238,4 @@ _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normN
 
 
 def _smooth(expression: cp.Expression) -> bool:
-    if expression.is_affine():
-        return True
-    return not ({type(atom).__name__ for atom in _atoms(expression)} & _KINKS)
-
-
-def _atoms(expression: cp.Expression) -> list[cp.Expression]:
-    stack, found = [expression], []
-    while stack:
-        node = stack.pop()
-        found.append(node)
-        stack.extend(getattr(node, "args", []))
-    return found
+    return expression.is_affine() or not {atom.__name__ for atom in expression.atoms()} & _KINKS

@@ -128,11 +128,12 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
 
     clock = time.perf_counter()
     try:
-        point = _judged(program, answer)
+        point = _judged(program, answer, base)
     except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
         why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
+    assert point.residuals is not None
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
         return _conflict(program, base, reason)
@@ -144,10 +145,9 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
         elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
             status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
     done = time.perf_counter()
-    return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   values=point.values, duals=point.duals, objective=point.objective, bound=bound,
-                   residuals=point.residuals,
-                   times=replace(base.times, judge=judged - clock, prove=done - judged)).in_units(program.unit)
+    return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
+                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged)
+                   ).in_units(program.unit)
 
 
 def _conflict(program: Program, base: Solution, reason: str) -> Solution:
@@ -155,20 +155,11 @@ def _conflict(program: Program, base: Solution, reason: str) -> Solution:
     return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}").in_units(program.unit)
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A point with what we measured there."""
-
-    values: Values
-    duals: Values
-    objective: float
-    residuals: Residuals
-
-
-def _judged(program: Program, answer: Answer) -> _Judged:
+def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
+    """Return a solution at the answer's point, with what we measured there."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         objective, residuals = judge(program, answer.values, answer.duals)
-    return _Judged(program.values(), dict(answer.duals), objective, residuals)
+    return replace(base, values=program.values(), duals=dict(answer.duals), objective=objective, residuals=residuals)
 
 
 def _overflowed(program: Program) -> bool:
@@ -218,18 +209,23 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     return Status.LOCAL, ""
 
 
-def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) -> bool:
+def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -> bool:
     """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
     if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
         return False
     return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
 
 
-def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool
-           ) -> tuple[_Judged, Bound | None]:
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
+           ) -> tuple[Solution, Bound | None]:
     """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
     if program.certify is None:
-        return point, _convex_proof(program, point)
+        if program.kind == "NLP":
+            return point, None
+        try:
+            return point, certify_convex(program, point.values, point.duals, point.objective)
+        except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+            return point, None
     bound, start = program.certify(program, point.values, point.duals)
     if start is not None and not bound.proved:
         point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
@@ -239,26 +235,21 @@ def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judg
     return point, bound
 
 
-def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound,
-             separate: bool) -> tuple[_Judged, Bound]:
+def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
+             separate: bool) -> tuple[Solution, Bound]:
     """Solve again from a start, and certify the point found there where it lies lower."""
     answer = _attempt(replace(program, start=start), back_end, settings, separate)
     if answer.values and program.certify is not None:
-        again = _judged(program, answer)
+        again = _judged(program, answer, point)
         lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
+        if lower and _violation(again) <= max(_violation(point), 1e-9):
             point, bound = again, program.certify(program, again.values, again.duals)[0]
     program.assign(point.values)
     return point, bound
 
 
-def _convex_proof(program: Program, point: _Judged) -> Bound | None:
-    if program.kind == "NLP":
-        return None
-    try:
-        return certify_convex(program, point.values, point.duals, point.objective)
-    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        return None
+def _violation(point: Solution) -> float:
+    return float("inf") if point.residuals is None else point.residuals.violation
 
 
 @dataclass(frozen=True)
@@ -306,12 +297,11 @@ class Outcome:
         solution: the last solution.
         program: the last programme.
         steps: every (name, solution) on the way; one entry for a plain programme.
-        figures: those of the procedure's `Evidence`.
+        figures: those of the evidence, and which solvers stood in for others.
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
-        procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
-        bound: that of the procedure's `Evidence` where it is a function; the solution has no bound then.
-        extend: that of the procedure's `Evidence`.
+        evidence: with which a procedure judged the whole, so that solution and program are no pair of their own; the
+            solution has no bound where the evidence has a function that returns it.
     """
 
     model: Any
@@ -320,9 +310,7 @@ class Outcome:
     steps: tuple[tuple[str, Solution], ...]
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
-    procedure: bool = False
-    bound: Callable[[], Bound] | None = None
-    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
+    evidence: Evidence | None = None
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -359,9 +347,8 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-            later = found.bound if callable(found.bound) else None
-            solution = replace(solution, objective=found.objective, bound=None if later else found.bound,
-                               status=found.status, reason=found.reason)
+            bound = None if callable(found.bound) else found.bound
+            solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
+                               reason=found.reason)
             figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, later,
-                           found.extend)
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)
