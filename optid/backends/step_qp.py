@@ -161,11 +161,8 @@ class StepQP:
         self.rows: list[_Rows] = []
         self.cones: list[tuple[str, slice, cp.Constraint]] = []
         self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
-        self._pins = np.zeros(at.size, dtype=bool)
-        position = 0
-        for name, variable in zip(at.names, at.variables):
-            self._pins[position : position + variable.size] = pinned and name in [b for _, b in at.form.blocks]
-            position += variable.size
+        bs = [b for _, b in at.form.blocks] if pinned else []
+        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in zip(at.names, at.variables)])
         self._slopes: dict[int, np.ndarray] = {}
         self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
@@ -230,18 +227,20 @@ class StepQP:
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
         if back_end.name == "clarabel" and not self.cones:
-            return self._directly(settings)
-        program, matrices = self._programme
-        for parameter, value in zip(matrices, self._matrices()):
-            parameter.value = value
-        answer = back_end.run(program, settings)
-        values = {name: self.sizes[name] * answer.values[name] for name in self.sizes if name in answer.values}
-        duals = {name: self._unit**2 * answer.duals[name] for name, _, _ in self.cones if name in answer.duals}
-        for row in self.rows:
-            if row.name in answer.duals:
-                duals.setdefault(row.name, self._unit**2 * answer.duals[row.name])[row.span] /= row.unit
+            answer = self._directly(settings)
+        else:
+            program, matrices = self._programme
+            for parameter, value in zip(matrices, self._matrices()):
+                parameter.value = value
+            answer = back_end.run(program, settings)
         usable = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
-        return Answer(answer.status, answer.word, values if usable else {}, duals)
+        values = {name: size * answer.values[name] for name, size in self.sizes.items() if name in answer.values}
+        known = self.at.program.constraints
+        duals = {name: self._unit**2 * dual for name, dual in answer.duals.items() if name in known}
+        for row in self.rows:
+            if row.name in duals:
+                duals[row.name][row.span] /= row.unit
+        return replace(answer, values=values if usable else {}, duals=duals)
 
     def _directly(self, settings: Settings) -> Answer:
         matrix, target, held, *sides = self._matrices()
@@ -256,10 +255,9 @@ class StepQP:
         for row in sorted(self.rows, key=lambda row: not row.equality):  # as they were given: a stable order
             size = row.span.stop - row.span.start
             total = max(other.span.stop for other in self.rows if other.name == row.name)
-            part = self._unit**2 * found.duals["rows"][position : position + size] / row.unit
-            duals.setdefault(row.name, np.zeros(total))[row.span] = part
+            duals.setdefault(row.name, np.zeros(total))[row.span] = found.duals["rows"][position : position + size]
             position += size
-        return replace(found, values=self.at.unpack(found.values["x"] * self._scale), duals=duals)
+        return replace(found, values=self.at.unpack(found.values["x"]), duals=duals)
 
     def _matrices(self) -> list[np.ndarray]:
         """Model, target and held values, then slope and level of all rows, in the units of the QP."""

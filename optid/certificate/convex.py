@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from optid.arrays import Array
 from optid.certificate.lifting import lift_linear
 from optid.program.gradients import flat_value
-from optid.program.judging import Lagrangian, has_bounds
+from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
 from optid.structures.least_squares import LeastSquaresStructure
@@ -151,10 +151,9 @@ def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
     if variable.attributes["symmetric"]:
         gradient = (gradient + gradient.T) / 2
     room = np.full(variable.shape, _width(variable))
-    if has_bounds(variable):
-        lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+    if (bounds := bounds_of(variable)) is not None:
         value = np.asarray(variable.value, dtype=float)
-        room = np.clip(np.where(gradient > 0, value - lower, upper - value), 0.0, room)
+        room = np.clip(np.where(gradient > 0, value - bounds[0], bounds[1] - value), 0.0, room)
     return float(np.sum(np.abs(gradient) * room))
 
 

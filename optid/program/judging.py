@@ -65,10 +65,9 @@ def measure_violation(program: Program) -> tuple[float, str]:
                 worst, name = amount, key
     for key, variable in program.variables.items():
         value, amount, size = np.asarray(variable.value, dtype=float), 0.0, _size(variable, usual)
-        if has_bounds(variable):
-            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
-            amount = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
-            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in (lower, upper))])
+        if (bounds := bounds_of(variable)) is not None:
+            amount = float(np.max(np.maximum(bounds[0] - value, value - bounds[1]), initial=0.0))
+            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in bounds)])
         elif variable.attributes["PSD"] or variable.attributes["NSD"]:
             sign = 1.0 if variable.attributes["PSD"] else -1.0
             amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
@@ -106,9 +105,12 @@ def _terms(expression: cp.Expression, usual: Mapping[int, float]) -> float | Non
     return float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine expression
 
 
-def has_bounds(variable: cp.Variable) -> bool:
-    """Whether the variable carries bounds as attributes (nonneg, bounds, ...)."""
-    return any(variable.attributes[key] not in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds"))
+def bounds_of(variable: cp.Variable) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the bounds that a variable carries as attributes (nonneg, bounds, ...), None where it has none."""
+    if all(variable.attributes[key] in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds")):
+        return None
+    lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+    return lower, upper
 
 
 def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
@@ -211,10 +213,9 @@ class Lagrangian:
         gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
         if flags["symmetric"]:
             gradient = (gradient + gradient.T) / 2
-        if has_bounds(variable):
-            lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
+        if (bounds := bounds_of(variable)) is not None:
             value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
-            held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
+            held = ((value <= bounds[0] + margin) & (gradient > 0)) | ((value >= bounds[1] - margin) & (gradient < 0))
             gradient = np.where(held, 0.0, gradient)
         return np.abs(np.ravel(gradient, order="F"))
 
