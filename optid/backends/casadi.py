@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Smooth, cache, smooth
+from optid.backends.dnlp import Smooth, kept, smooth
 from optid.errors import StructureError
 from optid.program.gradients import MOVES, sources
 from optid.program.program import Program
@@ -50,45 +50,30 @@ def translate(form: Smooth) -> dict[str, Any]:
     for vector, leaves in ((x, form.variables), (p, form.parameters)):
         edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
         known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
-    columns = _Graph(known)
-    rows = [ca.densify(columns.column(row.expression)) for row in form.rows]
-    return {"x": x, "p": p, "f": ca.densify(columns.column(form.problem.objective.expr)),
+    done: dict[int, tuple[Any, Any]] = {}
+
+    def column(expr: Any) -> Any:
+        """Translate an expression, each once; it is kept, so that its id stays its own."""
+        if id(expr) not in done:
+            done[id(expr)] = (expr, _column(expr, known, column))
+        return done[id(expr)][1]
+
+    rows = [ca.densify(column(row.expression)) for row in form.rows]
+    return {"x": x, "p": p, "f": ca.densify(column(form.problem.objective.expr)),
             "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
 
 
-def graph(form: Smooth) -> dict[str, Any]:
-    """Return the translation of a smooth programme; made once and kept with the problem."""
-    kept = cache(form.original)
-    if "casadi" not in kept:
-        kept["casadi"] = translate(form)
-    return kept["casadi"]
-
-
-class _Graph:
-    """Translated expressions, each translated once."""
-
-    def __init__(self, leaves: dict[int, Any]) -> None:
-        self.leaves = leaves
-        self.done: dict[int, tuple[Any, Any]] = {}
-
-    def column(self, expr: Any) -> Any:
-        """Return the CasADi column of an expression."""
-        if id(expr) not in self.done:
-            self.done[id(expr)] = (expr, self._column(expr))  # the expression is kept, so that its id stays its own
-        return self.done[id(expr)][1]
-
-    def _column(self, expr: Any) -> Any:
-        if isinstance(expr, cp.Variable | cp.Parameter):
-            return self.leaves[expr.id]
-        if expr.is_constant() and not expr.parameters():
-            return constant(expr.value, (int(expr.size), 1))
-        name = type(expr).__name__
-        columns = [self.column(arg) for arg in expr.args]
-        if name in MOVES:
-            return _move(expr, columns)
-        if name not in ATOMS:
-            raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
-        return ATOMS[name](expr, columns)
+def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> Any:
+    if isinstance(expr, cp.Variable | cp.Parameter):
+        return leaves[expr.id]
+    if expr.is_constant() and not expr.parameters():
+        return constant(expr.value, (int(expr.size), 1))
+    name, columns = type(expr).__name__, [column(arg) for arg in expr.args]
+    if name in MOVES:
+        return _move(expr, columns)
+    if name not in ATOMS:
+        raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
+    return ATOMS[name](expr, columns)
 
 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
@@ -245,7 +230,9 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     chosen = options(name, settings)
     if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
         chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
-    solver = _compiled(name, form, chosen)
+    graph = kept(program.problem, "casadi", lambda: translate(form))
+    solver = kept(program.problem, (name, repr(sorted(chosen.items()))),
+                  lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
     lower, upper = form.bounds
     row_lower, row_upper = form.row_bounds
@@ -268,10 +255,3 @@ def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
         return "success", Status.LOCAL
     stopped = int(statistics.get("iter_count", 0)) >= LIMIT
     return ("iteration limit", Status.LIMIT) if stopped else (f"no success ({word})", Status.INACCURATE)
-
-
-def _compiled(name: str, form: Smooth, chosen: dict[str, Any]) -> Any:
-    kept, key = cache(form.original), (name, repr(sorted(chosen.items())))
-    if key not in kept:
-        kept[key] = ca.nlpsol("solver", name, graph(form), chosen)
-    return kept[key]

@@ -5,6 +5,7 @@ variables); what comes out, `Smooth`, is what every NLP back end works on. The w
 through the inverse data of the same chain, never by position.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -129,15 +130,15 @@ def smooth(problem: cp.Problem) -> Smooth:
     Raises:
         StructureError: a part that the smooth chain does not carry over faithfully.
     """
-    kept = cache(problem)
-    if "smooth" not in kept:
-        kept["smooth"] = _apply(problem)
-    return kept["smooth"]
+    return kept(problem, "smooth", lambda: _apply(problem))
 
 
-def cache(problem: cp.Problem) -> dict[Any, Any]:
-    """Return our part of the problem's cache of compiled solvers, which lives and dies with the problem."""
-    return problem._solver_cache.setdefault(CACHE, {})
+def kept(problem: cp.Problem, key: Any, make: Callable[[], Any]) -> Any:
+    """Return what is kept under a key with the problem, in whose cache of compiled solvers it lives; made once."""
+    found = problem._solver_cache.setdefault(CACHE, {})
+    if key not in found:
+        found[key] = make()
+    return found[key]
 
 
 class Derivatives:
@@ -180,10 +181,7 @@ class Derivatives:
 
 def derivatives(form: Smooth) -> Derivatives:
     """Return the compiled derivatives of a smooth problem; made once and kept with the problem."""
-    kept = cache(form.original)
-    if "derivatives" not in kept:
-        kept["derivatives"] = Derivatives(form)
-    return kept["derivatives"]
+    return kept(form.original, "derivatives", lambda: Derivatives(form))
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -211,52 +209,32 @@ class _SmoothChain(Dnlp2Smooth):
     def __init__(self) -> None:
         super().__init__()
         originals = self.smooth_canon_methods
-        self.smooth_canon_methods = {
-            **originals,
-            DivExpression: _divide(originals[DivExpression]),
-            quad_over_lin: _quad_over_lin(originals[quad_over_lin]),
-            cp.log_sum_exp: _log_sum_exp(originals[cp.log_sum_exp]),
-            cp.rel_entr: _refuse_parameters(originals[cp.rel_entr]),
-            cp.kl_div: _refuse_parameters(originals[cp.kl_div]),
-        }
 
+        def divide(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            return originals[DivExpression](expr, args) if args[1].variables() else (expr.copy(args), [])
 
-def _divide(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        return original(expr, args) if args[1].variables() else (expr.copy(args), [])
+        def squares(expr: Any, args: list) -> tuple[Any, list]:
+            if args[1].variables():
+                if expr.axis is not None:
+                    raise StructureError(
+                        f"{expr} along an axis with a variable denominator: write the columns one by one")
+                return originals[quad_over_lin](expr, args)
+            total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
+            unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
+            return (total if unit else total / args[1]), []
 
-    return canonicalise
+        def level(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            found, constraints = originals[cp.log_sum_exp](expr, args)
+            found.value = expr.copy(args).value
+            return found, constraints
 
+        def entropy(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            if expr.parameters():
+                raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
+            return originals[type(expr)](expr, args)
 
-def _quad_over_lin(original: Any) -> Any:
-    def canonicalise(expr: Any, args: list) -> tuple[Any, list]:
-        if args[1].variables():
-            if expr.axis is not None:
-                raise StructureError(f"{expr} along an axis with a variable denominator: write the columns one by one")
-            return original(expr, args)
-        total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
-        unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
-        return (total if unit else total / args[1]), []
-
-    return canonicalise
-
-
-def _log_sum_exp(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        level, constraints = original(expr, args)
-        level.value = expr.copy(args).value
-        return level, constraints
-
-    return canonicalise
-
-
-def _refuse_parameters(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        if expr.parameters():
-            raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
-        return original(expr, args)
-
-    return canonicalise
+        self.smooth_canon_methods = {**originals, DivExpression: divide, quad_over_lin: squares,
+                                     cp.log_sum_exp: level, cp.rel_entr: entropy, cp.kl_div: entropy}
 
 
 def _row(constraint: Constraint) -> Row:

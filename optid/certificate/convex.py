@@ -12,8 +12,6 @@ x bounds the optimum from below, however inaccurate w is: bad multipliers give a
   curvature does not catch.
 """
 
-from collections.abc import Iterable
-
 import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -80,7 +78,7 @@ def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: V
 
 def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float | None:
     """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
-    lagrangian = _lagrangian(program, duals, program.user_constraints)
+    lagrangian = Lagrangian.of(program, duals, program.user_constraints)
     if lagrangian is None:
         return None
     root = form.problem.root
@@ -94,16 +92,8 @@ def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Value
     return objective + lagrangian.value - float(step @ step) / 4 - loose
 
 
-def _lagrangian(program: Program, duals: Values, names: Iterable[str]) -> Lagrangian | None:
-    """Weigh the named constraints; None where multipliers are missing or not used here."""
-    if any(name not in duals for name in names):
-        return None
-    found = Lagrangian.of(program, {name: duals[name] for name in names})
-    return found if found.known else None
-
-
 def _tangent_bound(program: Program, duals: Values, objective: float) -> float | None:
-    lagrangian, variables = _lagrangian(program, duals, program.constraints), list(program.variables.values())
+    lagrangian, variables = Lagrangian.of(program, duals, program.constraints), list(program.variables.values())
     if lagrangian is None or not lagrangian.add(program.objective.expr, np.ones(1)) or any(
             lagrangian.free_part(variable) is None for variable in variables):
         return None

@@ -1,6 +1,6 @@
 """Our own residuals at a solver's point: a solver's status is a claim, these numbers decide."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import cvxpy as cp
 import numpy as np
@@ -41,11 +41,6 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
 
 def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
     return variable_size(flat_value(variable), usual.get(variable.id))
-
-
-def value_size(program: Program, objective: float) -> float:
-    """Yardstick of errors in the objective: its magnitude, or a hundredth of the zero model's where it vanishes."""
-    return max(abs(objective), 1e-2 * program.scale)
 
 
 def measure_violation(program: Program) -> tuple[float, str]:
@@ -153,7 +148,6 @@ class Lagrangian:
         terms: {id of a variable: sum of the magnitudes of its terms}.
         value: sum of the products of multipliers and constraints.
         complementarity: sum of their magnitudes, over inequalities and cones.
-        known: whether every part had a gradient.
     """
 
     def __init__(self, program: Program) -> None:
@@ -161,21 +155,22 @@ class Lagrangian:
         self.usual = program.usual_sizes()
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
         self.terms = {v.id: np.zeros(v.size) for v in self.variables}
-        self.value, self.complementarity, self.known = 0.0, 0.0, True
+        self.value, self.complementarity = 0.0, 0.0
 
     @classmethod
-    def of(cls, program: Program, duals: Values) -> "Lagrangian":
-        """Add up the constraints that have multipliers, these projected on the dual cones."""
+    def of(cls, program: Program, duals: Values, names: Iterable[str]) -> "Lagrangian | None":
+        """Add up the named constraints, multipliers projected on the dual cones; None where one has none, or no use."""
         found = cls(program)
-        for name, multipliers in duals.items():
+        for name in names:
             position = 0
+            if name not in duals:
+                return None
             for member in program.constraints[name]:
                 length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, multipliers[position : position + length])
+                terms = multiplier_terms(member, duals[name][position : position + length])
                 position += length
                 if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
-                    found.known = False
-                    return found
+                    return None
                 products = [flat_value(expression) * weights for expression, weights in terms]
                 found.value += float(sum(map(np.sum, products)))
                 if not isinstance(member, EQUALITIES):
@@ -221,17 +216,14 @@ class Lagrangian:
 
 
 def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
-    unknown = float("nan"), float("nan")
-    yardstick = max(abs(objective), program.scale)
-    if any(name not in duals for name in program.constraints):
-        return unknown
     try:
-        lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
-        if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
-            return unknown
+        lagrangian = Lagrangian.of(program, duals, program.constraints)
+        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
+            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
+            return (lagrangian.residual(max(abs(objective), program.scale)), float(lagrangian.complementarity / size))
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        return unknown
-    return lagrangian.residual(yardstick), float(lagrangian.complementarity / value_size(program, objective))
+        pass
+    return float("nan"), float("nan")
 
 
 _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
