@@ -99,7 +99,10 @@ class _Constrained:
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
-            return self._no_start()
+            if not satisfiable(self.program, list(self.program.user_constraints)):
+                return Answer(Status.INFEASIBLE, "the constraints contradict each other")
+            return Answer(Status.FAILED,
+                          "no start satisfies the constraints, although they do not contradict each other")
         tried.sort(key=lambda pair: pair[0])
         distinct: list[np.ndarray] = []
         for _, x in tried:
@@ -218,7 +221,8 @@ class _Constrained:
                 before, after = self._merit(x, weight), self._merit(new, weight)
                 slack = 1e-11 * (before + floor)
                 # measured on the lifted vector: b means nothing where mu is zero
-                size = _distance(self._lift(x), self._lift(new))
+                old, reached = self._lift(x), self._lift(new)
+                size = float(np.linalg.norm(reached - old) / (1e-300 + np.linalg.norm(reached)))
                 rises = after > before + slack and size > 1e-7
                 # the tangents may mislead along a curved constraint: return to it by solving for all but b
                 settled = self._settle(self.at.point(new)) if rises else None
@@ -264,11 +268,6 @@ class _Constrained:
             return found
         return dict(zip(sizes, np.split(fitted, np.cumsum([*sizes.values()])[:-1])))
 
-    def _no_start(self) -> Answer:
-        if not satisfiable(self.program, list(self.program.user_constraints)):
-            return Answer(Status.INFEASIBLE, "the constraints contradict each other")
-        return Answer(Status.FAILED, "no start satisfies the constraints, although they do not contradict each other")
-
 
 def _signed(point: Point) -> list[Point]:
     """The same model with every pattern of signs of (mu_i, b_i)."""
@@ -278,7 +277,3 @@ def _signed(point: Point) -> list[Point]:
         found.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
                            tuple(s * b for s, b in zip(signs, point.bs))))
     return found
-
-
-def _distance(z: np.ndarray, reached: np.ndarray) -> float:
-    return float(np.linalg.norm(reached - z) / (1e-300 + np.linalg.norm(reached)))

@@ -138,11 +138,6 @@ class _Rows:
         """Whether it is an equality."""
         return isinstance(self.member, EQUALITIES)
 
-    @property
-    def affine(self) -> bool:
-        """Whether slope and level are those of the constraint everywhere, and not of its tangent."""
-        return self.member.is_dcp()
-
 
 class StepQP:
     """``minimise ‖U x - t‖²`` over the programme's own variables and constraints, with matrices that change.
@@ -218,7 +213,7 @@ class StepQP:
         for row in self.rows:
             if row.lifted is not None:
                 row.slope, value = row.lifted[0] @ lift, row.lifted[0] @ z - row.lifted[1]
-            elif not row.affine:
+            elif not row.member.is_dcp():  # its tangent
                 row.slope, value = self.slope(row.member.expr), flat_value(row.member.expr)
             else:
                 continue
@@ -303,14 +298,11 @@ class StepQP:
 
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
-        if expression.is_affine():
-            if expression.id not in self._slopes:
-                self._slopes[expression.id] = self._jacobian(expression)
-            return self._slopes[expression.id]
-        return self._jacobian(expression)
-
-    def _jacobian(self, expression: cp.Expression) -> np.ndarray:
-        return self._laid_out(jacobians(expression) or {}, expression.size)
+        if not expression.is_affine():
+            return self._laid_out(jacobians(expression) or {}, expression.size)
+        if expression.id not in self._slopes:
+            self._slopes[expression.id] = self._laid_out(jacobians(expression) or {}, expression.size)
+        return self._slopes[expression.id]
 
     def _laid_out(self, slopes: Mapping[cp.Variable, Any], rows: int) -> np.ndarray:
         """Put Jacobians by variable side by side."""

@@ -12,25 +12,9 @@ from time import perf_counter
 
 import numpy as np
 
-from optid.certificate.minors import (
-    Block,
-    Lagrangian,
-    ascend,
-    free_mask,
-    project_minors,
-    rotation,
-    tangent_minors,
-)
+from optid.certificate.minors import Block, Lagrangian, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
-from optid.certificate.shape_duals import (
-    ACTIVE,
-    Linear,
-    Multipliers,
-    align_cuts,
-    check_constraints,
-    kkt_multipliers,
-    sign_free_cut,
-)
+from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_constraints, kkt_multipliers, sign_free_cut
 from optid.errors import StructureError
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
@@ -85,7 +69,8 @@ class Case:
         bs: (nb_i,) each, of unit length.
         objective: the objective around the point.
         cones: constraint matrices by block.
-        multipliers: KKT multipliers.
+        nu: KKT multipliers (r_i,) of the cones, by block.
+        lam: KKT multipliers (r,) of the linear constraints.
         linear: constraints on the lifted vector.
         began: clock at the start.
     """
@@ -96,7 +81,8 @@ class Case:
     bs: list[Array]
     objective: Lagrangian
     cones: dict[int, Array]
-    multipliers: Multipliers
+    nu: dict[int, Array]
+    lam: Array
     linear: Linear
     began: float
 
@@ -129,7 +115,7 @@ class Case:
 
     def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
         """The objective with the linear terms, at the KKT multipliers or others."""
-        chosen = self.multipliers.linear if multipliers is None else multipliers
+        chosen = self.lam if multipliers is None else multipliers
         return self.objective.with_linear(self.linear.rows, self.linear.slack(self.objective.z)[0], chosen)
 
     def cut_form(self, cuts: dict[int, Array]) -> Array | None:
@@ -179,7 +165,7 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
     risen, taken = rise(case, minors, cuts, steps)
     if risen is None:
         found = max((conclude(case, "ascent", "multipliers shrunk until positive definite", part * minors,
-                              {i: part * weights for i, weights in cuts.items()}, part * case.multipliers.linear)
+                              {i: part * weights for i, weights in cuts.items()}, part * case.lam)
                      for part in PARTS), key=lambda attempt: attempt.bound.value)
     else:
         found = conclude(case, "ascent", f"{taken} projections", risen, cuts)
@@ -210,13 +196,13 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
         linear = replace(linear, rows=core.whitening.columns(linear.rows[:, 0 if keep_linear else problem.linear:]))
     else:
         linear = Linear.none(len(z))
-    multipliers = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, multipliers, linear, began)
+    nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
+    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
     """Sign-free cuts at the KKT multipliers: they cancel what the constraints leave of the gradient."""
-    return {i: np.multiply.outer(sign_free_cut(case.multipliers.cones[i], cone, case.mus[i]),
+    return {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]),
                                  np.outer(case.bs[i], case.bs[i])) for i, cone in case.cones.items()}
 
 
@@ -256,21 +242,21 @@ def onto_minors(case: Case, matrix: Array) -> Array:
 def relaxed(case: Case, found: Certification, steps: int) -> Certification:
     """The SDP: its bound made valid by shrinking, then its multipliers aligned with the point for an exact proof."""
     method = "product cuts" if case.cones else "sdp"
-    relaxation = relax(case.objective, case.blocks, case.cones, case.linear)
-    if relaxation is None:
+    solved = relax(case.objective, case.blocks, case.cones, case.linear)
+    if solved is None:
         return replace(found, bound=replace(found.bound, reason=f"{found.bound.reason}; the SDP solver failed"))
-    better = tuple(_candidate(case, moment) for moment in relaxation.moments.T)
-    minors = onto_minors(case, relaxation.minors)
+    raw, weights_by_block, linear, moments = solved
+    better, minors = tuple(_candidate(case, moment) for moment in moments.T), onto_minors(case, raw)
     for shrink in SHRINKS:
-        cuts = {i: (1 - shrink) * weights for i, weights in relaxation.cuts.items()}
-        bound = conclude(case, method, "relaxation", (1 - shrink) * minors, cuts, relaxation.linear, better)
+        cuts = {i: (1 - shrink) * weights for i, weights in weights_by_block.items()}
+        bound = conclude(case, method, "relaxation", (1 - shrink) * minors, cuts, linear, better)
         if np.isfinite(bound.bound.value):
             found = bound if bound.bound.value > found.bound.value else replace(found, better=better)
             break
     if found.bound.proved:
         return found
-    cuts = {i: align_cuts(weights, case.cones[i], case.mus[i], case.bs[i], case.multipliers.cones[i])
-            for i, weights in relaxation.cuts.items()}
+    cuts = {i: align_cuts(weights, case.cones[i], case.mus[i], case.bs[i], case.nu[i])
+            for i, weights in weights_by_block.items()}
     aligned = tangent(case, cuts) + free_part(case, minors)
     risen, taken = rise(case, aligned, cuts, steps)
     if risen is not None:
@@ -314,6 +300,6 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
         reason = f"not proved, relative gap {gap:.1e}: {how}"
     else:
         reason = f"not proved, no finite bound: {how}"
-    evidence = Evidence(case.core, minors, cuts, case.multipliers.linear if linear is None else linear)
+    evidence = Evidence(case.core, minors, cuts, case.lam if linear is None else linear)
     return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
                          () if proved else better)

@@ -60,17 +60,10 @@ def check_constraints(cones: Mapping[int, Array], linear: Linear, problem: RankO
             raise StructureError(f"cone {i} has shape {cone.shape}; block {i} of {problem.blocks} needs (r, P)")
 
 
-@dataclass(frozen=True, eq=False)
-class Multipliers:
-    """KKT multipliers of a local solution: nu of the cones (by block) and lam of the linear constraints."""
-
-    cones: dict[int, Array]
-    linear: Array
-
-
 def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int, mus: Sequence[Array],
-                    bs: Sequence[Array], cones: dict[int, Array], linear: Linear, z: Array) -> Multipliers:
-    """Nonnegative least squares for the multipliers that make the gradient along the manifold vanish.
+                    bs: Sequence[Array], cones: dict[int, Array], linear: Linear, z: Array
+                    ) -> tuple[dict[int, Array], Array]:
+    """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 
     Args:
         slope: (k,) half the gradient of the objective, in the coordinates of all the rest.
@@ -83,7 +76,7 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
         z: the lifted point (k,).
     """
     if not cones and not len(linear.right):
-        return Multipliers({}, np.zeros(0))
+        return {}, np.zeros(0)
     units = [mu / (np.linalg.norm(mu) or 1.0) for mu in mus]
     jacobian = np.asarray(block_diag(np.eye(offset), *(
         np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
@@ -106,7 +99,7 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
     for i, piece in zip(cones, pieces):
         nu[i][active[i]] = piece
     lam[held] = last
-    return Multipliers(nu, lam)
+    return nu, lam
 
 
 def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:

@@ -149,7 +149,9 @@ class Program:
                     foreign = set(member.variables()) - known
                     own = {v for v in foreign if self.view.owns(v)}
                     for variable in sorted(own, key=lambda v: v.id):
-                        _name_new(variables, variable)
+                        numbered = (f"{variable.name()} {k}" for k in range(2, len(variables) + 3))
+                        free = (one for one in (variable.name(), *numbered) if one not in variables)
+                        variables[next(free)] = variable
                     known |= own
                     if foreign := foreign - own:
                         raise StructureError(
@@ -289,13 +291,6 @@ class Program:
     def size(self) -> int:
         """Number of scalar unknowns."""
         return sum(v.size for v in self.variables.values())
-
-
-def _name_new(variables: dict[str, cp.Variable], variable: cp.Variable) -> None:
-    name, count = variable.name(), 2
-    while name in variables:
-        name, count = f"{variable.name()} {count}", count + 1
-    variables[name] = variable
 
 
 _MATRIX_ATOMS = {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac", "matrix_frac", "tr_inv"}

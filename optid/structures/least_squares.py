@@ -42,16 +42,12 @@ class LeastSquaresStructure(Structure):
         r = problem.root @ z - problem.target
         value = float(r @ r) + problem.remainder
         pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
-        parts, position = [], 0
-        for name in self.linear:
-            span = slice(position, position + flat[name].size)
-            parts.append((name, pull[span], effort[span]))
-            position = span.stop
-        for (mu_name, b_name), (mu, b) in zip(self.blocks, pairs):
-            span = slice(position, position + mu.size * b.size)
-            block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
+        sizes = [*(flat[name].size for name in self.linear), *(mu.size * b.size for mu, b in pairs)]
+        pulls, efforts = (np.split(part, np.cumsum(sizes)[:-1]) for part in (pull, effort))
+        parts, count = list(zip(self.linear, pulls, efforts)), len(self.linear)
+        for (mu_name, b_name), (mu, b), *both in zip(self.blocks, pairs, pulls[count:], efforts[count:]):
+            block, terms = (part.reshape(b.size, mu.size) for part in both)
             parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
-            position = span.stop
         yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
         for name, gradient, terms in parts:
             size = variable_size(flat[name], usual.get(program.variables[name].id))

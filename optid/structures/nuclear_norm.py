@@ -335,13 +335,11 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
         rows: samples of a window.
         usable: (N,) per experiment.
     """
-    found, offset = [], 0
-    for length, good in zip(lengths, usable):
-        if length >= rows:
-            whole = np.lib.stride_tricks.sliding_window_view(good, rows).all(axis=1)
-            found.append(offset + np.flatnonzero(whole))
-        offset += length
-    return np.concatenate(found) if found else np.zeros(0, dtype=int)
+    if sum(lengths) < rows:
+        return np.zeros(0, dtype=int)
+    whole = np.lib.stride_tricks.sliding_window_view(np.concatenate(usable), rows).all(axis=1)
+    experiment = np.repeat(np.arange(len(lengths)), lengths)
+    return np.flatnonzero(whole & (experiment[: whole.size] == experiment[rows - 1 :]))
 
 
 @dataclass(frozen=True, eq=False)
