@@ -17,7 +17,7 @@ from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
 from optid.program.expressions import flat
-from optid.program.gradients import affine_parts, flat_value, jacobians
+from optid.program.gradients import affine_parts, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Status
@@ -174,7 +174,7 @@ class StepQP:
         if parts is None or {v.id for v in parts[0]} - {v.id for v in self.at.variables}:
             self.cones.append((name, span, member))
             return
-        slope, level = self._laid_out(parts[0], member.size), parts[1]
+        slope, level = side_by_side(parts[0], self.at.variables, member.size), parts[1]
         unit = float(np.max(np.abs(slope) @ self._scale + np.abs(level), initial=0.0)) or 1.0
         self.rows.append(_Rows(name, span, member, unit, slope, level))
 
@@ -299,14 +299,10 @@ class StepQP:
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
         if not expression.is_affine():
-            return self._laid_out(jacobians(expression) or {}, expression.size)
+            return side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
         if expression.id not in self._slopes:
-            self._slopes[expression.id] = self._laid_out(jacobians(expression) or {}, expression.size)
+            self._slopes[expression.id] = side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
         return self._slopes[expression.id]
-
-    def _laid_out(self, slopes: Mapping[cp.Variable, Any], rows: int) -> np.ndarray:
-        """Put Jacobians by variable side by side."""
-        return np.hstack([slopes[v].toarray() if v in slopes else np.zeros((rows, v.size)) for v in self.at.variables])
 
 
 def _spans(group: tuple[cp.Constraint, ...]) -> list[slice]:

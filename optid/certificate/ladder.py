@@ -188,7 +188,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]
-    z = np.concatenate([w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
+    z = np.concatenate([w, *(np.outer(b, mu).ravel() for mu, b in zip(mus, bs))])
     residual = core.root @ z - core.target
     slope = core.root.T @ residual
     value = float(residual @ residual) + problem.remainder

@@ -13,7 +13,7 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
-from optid.program.gradients import affine_parts
+from optid.program.gradients import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
@@ -195,8 +195,8 @@ def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np
         return None
     slopes, constant = found
     rows = np.zeros((constant.size, size))
-    for variable, slope in slopes.items():
-        rows[:, columns[variable.id] : columns[variable.id] + variable.size] = slope.toarray()
+    for v in slopes:
+        rows[:, columns[v.id] : columns[v.id] + v.size] = side_by_side(slopes, [v], constant.size)
     return rows, -constant
 
 

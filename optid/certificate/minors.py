@@ -40,7 +40,7 @@ def tangent_minors(gradient: Array, mu: Array, b: Array) -> Array:
         b: (nb,) of unit length.
     """
     size = float(mu @ mu)
-    outer = np.outer(gradient.T.ravel(), np.kron(b, mu)) / size
+    outer = np.outer(gradient.T.ravel(), np.outer(b, mu)) / size
     return 2 * project_minors(outer + outer.T, gradient.shape)  # pyright: ignore[reportArgumentType]
 
 

@@ -177,9 +177,9 @@ def _nonlinear() -> list[Case]:
             "product": x[0] * x[1] * x[2] * x[3] >= 25, "sphere": cp.sum_squares(x) == 40, "lower": x >= 1,
             "upper": x <= 5}), start={"x": np.array([1.0, 5.0, 5.0, 1.0])},
               # problem 71 of Hock and Schittkowski (1981); digits by Newton's method on its optimality conditions
-              value=17.014017289, point={"x": [1.0, 4.7429996373, 3.8211499842, 1.3794082932]},
-              duals={"product": [0.55229366012], "sphere": [0.16146856677], "lower": [1.0878712287, 0, 0, 0],
-                     "upper": [0, 0, 0, 0]}),
+              value=17.014017289156303, point={"x": [1.0, 4.742999637264417, 3.821149984184874, 1.3794082931726723]},
+              duals={"product": [0.5522936601207269], "sphere": [0.16146856677050583],
+                     "lower": [1.0878712286669403, 0, 0, 0], "upper": [0, 0, 0, 0]}),
         _case("nlp_hyperbola", {"x": 2}, lambda x: (cp.sum(x), {"product": x[0] * x[1] >= 1, "sign": x >= 0}),
               start={"x": np.array([3.0, 1.0])},
               value=2.0, point={"x": [1.0, 1.0]}, duals={"product": [1.0], "sign": [0.0, 0.0]}),

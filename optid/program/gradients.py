@@ -1,6 +1,6 @@
 """Derivatives and sizes of CVXPY expressions at the assigned point, in the one form that all of optid uses."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -30,17 +30,17 @@ def flat_value(expression: cp.Expression) -> np.ndarray:
     return np.ravel(np.asarray(expression.value, dtype=float), order="F")
 
 
-def jacobians(expression: cp.Expression) -> dict[cp.Variable, sp.csr_array] | None:
+def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
     """Return the Jacobian (rows, size) of an expression with respect to each of its variables.
 
     Rows and columns follow the entries column by column. None where CVXPY knows no gradient at the assigned point.
     Small expressions are differentiated here, with the common atoms by their own rules: CVXPY composes sparse
-    matrices atom by atom, which takes ten times as long. Large ones are left to it.
+    matrices atom by atom, which takes ten times as long. Large ones are left to it, and their Jacobians are sparse.
     """
     variables = expression.variables()
     if expression.size * sum(variable.size for variable in variables) <= DENSE:
         node = _differentiate(expression, {})
-        return None if node is None else {v: sp.csr_array(_columns(slope)) for v, slope in node.slopes.items()}
+        return None if node is None else {v: _columns(slope) for v, slope in node.slopes.items()}
     found = {}
     for variable, part in expression.grad.items():
         if part is None:
@@ -172,7 +172,13 @@ RULES: dict[str, Callable[[Any, list[Any]], list[Map]]] = {
 """By atom, from its arguments' values, what maps the derivatives (*shape, n) of every argument, up to broadcasting."""
 
 
-def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, sp.csr_array], np.ndarray] | None:
+def side_by_side(slopes: Mapping[cp.Variable, Any], variables: Iterable[cp.Variable], rows: int) -> np.ndarray:
+    """Return Jacobians as one array (rows, sizes of the variables), zero for variables that have none."""
+    parts = [slopes.get(variable, np.zeros((rows, variable.size))) for variable in variables]
+    return np.hstack([part.toarray() if sp.issparse(part) else part for part in parts])
+
+
+def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, Any], np.ndarray] | None:
     """Return the Jacobians of an affine expression, as `jacobians` does, and its constant, flat; None if not affine.
 
     The constant is the value at the origin, so that one that is zero is exactly zero.

@@ -5,10 +5,9 @@ Newton's method with Levenberg damping acts in one factor, the other one elimina
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
+from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
 from optid.structures.whitening import block_slices
@@ -175,24 +174,26 @@ class _Projected:
 
     def curvature(self, root: Array, shapes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
         """Gradient and Hessian of half the value in the b_i, definite along each b_i, which changes nothing."""
-        regressors, forces, gauges = [], [], []
+        regressors, row, column = [], 0, 0
+        forces = np.zeros((len(self.triangle), sum(b.size for b in self.bs)))
         gradients = matrices(root.T @ self.residual, tuple(shapes))
         for piece, mu, b, size, gradient in zip(self.pieces, self.mus, self.bs, self.sizes, gradients):
             scale = 1.0 / size if size > 0 else 0.0
             regressors.append((piece @ (scale * mu)).T)
-            forces.append(scale * gradient)
-            gauges.append(np.outer(b, b))
+            forces[row : row + mu.size, column : column + b.size] = scale * gradient
+            row, column = row + mu.size, column + b.size
         across = np.concatenate(regressors, axis=1)
         diagonal = np.abs(np.diag(self.triangle))
         usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
         mixed = self.basis.T @ across
         if usable:
-            forced: Any = solve_triangular(self.triangle, block_diag(*forces), trans=1)
-            mixed = mixed + forced
+            mixed = mixed + solve_triangular(self.triangle, forces, trans=1)
         hessian = across.T @ across - mixed.T @ mixed
-        weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
-        gauge: Any = block_diag(*gauges)
-        return across.T @ self.residual, hessian + weight * gauge
+        weight, column = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny), 0
+        for b in self.bs:
+            hessian[column : column + b.size, column : column + b.size] += weight * np.outer(b, b)
+            column += b.size
+        return across.T @ self.residual, hessian
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:

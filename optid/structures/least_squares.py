@@ -38,7 +38,8 @@ class LeastSquaresStructure(Structure):
         problem = self.problem
         flat = {name: np.ravel(v.value, order="F") for name, v in program.variables.items()}
         pairs = [(flat[mu], flat[b]) for mu, b in self.blocks]
-        z = np.concatenate([*(flat[name] for name in self.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
+        products = (np.outer(b, mu).ravel() for mu, b in pairs)
+        z = np.concatenate([*(flat[name] for name in self.linear), *products, np.zeros(0)])
         r = problem.root @ z - problem.target
         value = float(r @ r) + problem.remainder
         pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)

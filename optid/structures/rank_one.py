@@ -81,7 +81,7 @@ class Point:
 
     def lift(self) -> Array:
         """Return z = [w; kron(b_1, mu_1); ...]."""
-        return np.concatenate([self.w, *(np.kron(b, mu) for mu, b in zip(self.mus, self.bs))])
+        return np.concatenate([self.w, *(np.outer(b, mu).ravel() for mu, b in zip(self.mus, self.bs))])
 
     def normalised(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""
@@ -164,7 +164,7 @@ class Core:
         """Back substitution: the best point of the problem for these whitened factors (and w, where it is kept)."""
         mus, bs = self.whitening.back(mus, bs)
         kept_w = _solve_upper(self.whitening.factor_w, w) if w is not None else np.empty(0)
-        core = np.concatenate([kept_w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
+        core = np.concatenate([kept_w, *(np.outer(b, mu).ravel() for mu, b in zip(mus, bs))])
         k = self.eliminated
         z = np.empty(len(self.order))
         z[self.order[k:]] = core
