@@ -135,6 +135,8 @@ class Program:
         Raises:
             StructureError: unknown variable, name used twice, or a nonconvex constraint in a convex formulation.
         """
+        if not builders:
+            return self
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)

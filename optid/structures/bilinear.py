@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs, solve_triangular
+from scipy.linalg import get_lapack_funcs
 
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
 from optid.structures.whitening import block_slices
 
-(_posv,) = get_lapack_funcs(("posv",), dtype=float)
+_posv, _trtrs = get_lapack_funcs(("posv", "trtrs"), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class _Projected:
         if not np.min(diagonal) > 1e-13 * np.max(diagonal):  # an input without effect, or two that are one
             mus = np.linalg.lstsq(design, target, rcond=1e-13)[0]
         else:
-            mus = solve_triangular(triangle, basis.T @ target)
+            mus = _trtrs(triangle, basis.T @ target)[0]
         split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
         return cls(pieces, units, split, basis, triangle, design @ mus - target)
 
@@ -187,7 +187,7 @@ class _Projected:
         usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
         mixed = self.basis.T @ across
         if usable:
-            mixed = mixed + solve_triangular(self.triangle, forces, trans=1)
+            mixed = mixed + _trtrs(self.triangle, forces, trans=1)[0]
         hessian = across.T @ across - mixed.T @ mixed
         weight, column = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny), 0
         for b in self.bs:
