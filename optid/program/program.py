@@ -140,7 +140,7 @@ class Program:
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual: dict[int, float] | None = None
+        usual = self.usual_sizes()
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -166,7 +166,6 @@ class Program:
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
                 if self.view.units is not None:
-                    usual = usual if usual is not None else self.usual_sizes()
                     constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
                 else:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
