@@ -117,6 +117,7 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
     while left.size:
         first = left[0]
         multipliers = least_distance(-rows, -(points[first] @ rows.T + slack) / size, np.zeros(len(rows), dtype=bool))
+        assert multipliers is not None  # the polyhedron contains the origin
         projected[first] += size * multipliers @ rows
         left = left[1:]
         active = np.flatnonzero(multipliers > 0)
