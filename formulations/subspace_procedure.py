@@ -15,7 +15,7 @@ import numpy as np
 from formulations.constraints.poles import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
-from optid.certificate.simulation_bound import simulation_bound
+from optid.certificate.hankel import simulation_bound
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability

@@ -33,6 +33,14 @@ def data_of(records):
     return Data([r[:, :2] for r in records], [r[:, 2:4] for r in records], inputs=NAMES[0], outputs=NAMES[1])
 
 
+def gram(step):
+    return step.problem.root.T @ step.problem.root
+
+
+def energy(step):
+    return step.problem.value(np.zeros(len(step.problem.target)))
+
+
 def simulated(form, record, z, x0=None):
     """Outputs of the observer form for unknowns z, by the recursion itself; NaN where the target is missing."""
     n, l, x = form.n, form.l, form.expansion  # noqa: E741
@@ -85,9 +93,9 @@ def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypa
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])
-    np.testing.assert_allclose(step.problem.H, phi.T @ phi, atol=1e-9)
-    np.testing.assert_allclose(step.problem.g, phi.T @ y, atol=1e-9)
-    assert step.problem.c == pytest.approx(y @ y) and step.rows == len(y)
+    np.testing.assert_allclose(gram(step), phi.T @ phi, atol=1e-9)
+    np.testing.assert_allclose(step.problem.root.T @ step.problem.target, phi.T @ y, atol=1e-9)
+    assert energy(step) == pytest.approx(y @ y) and step.rows == len(y)
     best = np.linalg.lstsq(phi, y, rcond=None)[0]
     np.testing.assert_allclose(step.least_squares(), best, atol=1e-8)
     bu, du, ez, d, x0 = step.matrices(best)
@@ -107,12 +115,12 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
     step = observer_problem(records, form)
     monkeypatch.setattr("optid.identify.subspace.realisation.MANY", np.inf)
     stacked = observer_problem(records, form)
-    scale = np.sqrt(np.outer(np.diag(stacked.problem.H), np.diag(stacked.problem.H)))
-    np.testing.assert_allclose(step.problem.H / scale, stacked.problem.H / scale, atol=1e-11)
+    scale = np.sqrt(np.outer(np.diag(gram(stacked)), np.diag(gram(stacked))))
+    np.testing.assert_allclose(gram(step) / scale, gram(stacked) / scale, atol=1e-11)
     np.testing.assert_allclose(step.least_squares(), stacked.least_squares(), atol=1e-10)
     assert step.problem.remainder == pytest.approx(stacked.problem.remainder, rel=1e-9)
-    assert (step.problem.remainder < 1e-24 * step.problem.c) == (kind == "exact")
-    assert step.rows == stacked.rows and step.problem.c == pytest.approx(stacked.problem.c)
+    assert (step.problem.remainder < 1e-24 * energy(step)) == (kind == "exact")
+    assert step.rows == stacked.rows and energy(step) == pytest.approx(energy(stacked))
 
 
 def test_missing_outputs_without_feedback_leave_the_state_alone():
@@ -123,7 +131,7 @@ def test_missing_outputs_without_feedback_leave_the_state_alone():
     step = observer_problem(records, form)
     phi, y = columns(form, records[0], 0)
     present = ~np.isnan(y)
-    np.testing.assert_allclose(step.problem.H, phi[present].T @ phi[present], atol=1e-9)
+    np.testing.assert_allclose(gram(step), phi[present].T @ phi[present], atol=1e-9)
     assert step.rows == 115
 
 

@@ -57,12 +57,13 @@ class Fit:
     @cached_property
     def solution(self) -> Solution:
         """Status, proof, residuals and times."""
-        solution, bound = self.outcome.solution, self.outcome.bound
-        return solution if bound is None else replace(solution, bound=bound())
+        solution, evidence = self.outcome.solution, self.outcome.evidence
+        return replace(solution, bound=evidence.bound()) if evidence and callable(evidence.bound) else solution
 
     @cached_property
     def _completed(self) -> tuple[Any, dict[str, Any]]:
-        model, figures = self.outcome.extend() if self.outcome.extend else (self.outcome.model, {})
+        evidence = self.outcome.evidence
+        model, figures = evidence.extended() if evidence else (self.outcome.model, {})
         transform = getattr(self.data, "transform", None)
         if model is not None and transform is not None and not transform.is_identity:
             model = model.with_transform(transform)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.certificate.simulation_bound import simulation_bound
+from optid.certificate.hankel import simulation_bound
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
