@@ -21,6 +21,7 @@ from scipy.signal import lfilter
 from scipy.special import ndtr
 
 from optid.certificate import certify
+from optid.program.solution import relative_gap
 from optid.structures.bilinear import best_of
 from optid.structures.rank_one import RankOne, reduce
 
@@ -106,7 +107,8 @@ def row(problem, cell, bound, value, reference, stage, seconds):
     """What is kept of one problem."""
     floor = 1e-9 * problem.scale
     return cell | {
-        "proved": bound.proved, "stage": stage, "gap": problem.gap(value, bound.value), "seconds": seconds,
+        "proved": bound.proved, "stage": stage, "gap": relative_gap(value, bound.value, problem.scale),
+        "seconds": seconds,
         "false": bound.proved and value > reference + TOLERANCE * max(reference, floor),
         "excess": (bound.value - min(reference, value)) / max(value, floor),
         "missed": value > reference * (1 + 1e-7)}

@@ -23,7 +23,7 @@ import numpy as np
 import formulations.shift
 import optid
 import optid.identify.subspace.shift
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from optid.errors import DataWarning
 from optid.solving.solve import run
 

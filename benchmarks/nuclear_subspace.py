@@ -28,10 +28,8 @@ import numpy as np
 
 import optid
 from formulations.nuclear_subspace import nuclear_programme
-from formulations.subspace_procedure import preliminary
 from optid.backends import Settings, find
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
-from optid.identify.subspace.observability import prepared
 from optid.identify.subspace.plan import Plan
 from optid.solving.solve import solve
 
@@ -64,9 +62,8 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
                    nx: int | str = "auto") -> tuple[dict[tuple[float, int], float], float]:
     """Validation fit over weights and orders, and the CPU seconds of all programmes of the path."""
     plan = Plan("subspace.nuclear", train, nx, rows, "linear", None, form)
-    expansion, alpha = prepared(plan)
     clock = time.process_time()
-    structured = structure(plan, expansion, alpha)
+    structured = structure(plan)
     program = nuclear_programme(structured, 1.0)
     found, seconds = {}, time.process_time() - clock
     for weight in weights:
@@ -74,7 +71,7 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
         clock = time.process_time()
         solution = solve(program, "admm", accuracy=1e-7)
         seconds += time.process_time() - clock
-        for n, score in order_scores(plan, expansion, structured, solution.values, test, preliminary).items():
+        for n, score in order_scores(structured, solution.values, test).items():
             found[float(weight), n] = score
     return found, seconds
 
@@ -142,7 +139,7 @@ def main() -> None:
         print(f"    best N4SID (block rows, order, weighting) {where}: {best[where]:.2f} %")
     if not arguments.no_race:
         plan = Plan("subspace.nuclear", train, "auto", rows, "linear", None, "projection")
-        structured = structure(plan, *prepared(plan))
+        structured = structure(plan)
         race(structured, float(np.mean(structured.scale)) ** 2 / 0.27**2, arguments.solvers, arguments.accuracy,
              arguments.repeats)
 
@@ -162,7 +159,7 @@ def main() -> None:
     if not arguments.no_race:
         for form in arguments.forms:
             plan = Plan("subspace.nuclear", train, "auto", arguments.rows, "linear", None, form)
-            structured = structure(plan, *prepared(plan))
+            structured = structure(plan)
             print(f"  race, {form}")
             race(structured, 30.0, arguments.solvers, arguments.accuracy, arguments.repeats)
 

@@ -14,7 +14,7 @@ import time
 import numpy as np
 from montecarlo import share
 
-from optid.bases import Linear, fitted_bases
+from optid.bases import Linear
 from optid.identify.order import RankTest, order_test
 from optid.plants import NOISE_CASES, TWO_MODES
 from optid.statistics.expansion import expand
@@ -29,7 +29,7 @@ def one(case: str, n: int, seed: int, alpha: int = 8) -> RankTest:
     u = np.random.default_rng(seed).normal(size=(n, 2))
     data = TWO_MODES.record(u, seed + 1000, process=process, measurement=measurement, colour=colour)
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
-    return order_test(records, expand(records, fitted_bases(data, Linear()), [], data.inputs, data.outputs), alpha)
+    return order_test(records, expand(data, Linear()), alpha)
 
 
 def main() -> None:

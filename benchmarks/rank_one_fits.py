@@ -16,7 +16,7 @@ from optid.certificate import certify
 from optid.certificate.ladder import Certification
 from optid.errors import StructureError
 from optid.structures.bilinear import LocalSolution, best_of, descend, starts
-from optid.structures.rank_one import Array, Point, RankOne, block_slices, matrices, reduce
+from optid.structures.rank_one import Array, Point, RankOne, matrices, reduce
 
 
 def change_basis(problem: RankOne, changes: Mapping[int, Array]) -> RankOne:
@@ -27,7 +27,7 @@ def change_basis(problem: RankOne, changes: Mapping[int, Array]) -> RankOne:
         changes: by block (P_i, new size).
     """
     parts, blocks = [problem.root[:, :problem.linear]], []
-    for i, (columns, (p, nb)) in enumerate(zip(block_slices(problem), problem.blocks)):
+    for i, (columns, (p, nb)) in enumerate(zip(problem.slices, problem.blocks)):
         change = changes.get(i, np.eye(p))
         part = problem.root[:, columns].reshape(-1, nb, p) @ change
         parts.append(part.reshape(len(part), -1))
@@ -107,7 +107,7 @@ def _descend(problem: RankOne, point: Point, signed: tuple[int, ...], rounds: in
 
 def _designs(problem: RankOne) -> list[Array]:
     return [problem.root[:, columns].reshape(-1, nb, p)
-            for columns, (p, nb) in zip(block_slices(problem), problem.blocks)]
+            for columns, (p, nb) in zip(problem.slices, problem.blocks)]
 
 
 def _fit_mus(problem: RankOne, bs: list[Array], signed: tuple[int, ...]) -> list[Array]:
@@ -167,7 +167,7 @@ def _finish(problem: RankOne, point: Point, signed: tuple[int, ...]) -> LocalSol
 def _multipliers_hold(problem: RankOne, point: Point, signed: tuple[int, ...]) -> bool:
     """Whether no vanishing delta would lower the objective by growing."""
     slope = problem.root.T @ (problem.root @ point.lift() - problem.target)
-    reference = float(np.linalg.norm(problem.g))
+    reference = float(np.linalg.norm(problem.root.T @ problem.target))
     gradients = matrices(slope, problem.blocks)
     return all((gradients[i] @ point.bs[i])[point.mus[i] == 0].min(initial=0.0) >= -1e-9 * reference for i in signed)
 
@@ -205,13 +205,13 @@ def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, 
     core = reduce(problem)
     if not core.shapes:
         best = descend(core, [], [])
-        return Certified(best, certify(problem, best.point, core=core), 1)
+        return Certified(best, certify(problem, best.point), 1)
     best = descend(core, *starts(core, 1, seed)[0])
-    proof = certify(problem, best.point, effort="instant", core=core)
+    proof = certify(problem, best.point, effort="instant")
     if proof.bound.proved:
         return Certified(best, proof, 1)
     best = min(best, best_of(core, count, seed, first=1), key=lambda solution: solution.value)
-    proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+    proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size)
     tried = count
     for round_ in range(2):
         if proof.bound.proved or effort == "instant":
@@ -224,7 +224,7 @@ def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, 
         challenger = min(again, key=lambda solution: solution.value)
         if challenger.value < best.value * (1 - 1e-10):
             best = challenger
-            proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size, core=core)
+            proof = certify(problem, best.point, effort=effort, steps=steps, max_size=max_size)
         elif proof.better:
             proof = replace(proof, better=())
     return Certified(best, proof, tried)

@@ -29,8 +29,9 @@ from scipy.signal import dlsim
 from optid import Data, Polynomial, Triangular, fit
 from optid.identify.subspace.projection import project, realise
 from optid.statistics.expansion import expand
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
 from optid.statistics.rq import rq
+from optid.statistics.sums import windows_of
 
 PRINTED = "69.8841 14.9963 3.6675 1.9677 0.3000 0.2078 0.1651 0.1373 0.1133 0.1059 0.0856 0.0784 0.0733 0.0678 0.0571"
 A = np.array([[0.7, 0.35, 0, 0], [-0.35, 0.7, 0.1, 0], [0, 0, 0.5, 0.2], [0, 0, 0, -0.4]])
@@ -54,7 +55,7 @@ def expanded_record(count: int, basis: str) -> tuple[np.ndarray, object]:
     _, y, _ = dlsim((A, B, C, np.zeros((2, 2)), 1), f)
     family = (Polynomial(10) if basis == "polynomial" else Triangular(10)).fitted(-1.0, 1.0)
     record = np.hstack([u, y + 0.1 * rng.standard_normal((count, 2))])
-    return record, expand([record], [family, family], [], ["u1", "u2"], ["y1", "y2"])
+    return record, expand(Data(u, record[:, 2:]), family)
 
 
 def own(record: np.ndarray, expansion, rows: int):

@@ -13,7 +13,7 @@ from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.least_squares import LeastSquaresStructure
@@ -51,7 +51,7 @@ def _programme(problem: EquationError) -> Program:
     objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
     constraints = {"residual": (r == residual,)}
 
-    def recover(values: Values) -> HammersteinARX:
+    def recover(values: Values) -> HammersteinTF:
         return problem.model(values, [np.ones(1)] * len(b), [values[key] for key in b], gauge="none", flip=False)
 
     return Program(

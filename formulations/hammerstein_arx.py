@@ -17,9 +17,10 @@ from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_rank_one
 from optid.data.record import Data
 from optid.data.streams import Stream
+from optid.identify.arguments import one_of
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import check_gauge, in_gauge, scale_fixed
-from optid.models import HammersteinARX
+from optid.identify.gauges import FIXED, in_gauge, scale_fixed
+from optid.models import HammersteinTF
 from optid.program.expressions import flat
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
@@ -55,7 +56,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         StructureError: impossible orders, unknown gauge, constraints that do not fit.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
                           nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
 
@@ -82,7 +83,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> P
         scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
     signed = gauge == "norm" and _has_signed_factors(program, {one.id for one in factors.values()})
 
-    def recover(values: Values) -> HammersteinARX:
+    def recover(values: Values) -> HammersteinTF:
         return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,
                              flip=gauge == "norm" and not signed)
 

@@ -19,14 +19,15 @@ from optid.certificate.lifting import certify_nuclear
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
+from optid.identify.arguments import one_of
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import check_gauge, in_gauge
-from optid.models import HammersteinARX
+from optid.identify.gauges import FIXED, in_gauge
+from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.least_squares import LeastSquaresStructure
+from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import Core, reduce
-from optid.structures.whitening import leading_pair
 
 
 def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -56,7 +57,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
         StructureError: impossible orders, unknown gauge, nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     if not weight >= 0:
         raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, weight=float(weight)),
@@ -88,7 +89,7 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
         StructureError: impossible orders, unknown gauge or split, nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    check_gauge(gauge)
+    one_of("gauge", gauge, FIXED)
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, svd=svd), convex=True,
@@ -121,16 +122,9 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str, weig
         scale=problem.problem.scale, unit=problem.unit, compressed=problem, **form).subject_to(*builders)
 
 
-def _rank_one_model(problem: EquationError, core: Core, gauge: str, svd: str, values: Values) -> HammersteinARX:
+def _rank_one_model(problem: EquationError, core: Core, gauge: str, svd: str, values: Values) -> HammersteinTF:
     """Return the model of the leading singular pair of every Theta."""
-    pairs = []
-    for c, theta in enumerate(problem.matrices(values)):
-        left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
-        if svd == "whitened" and c in core.kept:  # in the Kronecker metric of the Gram matrix
-            position = core.kept.index(c)
-            left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
-        mu, b = leading_pair(theta, left, right)
-        b = b.reshape(problem.b_shape(c), order="F")
-        pairs.append(in_gauge(gauge, mu, b, values.get("a"), problem.layout.inputs[c]))
+    pairs = [in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.layout.inputs[c])
+             for c, (mu, b) in enumerate(leading_pairs(core, problem.matrices(values), svd == "whitened"))]
     mus, bs = zip(*pairs)
     return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")

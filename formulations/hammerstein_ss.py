@@ -16,13 +16,12 @@ channel and certified; then the innovation form from the residuals.
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from formulations.subspace_procedure import identified
+from optid.arrays import check_integer
+from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
-from optid.identify.design.expansion import Bases, FeedbackBases
 from optid.identify.subspace.plan import in_record_units, planned
 from optid.solving.solve import Procedure
 
@@ -154,8 +153,7 @@ def asivid(
         DataWarning: the feedback basis is nearly linear in y; the simulated feedback explains little of the measured.
     """
     one_of("noise", noise, NOISES)
-    if isinstance(iterations, bool) or not isinstance(iterations, int | np.integer) or iterations < 0:
-        raise StructureError(f"iterations={iterations!r}: it must be an integer >= 0.")
+    check_integer(iterations, "iterations", 0)
     kind = "simulated" if iterations else "inputs"
     plan = planned("hammerstein_ss.asivid", data, nx=nx, block_rows=block_rows, basis=basis,
                    feedback_basis=feedback_basis, instruments=kind + ("+past" if noise == "white" else ""), form=form,

@@ -14,10 +14,10 @@ from typing import Any
 
 from formulations.state_space import StateSpaceFit
 from formulations.state_space_procedure import state_space_fit
-from optid.bases import Basis, Polynomial, parse
+from optid.arrays import check_integer
+from optid.bases import Bases, Basis, Polynomial, parse
 from optid.data.record import Data
-from optid.identify.arguments import one_of, whole_number
-from optid.identify.design.expansion import Bases
+from optid.identify.arguments import one_of
 from optid.identify.prediction_error.latent_search import add_channels
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure
@@ -55,7 +55,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
         RankError: too few samples, or no direction of z whose run stays finite.
     """
-    whole_number("channels", channels, 1)
+    check_integer(channels, "channels")
     one_of("latent", latent, ("states+inputs", "states"))
     inner = on_latent(latent_basis)
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")

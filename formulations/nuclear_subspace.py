@@ -23,14 +23,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.subspace_procedure import completed, preliminary
-from optid.data.channels import Transform
+from formulations.subspace_procedure import identified
+from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import one_of
-from optid.identify.design.expansion import Bases, FeedbackBases
-from optid.identify.subspace.low_rank import Structured, choose_weight, order_of, rank_of, structure
-from optid.identify.subspace.observability import Observability, prepared
+from optid.identify.subspace.low_rank import Structured, choose_weight, structure
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, Solution, Status, relative_gap
@@ -107,46 +105,37 @@ def _weights(weight: float | str | Sequence[float], noise: float | None) -> tupl
 def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold_out: float) -> Procedure:
     trials, weight = {}, weights[0]
     if len(weights) > 1:
-        pose = partial(nuclear_programme, penalty=1.0, units=plan.units)
-        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, pose, preliminary)
+        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, partial(nuclear_programme, penalty=1.0))
         plan = replace(plan, nx=nx)
-    expansion, alpha = prepared(plan)
-    structured = structure(plan, expansion, alpha)
+    structured = structure(plan)
     if noise is not None:
         weight = float(np.mean(structured.scale)) ** 2 / noise**2 * energy_unit(plan.units)
-    solution: Solution = yield nuclear_programme(structured, structured.penalty(weight), plan.units)
+    solution: Solution = yield nuclear_programme(structured, structured.penalty(weight))
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
-    vectors, sizes = structured.decomposed(solution.values)
-    rank = rank_of(sizes, structured.floor)
-    nx = plan.order or order_of(sizes, alpha - 1, structured.floor)
+    _, sizes = parts = structured.decomposed(solution.values)
+    rank, nx = structured.rank(sizes), plan.order or structured.order(sizes)
     if nx > rank:
         return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "
                                                  "use a larger weight or a smaller order")
-    figures = {"order": nx, "block rows": alpha, "form": plan.instruments, "singular values": sizes, **trials,
-               "weight": weight, "lambda": structured.penalty(weight), "rank": rank,
+    figures = {"order": nx, "block rows": structured.problem.rows, "form": plan.instruments, "singular values": sizes,
+               **trials, "weight": weight, "lambda": structured.penalty(weight), "rank": rank,
                "objective of the convex programme": solution.objective,
                "its dual bound": -np.inf if solution.bound is None else solution.bound.value,
                "its relative gap": solution.gap,
                "missing outputs estimated": int(np.sum(~structured.problem.known))}
-    gamma = structured.gamma(vectors, sizes, nx, solution.values)
-    found = Observability(plan, plan.records, expansion, gamma, structured.scale, figures)
-    evidence = yield from completed(plan, found)
+    found = replace(structured.observability(solution.values, parts, nx), figures=figures)
+    evidence = yield from identified(plan, found)
     if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status in (Status.LOCAL, Status.OPTIMAL):
         evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
     return evidence
 
 
-def nuclear_programme(structured: Structured, penalty: float, units: Transform | None = None) -> Program:
-    """Pose the convex programme.
+def nuclear_programme(structured: Structured, penalty: float) -> Program:
+    """Pose the convex programme for a penalty lambda.
 
     Named variables: ``yhat`` (samples, l), outputs of mean zero and unit variance, and, in predictor form, ``T``, one
     column per output. The expression ``output`` is yhat in units of the data.
-
-    Args:
-        structured: the numbers.
-        penalty: lambda.
-        units: from those of ``structured`` to those of the record.
     """
     problem = structured.problem
     yhat = cp.Variable(problem.y.shape, name="yhat")
@@ -167,7 +156,7 @@ def nuclear_programme(structured: Structured, penalty: float, units: Transform |
     weight = cp.Parameter(nonneg=True, name="weight", value=penalty)
     constraints = {"structure": (inner == matrix,), "residual": (residual == misfit,)}
     view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
-                 + np.tile(structured.centre, (len(problem.y), 1))}, units=units)
+                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.plan.units)
     return Program(
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,

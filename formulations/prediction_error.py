@@ -30,11 +30,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.bases.basis import Basis
 from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel, whole_number
-from optid.identify.gauges import check_gauge, scale_fixed
+from optid.identify.arguments import enough_rows, one_of, one_output, outputs_present, per_channel
+from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
@@ -83,8 +84,8 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
             does not tell apart.
     """
-    return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, whole_number("nd", nd), constraints, gauge,
-                      offset, starts, seed)
+    return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, check_integer(nd, "nd", 0),
+                      constraints, gauge, offset, starts, seed)
 
 
 def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, constraints: Sequence[Any] = (),
@@ -94,7 +95,7 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are
     the errors raised.
     """
-    return _procedure("bj.exact", data, na, nb, nk, "linear", nc, whole_number("nd", nd), constraints, None, offset,
+    return _procedure("bj.exact", data, na, nb, nk, "linear", nc, check_integer(nd, "nd", 0), constraints, None, offset,
                       starts, seed)
 
 
@@ -143,7 +144,7 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
-    count = whole_number("starts", starts, 1, "the number of starts")
+    count = check_integer(starts, "starts")
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
     return _run(name, criterion, constraints, count, seed)
 
@@ -155,13 +156,13 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     Where D is A, nd is None; of a linear model the gauge.
     """
     if gauge is not None:
-        check_gauge(gauge)
+        one_of("gauge", gauge, FIXED)
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
-    orders = (whole_number("na", na, 0, "the number of poles"), per_channel("nb", nb, data.inputs, low=1),
+    orders = (check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
               per_channel("nk", nk, data.inputs, low=0))
     record, layout, units = plant_record(data, *orders, basis, offset, states=nd is not None)
     unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, bool(offset),
-                                whole_number("nc", nc), nd)
+                                check_integer(nc, "nc", 0), nd)
     if unknowns.apart:
         enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
     return TransferErrors(record, unknowns, gauge or "none", units)

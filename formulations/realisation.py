@@ -2,7 +2,7 @@
 
     min ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
 
-R and s are the record, compressed (`optid.identify.subspace.observer`). Two forms:
+R and s are the record, compressed (`optid.identify.subspace.realisation`). Two forms:
 
 * factored: every channel is rank one; solved and certified by the machinery of rank-one blocks. Named variables:
   ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``,
@@ -25,6 +25,7 @@ import numpy as np
 from optid.bases import Linear
 from optid.certificate.lifting import certify_rank_one
 from optid.data.channels import Transform
+from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.realisation import Realisation
 from optid.program.expressions import flat
 from optid.program.program import Program
@@ -36,17 +37,9 @@ RELAXED = 150
 """Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
 
 
-def realisation_programme(realisation: Realisation, name: str, units: Transform, constraints: Sequence[Any] = ()
-                          ) -> Program:
-    """Pose the step; ``recover`` gives `optid.identify.subspace.realisation.Factors`.
-
-    Args:
-        realisation: the least squares and its form.
-        name: name of the formulation.
-        units: from those of the step to those of the record, in which the constraints speak.
-        constraints: builders, about the coefficients.
-    """
-    problem, form = realisation.step.problem, realisation.step.form
+def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
+    """Pose the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
+    problem, form, units = realisation.problem, realisation.form, plan.units
     shape = form.n if form.experiments == 1 else (form.n, form.experiments)
     linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
                                                       if form.offset else {})
@@ -68,22 +61,22 @@ def realisation_programme(realisation: Realisation, name: str, units: Transform,
     structural = {"residual": (residual == error,), **gauge}
     relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
     return Program(
-        name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
-        {**variables, "residual": residual}, realisation.start(), realisation.factors,
+        plan.name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
+        {**variables, "residual": residual}, realisation.start(), partial(realisation.model, plan.data),
         _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
         scale=problem.scale, unit=1.0 if relative else energy_unit(units),
-        structure=structure, certify=certify).subject_to(*constraints)
+        structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
 
 
 def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]
           ) -> View:
     """Return what constraints may speak about; Theta_i is (P, n + l) or, without feedthrough, (P, n)."""
-    form = realisation.step.form
-    x, n, l = form.expansion, form.n, form.l  # noqa: E741
+    form, x, n = realisation.form, realisation.form.expansion, realisation.form.n
     expressions = variables | {realisation.names(i)[2]: theta for i, theta in enumerate(thetas)}
     inner = [theta[:, :n].T for theta in thetas]
-    direct = [theta[:, n:].T if b > n else np.zeros((l, p)) for theta, (p, b) in zip(thetas, form.blocks)]
-    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct[: x.m])
+    direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
+              for theta, direct in zip(thetas, form.feedthrough)]
+    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct)
     if x.q:
         expressions["Ez"] = cp.hstack(inner[x.m :])
     if all(isinstance(basis, Linear) for basis in x.inputs):

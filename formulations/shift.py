@@ -19,31 +19,39 @@ from cvxpy.constraints.psd import PSD
 from formulations.constraints.rule import Rule
 from optid.identify.subspace import shift
 from optid.identify.subspace.shift import DEFINITE, Shifting, ShiftStep
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.program.view import View
 
 
 def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = ()) -> Shifting:
     """Solve ``min ‖up A - down‖`` under rules, as `optid.identify.subspace.shift.constrained_shift`."""
-    return shift.constrained_shift(up, down, rules, (joint, refined, centred))
+    return shift.constrained_shift(up, down, rules, (fitted, centred))
 
 
-def joint(step: ShiftStep, rules: Sequence[Rule]) -> Program:
-    """Return the programme in P and Q: the residual weighted by P."""
+def fitted(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.ndarray] | None = None) -> Program:
+    """Return min ‖residual‖ under rules: in P and Q, weighted by P; with P and a start for A given, in A alone.
+
+    ``recover`` gives A. The norm rather than its square: where a plant obeys almost exactly, the square would vanish in
+    the tolerance.
+    """
     n = len(step.basis)
-    p, q = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, n), name="Q")
-    fit = (step.top @ q - step.low @ p) @ step.change
-    contracted = step.free * min(1.0, 0.5 / max(np.max(np.abs(np.linalg.eigvals(step.free))), 1e-12))
-    return _least_norm("shift", step, fit, {"P": p, "Q": q}, {"P": np.eye(n), "Q": contracted}, (p, q), rules,
-                       _normalised(p))
-
-
-def refined(step: ShiftStep, p: np.ndarray, a: np.ndarray, rules: Sequence[Rule]) -> Program:
-    """Return the programme in A alone, with P fixed: its residual is unweighted."""
-    inner = cp.Variable(a.shape, name="A")
-    fit = (step.top @ inner - step.low) @ step.change
-    return _least_norm("shift with fixed P", step, fit, {"A": inner}, {"A": step.inner(a)},
-                       (cp.Constant((p + p.T) / 2), inner @ p), rules, {})
+    if given is None:
+        p, q = cp.Variable((n, n), symmetric=True, name="P"), cp.Variable((n, n), name="Q")
+        contracted = step.free * min(1.0, 0.5 / max(np.max(np.abs(np.linalg.eigvals(step.free))), 1e-12))
+        variables, start = {"P": p, "Q": q}, {"P": np.eye(n), "Q": contracted}
+        name, fit, structural = "shift", step.top @ q - step.low @ p, _normalised(p)
+    else:
+        inner = cp.Variable((n, n), name="A")
+        p, q = cp.Constant((given[0] + given[0].T) / 2), inner @ given[0]
+        variables, start = {"A": inner}, {"A": step.inner(given[1])}
+        name, fit, structural = "shift with fixed P", step.top @ inner - step.low, {}
+    residual, height = cp.Variable(fit.size, name="residual"), cp.Variable(name="height")
+    error = cp.vec(fit @ step.change, order="F")
+    constraints = {"residual": (residual == error,), "norm": (cp.SOC(height, residual),), **structural}
+    view = View({"P": p, "Q": q}, reference={"A": step.free})
+    return Program(name, cp.Minimize(height), constraints, {**variables, "residual": residual, "height": height},
+                   start, step.recover, view, structural=frozenset(constraints), derived={"residual": error},
+                   scale=step.size).subject_to(*rules)
 
 
 def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Program:
@@ -57,21 +65,6 @@ def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Program:
              for name, group in bare.constraints.items()}
     # the rules hold at A already: here they are not the user's, so that their prices stay those of the fit
     return replace(bare, constraints=eased, structural=frozenset(eased))
-
-
-def _least_norm(name: str, step: ShiftStep, fit: Any, variables: dict[str, Any], start: Values, pair: tuple[Any, Any],
-                rules: Sequence[Rule], constraints: dict[str, Any]) -> Program:
-    """Return min ‖fit‖ under rules about the pair (P, Q); ``recover`` gives A.
-
-    The norm rather than its square: where a plant obeys almost exactly, the square would vanish in the tolerance.
-    """
-    residual, height = cp.Variable(fit.size, name="residual"), cp.Variable(name="height")
-    error = cp.vec(fit, order="F")
-    constraints = {"residual": (residual == error,), "norm": (cp.SOC(height, residual),), **constraints}
-    view = View({"P": pair[0], "Q": pair[1]}, reference={"A": step.free})
-    return Program(name, cp.Minimize(height), constraints, {**variables, "residual": residual, "height": height},
-                   start, step.recover, view, structural=frozenset(constraints), derived={"residual": error},
-                   scale=step.size).subject_to(*rules)
 
 
 def _normalised(p: cp.Variable) -> dict[str, tuple[Any, ...]]:

@@ -29,9 +29,9 @@ import cvxpy as cp
 import numpy as np
 
 from formulations import state_space_procedure as procedure
+from optid.bases import Bases
 from optid.data.channels import Transform
 from optid.data.record import Data
-from optid.identify.design.expansion import Bases
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.models import HammersteinSS

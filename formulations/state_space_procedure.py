@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from formulations.subspace_procedure import identified
+from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
-from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present, whole_number
+from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -37,13 +38,13 @@ def state_space_fit(name: str, data: Data, nx: int | str, fit: Callable[..., Any
     """Fit a model in the units of the samples, and return it in those of the record.
 
     ``fit`` makes the programmes of (name, errors, constraints, units), `formulations.state_space.StateSpaceFit`;
-    ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none. The
-    other arguments are those of `formulations.state_space.hammerstein_ss`, as are the errors raised.
+    ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none.
+    The other arguments are those of `formulations.state_space.hammerstein_ss`, as are the errors raised.
     """
     words = {"criterion": criterion, "stability": stability, "weighting": weighting}
     for what, word in words.items():
         one_of(what, word, WORDS[what])
-    whole_number("iterations", iterations, 1)
+    check_integer(iterations, "iterations")
     in_memory(data, f"{criterion} errors")
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and criterion == "prediction":

@@ -9,30 +9,29 @@
 import warnings
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
-from optid.certificate.simulation_bound import simulation_bound
-from optid.data.record import Data
+from optid.certificate.hankel import simulation_bound
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
-from optid.identify.prediction_error.state_errors import state_model
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
-from optid.identify.subspace.observer import ObserverProblem
 from optid.identify.subspace.plan import Plan
-from optid.identify.subspace.realisation import Factors, Realisation
-from optid.models.hammerstein_ss import HammersteinSS
+from optid.identify.subspace.realisation import Realisation
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 
 
-def identified(plan: Plan) -> Procedure:
+def identified(plan: Plan, found: Observability | None = None) -> Procedure:
     """Run the steps of a plan.
+
+    Args:
+        plan: what was asked for.
+        found: the observability matrix, with what was measured before; None for that of projections.
 
     Yields:
         The programmes of the steps under constraints and of the step in B, D, E and x0.
@@ -40,23 +39,8 @@ def identified(plan: Plan) -> Procedure:
     Returns:
         The model with singular values, condition of R11 and further figures.
     """
-    return (yield from completed(plan, estimate_observability(plan, _estimated)))
-
-
-def completed(plan: Plan, found: Observability) -> Procedure:
-    """Run the steps after the observability matrix.
-
-    Args:
-        plan: what was asked for.
-        found: the observability matrix, with what was measured before.
-
-    Yields:
-        The programmes of the steps.
-
-    Returns:
-        The evidence, with figures added.
-    """
-    (a, _, gamma), l, figures = found.pair(), plan.data.l, dict(found.figures)  # noqa: E741
+    found = estimate_observability(plan) if found is None else found
+    a, gamma, l, figures = found.least_squares(), found.scaled, plan.data.l, dict(found.figures)  # noqa: E741
     doubt, rules = "", plan.about("poles")
     if rules or plan.stability == "auto" and spectral_radius(a) >= 1:
         shift = yield from constrained_shift(gamma[:-l], gamma[l:], rules or (stable(INSIDE),))
@@ -70,46 +54,19 @@ def completed(plan: Plan, found: Observability) -> Procedure:
                               "unstable without its feedback.", DataWarning, stacklevel=2)
         a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
     step = found.step(a)
-    realisation = Realisation(step, plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
-    program = realisation_programme(realisation, plan.name, plan.units, plan.about("coefficients"))
+    step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
+    program = realisation_programme(step, plan)
     solution: Solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
-    model = _model(plan, step, realisation.factors(solution.values))
+    model = program.recover(solution.values)
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
     return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
-                    status, reason, figures | step.ratios(), partial(_with_noise, model, plan.data))
+                    status, reason, figures | step.ratios(), partial(with_noise_or_reason, model, plan.data))
 
 
-def preliminary(found: Observability) -> HammersteinSS:
-    """Return the least-squares model of an observability matrix, for comparisons: no constraints, A contracted.
-
-    Raises:
-        RankError: the record does not determine it.
-    """
-    step = found.step(found.contracted())
-    realisation = Realisation(step, False)
-    return _model(found.plan, step, realisation.factors(realisation.start()))
-
-
-def _estimated(found: Observability) -> HammersteinSS:
-    return with_noise_or_reason(preliminary(found), found.plan.data)[0]
-
-
-def _with_noise(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, Any]]:
-    model, remark = with_noise_or_reason(model, data)
-    return model, {"noise model": remark} if remark else {}
-
-
-def _model(plan: Plan, step: ObserverProblem, factors: Factors) -> HammersteinSS:
-    form = step.form
-    model = state_model(form.expansion, plan.data, (form.a, factors.B, form.c, factors.D), factors.mus, factors.nus,
-                        factors.E, offset=factors.offset)
-    return replace(model, gauge="norm") if any(basis.size > 1 for basis in form.expansion.inputs) else model
-
-
-def _bound(plan: Plan, step: ObserverProblem, solution: Solution, unit: float, block_rows: int) -> Bound:
+def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:
     """Return the Hankel bound of the objective in units of the record; none where no proof was asked for."""
     said = "the (A, C) step minimises no criterion of the whole model"
     if solution.bound is None:

@@ -15,9 +15,9 @@ import numpy as np
 from formulations.lfr import on_latent
 from formulations.state_space import StateSpaceFit
 from formulations.state_space_procedure import state_space_fit
+from optid.bases import Bases
 from optid.data.record import Data
 from optid.identify.arguments import in_memory
-from optid.identify.design.expansion import Bases
 from optid.identify.prediction_error.latent_search import add_output_functions
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure

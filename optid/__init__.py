@@ -21,7 +21,6 @@ _HOME = {
     "Linear": "bases",
     "UserFunctions": "bases",
     "Nonlinearity": "models",
-    "HammersteinARX": "models",
     "HammersteinSS": "models",
     "NoiseCovariances": "models",
     "HammersteinTF": "models",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataError, DataWarning, OptidError, StructureError
 
 Array = NDArray[np.floating]
 
@@ -55,11 +55,7 @@ def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np
 
 
 def is_scalar_list(values: Any) -> bool:
-    """Tell one record written as a list of numbers from a list of records (one array per experiment).
-
-    Raises:
-        DataError: a nested list, which could mean either.
-    """
+    """Tell one record, a list of numbers, from a list of one array per experiment; refuse others (`DataError`)."""
     if not isinstance(values, list | tuple):
         return True
     kinds = {_kind(item) for item in values}
@@ -90,34 +86,30 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
                     "remove the fault that produced it.")
 
 
-def check_integer(value: Any, name: str, low: int = 1, high: int | None = None) -> int:
+def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
+                  error: type[OptidError] = StructureError) -> int:
     """Return an integer argument as an int.
 
-    Raises:
-        StructureError: no integer, or one outside the bounds.
+    Args:
+        value: of the argument.
+        name: of the argument, for the message.
+        low: least value.
+        high: largest value; None for any.
+        error: what is raised: no integer, or one outside the bounds.
     """
     top = value if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
-        kind = "a positive integer" if low == 1 else f"an integer >= {low}"
+        kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
         kind = kind if high is None else f"an integer from {low} to {high}"
-        raise StructureError(f"{name}={value!r} must be {kind}.")
+        raise error(f"{name} must be {kind}; got {value!r}.")
     return int(value)
 
 
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
-    """Refuse integers that float64 cannot hold; warn about signs of saturation and of wrap-around.
+    """Refuse integers (N, channels) beyond 2**53, which float64 cannot hold; see `check_finite`.
 
-    Args:
-        array: (N, channels) of an integer type.
-        labels: one text per channel for the message.
-        first: index of the first sample in the whole record, for chunked sources.
-        limits: look for saturation and wrap-around too.
-
-    Raises:
-        DataError: a magnitude above 2**53, named by channel and sample.
-
-    Warns:
-        DataWarning: samples at the limits of the type, or steps above three quarters of its range.
+    With `limits` samples at the limits of the type, and steps above three quarters of its range, are warned about
+    (`DataWarning`): signs of saturation and of wrap-around.
     """
     info = np.iinfo(array.dtype)
     for column, label in zip(array.T, labels):

@@ -56,11 +56,7 @@ class Description:
 
 
 def describe(point: EntryPoint) -> Description:
-    """Describe the function of an entry point.
-
-    Raises:
-        ImportError: its module cannot be found.
-    """
+    """Describe the function of an entry point; a module that cannot be found raises `ImportError`."""
     return _in_source(point.module, point.attr) or describe_function(point.load())
 
 

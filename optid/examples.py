@@ -1,4 +1,8 @@
-"""Built-in records: simulated systems whose truth is known, so that every command can be tried without data."""
+"""Built-in records: simulated systems whose truth is known, so that every command can be tried without data.
+
+Each function takes the seed of all that is random and the number of samples n, some also the standard deviation of the
+noise relative to the root of the power of the noise-free output, in place of the ratio that they state.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,11 +41,6 @@ def dead_zone(seed: int = 0, n: int = 1000, noise: float | None = None) -> Examp
     The output noise is v = e / A with white Gaussian e, and the ratio of the variances of the noise-free output and
     of v is 22 (D. Luo, PhD dissertation, University of Central Florida, 2005, section 3.4; A, b and f are chosen here,
     the source does not print them). The system starts at rest, dt = 0.1 s.
-
-    Args:
-        seed: seed of input and noise.
-        n: samples.
-        noise: standard deviation of the noise relative to that of the noise-free output; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1.0, 1.0, n)
@@ -57,12 +56,6 @@ def thruster(seed: int = 0, n: int = 600, noise: float | None = None) -> Example
     A = 1 - 1.2 q^-1 + 0.4 q^-2, b_0 = 0.2 (unit static gain), dt = 0.1 s. The input is a staircase plus a multisine, at
     most 1.5 A; the ratio of the energies of noise-free thrust and noise is 30. Modelled on section 3.5 of the same
     dissertation as `dead_zone`, whose data are not public.
-
-    Args:
-        seed: seed of the phases and of the noise.
-        n: samples.
-        noise: standard deviation of the noise relative to the root mean square of the noise-free
-            thrust; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = _currents(n, seed)
@@ -74,10 +67,6 @@ def broken_thruster(seed: int = 0, n: int = 400) -> Example:
 
     From then on the thrust that the current drives is half of what it was; input, dynamics and noise are of the same
     kind. For `optid diagnose`, with a state-space model of `thruster`.
-
-    Args:
-        seed: seed of input and noise.
-        n: samples.
     """
     rng = np.random.default_rng([seed, 2])
     u = _currents(n, seed + 1)
@@ -94,11 +83,6 @@ def two_inputs(seed: int = 0, n: int = 2000, noise: float | None = None) -> Exam
     A = 1 - 1.1 q^-1 + 0.3 q^-2; valve: f(u) = tanh(2 u), b = (-0.6, -0.3), u in [-1, 1]; heater: f(u) = u^2 / 4,
     b = (0.5, 0.4), u in [0, 2]. White uniform inputs, dt = 1 s; the ratio of the energies of the noise-free output,
     about its mean, and of the noise is 25.
-
-    Args:
-        seed: seed of inputs and noise.
-        n: samples.
-        noise: standard deviation of the noise relative to that of the noise-free output; as above when not given.
     """
     rng = np.random.default_rng(seed)
     u = np.column_stack([rng.uniform(-1.0, 1.0, n), rng.uniform(0.0, 2.0, n)])
@@ -110,10 +94,6 @@ def pendulum(seed: int = 0, n: int = 4000) -> Example:
 
     Dead zone, friction, an encoder of 4000 counts and noise on the speed; uniform levels within 8, held five samples
     of 0.02 s (`optid.plants.pendulum`). Gravity and friction are nonlinear feedback of the outputs.
-
-    Args:
-        seed: seed of input and noise.
-        n: samples.
     """
     u = plants.pendulum_input("levels", n, seed)
     plant = plants.ReactionWheelPendulum()
@@ -127,26 +107,17 @@ def vanderpol(seed: int = 0, n: int = 6000) -> Example:
 
     White uniform input within 2, dt = 0.1 s, process noise 0.005, measurement noise 0.02 (`optid.plants.van_der_pol`).
     The cubic damping is nonlinear feedback of the measured output.
-
-    Args:
-        seed: seed of input and noise.
-        n: samples.
     """
     u = np.random.default_rng([seed, 1]).uniform(-2.0, 2.0, n)
     data = plants.van_der_pol(u, seed, process=0.005, measurement=0.02)
     suggestion = {"na": 2, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": 2, "feedback_basis": "polynomial:4"}
-    return Example(data, {"n": 2, "f": (_square_with_sign,)}, suggestion)
+    return Example(data, {"n": 2, "f": (plants.van_der_pol_drive,)}, suggestion)
 
 
 EXAMPLES: dict[str, Callable[..., Example]] = {
-    "thruster": thruster,
-    "broken_thruster": broken_thruster,
-    "dead_zone": dead_zone,
-    "two_inputs": two_inputs,
-    "pendulum": pendulum,
-    "vanderpol": vanderpol,
+    function.__name__: function for function in (thruster, broken_thruster, dead_zone, two_inputs, pendulum, vanderpol)
 }
-"""The built-in records by the name that the command line takes; each function takes seed and n."""
+"""The built-in records by the name that the command line takes."""
 
 
 def example(name: str, **arguments: Any) -> Example:
@@ -189,14 +160,9 @@ class _System:
 
     def example(self, u: np.ndarray, ratio: float, noise: float | None, rng: np.random.Generator,
                 power: float | None = None) -> Example:
-        """Return the record to inputs u (N, m) with noise on the output.
+        """Return the record to inputs u (N, m) with output noise of this ratio of powers, or of this relative size.
 
-        Args:
-            u: (N, m) inputs.
-            ratio: of the power of the noise-free output to that of the noise.
-            noise: standard deviation of the noise over the root of that power, in place of the ratio.
-            rng: of the noise.
-            power: of the noise-free output; its variance in this record when not given.
+        The power of the noise-free output is its variance in this record when not given.
         """
         clean = self.output(u)
         power = float(np.var(clean)) if power is None else power
@@ -233,10 +199,6 @@ def _saturation(u: np.ndarray) -> np.ndarray:
 
 def _power(u: np.ndarray) -> np.ndarray:
     return u**2 / 4
-
-
-def _square_with_sign(u: np.ndarray) -> np.ndarray:
-    return u + 0.5 * u * np.abs(u)
 
 
 def _thrust(u: np.ndarray) -> np.ndarray:

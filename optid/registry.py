@@ -23,11 +23,7 @@ def registered(group: str) -> dict[str, EntryPoint]:
 
 
 def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]]:
-    """Return (name, callable) of a formulation given by name or as a callable.
-
-    Raises:
-        LookupFailed: no such name; the message has the nearest one.
-    """
+    """Return (name, callable) of a formulation given by name or as a callable; errors as of `entry_point`."""
     if callable(name):
         return getattr(name, "__name__", "formulation"), name
     return name, entry_point(FORMULATIONS, name).load()
@@ -46,11 +42,7 @@ def entry_point(group: str, name: str) -> EntryPoint:
 
 
 def fault_formulation(name: str) -> Callable[..., Any]:
-    """Return a programme about a fault by its name.
-
-    Raises:
-        LookupFailed: no such name; the message has the nearest one.
-    """
+    """Return a programme about a fault by its name; errors as of `entry_point`."""
     return entry_point(FAULTS, name).load()
 
 

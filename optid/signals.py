@@ -1,4 +1,8 @@
-"""Excitation signals: (N,) float64 records that stay within an amplitude range low to high.
+"""Excitation signals: (n,) float64 records that stay within an amplitude range.
+
+Each takes the number of samples n, the smallest and the largest value low and high, where it needs them the sampling
+time dt, which gives frequencies their unit, and the seed of what is random, besides the further arguments that it
+describes. An argument out of its range raises a `StructureError` that names it.
 
 A static nonlinearity is identified only where the input goes: a binary signal cannot show it (it collapses to an affine
 function), and one sinusoid of a polynomial of degree p has p harmonics only. Signals of many levels are the safe choice
@@ -9,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.errors import StructureError
 
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
@@ -24,21 +29,14 @@ def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
     lowers it further by clipping and restoring the amplitudes in turn (Van der Ouderaa, Schoukens, Renneboog, IEEE
     Trans. Instrum. Meas. 37, 1988). Stretching changes the amplitudes by one common factor and the mean.
 
-    Args:
+    Further arguments:
         n: samples, a multiple of `periods`.
-        low: smallest value.
-        high: largest value.
-        dt: sampling time; gives `band` and the argument of `spectrum` their unit.
         lines: harmonics of the period, 1 up to below half the samples of a period; all when not given.
         band: lowest and highest frequency (1/unit of dt), instead of lines.
         spectrum: relative amplitude of each line, or a function of the frequencies (k,); flat when not given.
         phases: "schroeder" or "random" (uniform, from the seed).
         periods: number of periods.
         crest_steps: rounds of crest factor reduction.
-        seed: seed of the random phases.
-
-    Raises:
-        StructureError: an argument out of its range, both lines and band, or no line in the band.
     """
     _check(n, low, high)
     size = _part(n, periods, "periods", "periods")
@@ -57,7 +55,8 @@ def multisine(n: int, low: float = -1.0, high: float = 1.0, *, dt: float = 1.0,
         if np.max(np.abs(np.fft.irfft(better, size))) >= np.max(np.abs(period)):
             break
         coefficients = better
-    return np.tile(_stretched(np.fft.irfft(coefficients, size), low, high), periods)
+    period = np.fft.irfft(coefficients, size)
+    return np.tile(low + (high - low) * (period - period.min()) / np.ptp(period), periods)
 
 
 def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, dt: float = 1.0, phase: float = 0.0
@@ -66,16 +65,9 @@ def sinusoid(n: int, low: float = -1.0, high: float = 1.0, *, frequency: float, 
 
     Never a sufficient excitation by itself: a static polynomial of degree p turns it into p harmonics.
 
-    Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
+    Further arguments:
         frequency: 1/unit of dt, at most half the sampling rate.
-        dt: sampling time.
         phase: at the first sample, rad.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     _check(n, low, high)
     _check_rate(frequency, dt, "frequency")
@@ -94,21 +86,14 @@ def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: i
     The register (`scipy.signal.max_len_seq`; Golomb, Shift Register Sequences, 1967) repeats after
     hold * (2**bits - 1) samples. A binary input cannot identify a static nonlinearity, only linear dynamics.
 
-    Args:
-        n: samples.
-        low: one value.
-        high: the other value.
+    Further arguments:
         hold: samples for which each value is held.
         bits: length of the register, 2 to 32; the shortest that does not repeat within n when not given.
-        seed: seed of the initial state of the register.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import max_len_seq
 
     _check(n, low, high)
-    draws = _held_draws(n, hold)
+    draws = -(-n // check_integer(hold, "hold"))
     bits = max(2, int(draws).bit_length()) if bits is None else bits
     if not 2 <= bits <= 32:
         raise StructureError(f"bits = {bits}: a register has 2 to 32 bits.")
@@ -122,18 +107,12 @@ def chirp(n: int, low: float = -1.0, high: float = 1.0, *, f0: float, f1: float,
           method: str = "linear", repeats: int = 1) -> np.ndarray:
     """Return a sine whose frequency runs from f0 to f1, several times over.
 
-    Args:
+    Further arguments:
         n: samples, a multiple of `repeats`.
-        low: smallest value.
-        high: largest value.
         f0: frequency at the start of a sweep (1/unit of dt), positive for method "logarithmic".
         f1: frequency at its end, at most half the sampling rate.
-        dt: sampling time.
         method: "linear", "quadratic", "logarithmic" or "hyperbolic" (`scipy.signal.chirp`).
         repeats: number of sweeps.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import chirp as swept
 
@@ -153,18 +132,10 @@ def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: 
 
     The filter runs in before the record starts, so that the record is stationary.
 
-    Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
+    Further arguments:
         cutoff: edge of a low-pass, or the edges of a band-pass (1/unit of dt), below half the sampling rate.
-        dt: sampling time.
         order: order of the filter.
         clip: number of standard deviations that reach from the middle to low and to high.
-        seed: seed of the noise.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     from scipy.signal import butter, sosfilt
 
@@ -190,20 +161,13 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
                    seed: int = 0) -> np.ndarray:
     """Return independent uniform values, each held for some samples; with hold 1 uniform white noise.
 
-    Args:
-        n: samples.
-        low: smallest value.
-        high: largest value.
+    Further arguments:
         hold: samples for which each value is held.
         levels: number of equally spaced values to draw from; any value when not given.
-        seed: seed of the draws.
-
-    Raises:
-        StructureError: an argument out of its range.
     """
     _check(n, low, high)
     rng = np.random.default_rng(seed)
-    draws = _held_draws(n, hold)
+    draws = -(-n // check_integer(hold, "hold"))
     values = rng.uniform(low, high, draws) if levels is None else rng.choice(_spaced(low, high, levels), draws)
     return np.repeat(values, hold)[:n]
 
@@ -211,20 +175,14 @@ def uniform_levels(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 
 def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold: int | None = None) -> np.ndarray:
     """Return a staircase from low to high and back, again and again.
 
-    Args:
-        n: samples.
-        low: lowest level.
-        high: highest level.
+    Further arguments:
         levels: number of equally spaced levels, at least 2.
         hold: samples per step; one staircase up and down fills the record when not given.
-
-    Raises:
-        StructureError: an argument out of its range, or n too small for the staircase.
     """
     _check(n, low, high)
     up = _spaced(low, high, levels)
     if hold is not None:
-        return np.repeat(np.resize(np.concatenate([up, up[-2:0:-1]]), _held_draws(n, hold)), hold)[:n]
+        return np.repeat(np.resize(np.concatenate([up, up[-2:0:-1]]), -(-n // check_integer(hold, "hold"))), hold)[:n]
     stairs = np.concatenate([up, up[-2::-1]])
     if n < stairs.size:
         raise StructureError(f"n = {n} samples cannot hold {stairs.size} steps; use fewer levels.")
@@ -232,14 +190,9 @@ def steps(n: int, low: float = -1.0, high: float = 1.0, *, levels: int = 5, hold
 
 
 def _check(n: int, low: float, high: float) -> None:
-    _check_count("n", n)
+    check_integer(n, "n")
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise StructureError(f"low = {low}, high = {high}: low must be below high.")
-
-
-def _check_count(name: str, value: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise StructureError(f"{name} = {value!r}: a positive number of samples is needed.")
 
 
 def _check_rate(frequency: float, dt: float, what: str) -> None:
@@ -259,19 +212,10 @@ def _filled(values: np.ndarray, low: float, high: float) -> np.ndarray:
     return (low + high) / 2 + (high - low) / 2 * values
 
 
-def _held_draws(n: int, hold: int) -> int:
-    _check_count("hold", hold)
-    return -(-n // hold)
-
-
 def _spaced(low: float, high: float, levels: int) -> np.ndarray:
     if levels < 2:
         raise StructureError(f"levels = {levels}: at least 2 are needed.")
     return np.linspace(low, high, levels)
-
-
-def _stretched(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    return low + (high - low) * (x - x.min()) / (x.max() - x.min())
 
 
 def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None

@@ -17,7 +17,8 @@ def direction_value(problem: RankOne, b: np.ndarray) -> float:
 def search_circle(problem: RankOne, points: int = 720) -> float:
     """Global minimum for one block with n_b = 2: a fine grid on the angle, every local minimum refined."""
     assert problem.blocks[0][1] == 2 and len(problem.blocks) == 1
-    gram, g, c, p, n = problem.H, problem.g, problem.c, problem.blocks[0][0], problem.linear
+    gram, g, c = problem.root.T @ problem.root, problem.root.T @ problem.target, problem.value(0 * problem.target)
+    p, n = problem.blocks[0][0], problem.linear
 
     def value(angle):
         lift = np.zeros((len(g), n + p))

@@ -10,7 +10,7 @@ from systems import by_hand
 
 import optid
 from optid.bases import Triangular
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 
 BASIS = Triangular(6).fitted(-1.0, 1.0)
 NODES = np.linspace(-1, 1, 7)
@@ -19,7 +19,7 @@ NODES = np.linspace(-1, 1, 7)
 def plant(gain=1.0, a=(-1.2, 0.5), b=(1.0, 0.6), f=lambda u: np.tanh(2 * u), offset=0.3):
     """A SISO plant whose nonlinearity is in the basis (up to a constant)."""
     values = f(NODES) - f(0.0)
-    return HammersteinARX(list(a), (gain * np.array(b),), (Nonlinearity(BASIS, np.delete(values, 3)),), (0,), offset)
+    return HammersteinTF(list(a), (gain * np.array(b),), (Nonlinearity(BASIS, np.delete(values, 3)),), (0,), offset)
 
 
 def record(gain=1.0, count=150, noise=0.4, seed=0, model=None):
@@ -84,7 +84,7 @@ def search(program, points=72):
 
 def regression(fit, solution=None):
     """Coefficients (columns, l) of the dense regressor in the units of the record, of a fit or of one of its steps."""
-    fit = fit if solution is None else replace(fit, solved=solution)
+    fit = fit if solution is None else replace(fit, outcome=replace(fit.outcome, solution=solution))
     values, ny, layout = fit.values, fit.data.l, fit.program.compressed.layout
     a = values.get("a", np.zeros(0))
     rows = [np.reshape(a, (ny, -1), order="F" if ny > 1 else "C").T if a.size else np.zeros((0, ny))]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 
 BASES = [
     Triangular(7),
@@ -33,7 +33,7 @@ def siso(basis=None, nk=0, offset=0.3, **changes):
         "offset": offset,
         "dt": 0.1,
     }
-    return HammersteinARX(**(arguments | changes))
+    return HammersteinTF(**(arguments | changes))
 
 
 def mimo():
@@ -43,7 +43,7 @@ def mimo():
     functions = tuple(
         nonlinearity(basis, seed) for seed, basis in enumerate([Triangular(6), Polynomial(3), BSpline(4)])
     )
-    return HammersteinARX(a, b, functions, (0, 2, 1), [0.2, -0.4], dt=0.5, input_units=("A", "", "m"))
+    return HammersteinTF(a, b, functions, (0, 2, 1), [0.2, -0.4], dt=0.5, input_units=("A", "", "m"))
 
 
 def inputs(model, count=200, seed=1):

@@ -296,7 +296,7 @@ def test_parse(text, basis):
         ("triangle:4", LookupFailed, "triangular"),
         ("triangular", StructureError, "triangular:10"),
         ("triangular:x", StructureError, "cannot be read"),
-        ("triangular:0", StructureError, ">= 1"),
+        ("triangular:0", StructureError, "positive integer"),
         ("triangular:4:colour=red", StructureError, "colour"),
         ("triangular:4:outside=mirror", StructureError, "clamp"),
         ("triangular:4:degree=2", StructureError, "degree"),

@@ -9,7 +9,7 @@ from scripts import benchmark
 
 from optid.certificate import certify
 from optid.certificate.minors import basis_from, cholesky, free_mask, project_minors, tangent_minors
-from optid.certificate.shape_duals import sign_free_cut
+from optid.certificate.shape_duals import Linear, sign_free_cut
 from optid.errors import StructureError
 from optid.structures.bilinear import best_of, minimise
 from optid.structures.rank_one import Point, RankOne, reduce
@@ -22,10 +22,11 @@ SHAPES = st.tuples(st.integers(2, 4), st.integers(2, 5))
 
 def recompute(problem: RankOne, evidence) -> float:
     """D = c - g^T S^-1 g in the original coordinates, from the multipliers, by dense algebra (no constraints)."""
-    lifted = problem.H
-    lifted[problem.linear:, problem.linear:] += evidence.forms()
+    lifted, slope = problem.root.T @ problem.root, problem.root.T @ problem.target
+    change = np.linalg.inv(evidence.core.whitening.columns(np.eye(len(evidence.minors))))
+    lifted[problem.linear:, problem.linear:] += change.T @ evidence.minors @ change
     assert np.linalg.eigvalsh(lifted)[0] > 0
-    return problem.c - problem.g @ np.linalg.solve(lifted, problem.g)
+    return problem.value(0 * slope) - slope @ np.linalg.solve(lifted, slope)
 
 
 @given(SHAPES, st.integers(0, 1000))
@@ -248,7 +249,7 @@ def test_monotone_bound_with_two_lags_against_a_search_over_directions():
         best = min(best, nnls(design - head @ (head.T @ design),
                               problem.target - head @ (head.T @ problem.target))[1] ** 2 + problem.remainder)
     found = minimise_in_cones(problem, {0: increments})
-    bound = certify(problem, found.point, cones=[increments]).bound
+    bound = certify(problem, found.point, cones={0: increments}).bound
     assert bound.proved
     assert found.value <= best <= found.value * (1 + 1e-5)
 
@@ -257,11 +258,11 @@ def test_a_point_outside_its_constraints_is_never_proved():
     problem, increments = monotone(0, 3, 5, 100, snr=0.3)
     free = minimise(problem).point
     for effort in ("ascent", "sdp"):
-        bound = certify(problem, free, cones=[increments], effort=effort).bound
+        bound = certify(problem, free, cones={0: increments}, effort=effort).bound
         assert not bound.proved and "violates" in bound.reason
     row = np.ones((1, len(problem.target)))
     right = np.array([row[0] @ free.lift() - 1.0])
-    assert not certify(problem, free, linear=(row, right, np.array([False]))).bound.proved
+    assert not certify(problem, free, linear=Linear(row, right, np.array([False]))).bound.proved
 
 
 def test_constrained_optimum_is_not_proved_without_its_cone_and_no_cone_is_needed_when_inactive():
@@ -270,7 +271,7 @@ def test_constrained_optimum_is_not_proved_without_its_cone_and_no_cone_is_neede
     free = minimise(problem)
     assert free.value < found.value * (1 - 1e-6)
     assert not certify(problem, found.point).bound.proved
-    assert certify(problem, found.point, cones=[increments]).bound.proved
+    assert certify(problem, found.point, cones={0: increments}).bound.proved
 
 
 @given(st.integers(0, 10**4))
@@ -287,7 +288,7 @@ def test_lifted_equality_agrees_with_elimination(seed):
     point = Point(np.r_[fixed, found.point.w], found.point.mus, found.point.bs)
     row = np.zeros((1, n + 1))
     row[0, 0] = 1.0
-    linear = (row, np.array([fixed]), np.array([True]))
+    linear = Linear(row, np.array([fixed]), np.array([True]))
     lifted = certify(problem, point, linear=linear, effort="ascent").bound
     direct = certify(substituted, found.point, effort="ascent").bound
     assert lifted.proved == direct.proved
@@ -308,11 +309,11 @@ def test_lifted_inequality_is_used_only_in_its_direction():
     inner = minimise(RankOne(np.triu(triangle[:n, :n]), triangle[:n, n], problem.remainder + triangle[n, n] ** 2,
                              problem.blocks, 1)).point
     point = Point(np.r_[limit, inner.w], inner.mus, inner.bs)
-    at_limit = certify(shifted, point, linear=(row, limit, np.array([False])))
+    at_limit = certify(shifted, point, linear=Linear(row, limit, np.array([False])))
     assert at_limit.bound.proved
     assert at_limit.bound.multipliers.linear[0] > 0
-    assert not certify(shifted, point, linear=(-row, -limit, np.array([False]))).bound.proved
-    inactive = certify(shifted, free, linear=(row, limit + 10.0, np.array([False])))
+    assert not certify(shifted, point, linear=Linear(-row, -limit, np.array([False]))).bound.proved
+    inactive = certify(shifted, free, linear=Linear(row, limit + 10.0, np.array([False])))
     assert inactive.bound.proved and inactive.bound.multipliers.linear[0] == 0
 
 
@@ -324,8 +325,8 @@ def test_sign_of_b_as_a_lifted_constraint_with_a_cone():
     row[0, 1:5] = 1.0
     value = float(row[0] @ found.point.lift())
     for effort in ("ascent", "sdp"):
-        result = certify(problem, found.point, cones=[increments], effort=effort,
-                         linear=(np.sign(value) * -row, np.zeros(1), np.array([False])))
+        result = certify(problem, found.point, cones={0: increments}, effort=effort,
+                         linear=Linear(np.sign(value) * -row, np.zeros(1), np.array([False])))
         assert result.bound.value <= found.value * (1 + 1e-9)
     assert result.bound.proved
 
@@ -334,8 +335,8 @@ def test_bad_arguments_are_named():
     problem = hammerstein(0, 3, 4, 60)
     point = minimise(problem).point
     with pytest.raises(StructureError, match="cone 0"):
-        certify(problem, point, cones=[np.ones((2, 3))])
+        certify(problem, point, cones={0: np.ones((2, 3))})
     with pytest.raises(StructureError, match=r"E \(r, 14\)"):
-        certify(problem, point, linear=(np.ones((1, 3)), np.ones(1), np.ones(1, bool)))
+        certify(problem, point, linear=Linear(np.ones((1, 3)), np.ones(1), np.ones(1, bool)))
     with pytest.raises(StructureError, match="effort"):
         certify(problem, point, effort="all")

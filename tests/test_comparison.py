@@ -15,8 +15,8 @@ from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.validation import compare_models, fit_by_horizon, fit_percent, validate
-from optid.identify.validation.correlations import between_outputs
-from optid.models import HammersteinARX, Nonlinearity
+from optid.identify.validation.correlations import autocorrelation
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 
 
@@ -33,8 +33,8 @@ def record(model, count=400, seed=1, noise=0.1):
     return Data(u, by_hand(model, u, noise=e), dt=model.dt, name="rig")
 
 
-def worse(model: HammersteinARX) -> HammersteinARX:
-    return HammersteinARX(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
+def worse(model: HammersteinTF) -> HammersteinTF:
+    return HammersteinTF(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
 
 
 def feedback_model() -> HammersteinSS:
@@ -57,7 +57,7 @@ def test_the_curve_is_the_fit_of_predictions_over_common_samples():
     assert np.all(np.diff(curve.fits[:, 0]) < 0) and curve.simulation[0] < curve.fits[0, 0]
     text = str(curve)
     assert f"{curve.fits[1, 0]:.2f}" in text and "simulation" in text
-    with pytest.raises(StructureError, match="horizon = 0"):
+    with pytest.raises(StructureError, match="horizon must be a positive integer"):
         fit_by_horizon(model, data, [0])
     with pytest.raises(DataError, match="100 samples ahead"):
         fit_by_horizon(model, data.window(0, 50), [100])
@@ -67,8 +67,7 @@ def test_a_horizon_is_validated_beside_one_step():
     model, data = mimo(), record(mimo())
     found = validate(model, data, horizon=3)
     assert found.horizon == 3 and set(found.predictors) == {"one step", "3 steps", "simulation"}
-    assert found.ahead["y2"].fit == pytest.approx(fit_percent(data.y, model.predict(data, 3))[1])
-    assert not validate(model, data).ahead
+    assert found.predictors["3 steps"]["y2"].fit == pytest.approx(fit_percent(data.y, model.predict(data, 3))[1])
 
 
 def test_every_experiment_is_measured():
@@ -88,10 +87,10 @@ def test_the_residual_of_one_output_that_follows_another_is_found():
     p_values = []
     for _ in range(120):
         e, other = rng.normal(size=400), rng.normal(size=400)
-        p_values.append(between_outputs([e + 0.8 * other], [other], "y1", "y2", 10).p_value)
+        p_values.append(autocorrelation([e + 0.8 * other], "y1", 10, past=[other], other="y2").p_value)
     assert 0.3 < np.mean(p_values) < 0.7  # correlation at the same instant is no evidence
     e[3:] += 0.3 * other[:-3]
-    late = between_outputs([e], [other], "y1", "y2", 10)
+    late = autocorrelation([e], "y1", 10, past=[other], other="y2")
     assert not late.passed and late.lags[np.argmax(np.abs(late.values))] == 3
     z, v = ((x - x.mean()) / x.std() for x in (e, other))
     assert late.values[2] == pytest.approx(np.mean(z[3:] * v[:-3]))
@@ -108,7 +107,7 @@ def test_the_three_simulators_of_a_model_with_feedback():
     found = validate(model, data, horizon=4)
     assert list(found.predictors) == ["one step", "4 steps", "measured feedback", "simulation"]
     expected = fit_percent(data.y, model.simulate_measured_feedback(data, x0="fit"))[0]
-    assert found.measured_feedback["y"].fit == pytest.approx(expected)
+    assert found.predictors["measured feedback"]["y"].fit == pytest.approx(expected)
     assert found.structure is None and "measured feedback" in str(found)
     assert max(map(len, str(found).splitlines())) <= 80
 
@@ -119,7 +118,7 @@ def test_the_three_simulators_of_a_model_with_feedback():
 def test_models_are_compared_over_the_samples_that_all_predict():
     model = siso()
     data = record(model)
-    short = HammersteinARX([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
+    short = HammersteinTF([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
     found = compare_models({"true": model, "poor": worse(model), "late": short}, data, horizon=2)
     common = np.isnan(short.predict(data))
     for i, one in enumerate((model, worse(model), short)):
@@ -140,7 +139,7 @@ def test_models_without_names_are_named_by_what_they_are():
 
 def test_a_model_that_runs_away_is_compared_by_what_it_predicts():
     model, data = siso(), record(siso())
-    unstable = HammersteinARX([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
+    unstable = HammersteinTF([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
     u = np.vstack([data.u] * 5)
     long = Data(u, np.vstack([data.y] * 5), dt=model.dt)
     found = compare_models({"true": model, "wild": unstable}, long)

@@ -7,8 +7,15 @@ from problems import BASIS
 import optid
 from optid import plants, signals
 from optid.errors import DataError, DataWarning
-from optid.identify.design.lines import longest_run, many_lines, remaining_shares
-from optid.identify.design.rules import check_condition, check_instruments, check_levels, check_lines
+from optid.identify.design.rules import (
+    check_condition,
+    check_instruments,
+    check_levels,
+    check_lines,
+    longest_run,
+    many_lines,
+    remaining_shares,
+)
 from optid.identify.record_checks import examine, examine_figures
 
 RNG = np.random.default_rng(0)

@@ -132,7 +132,7 @@ def test_refusals(found):
     white = whiten(found.model, data)
     with pytest.raises(DataError, match="does not fit"):
         sliding_scan(found, white, 201)
-    with pytest.raises(StructureError, match="hop=0"):
+    with pytest.raises(StructureError, match="hop must be a positive integer; got 0"):
         sliding_scan(found, white, WINDOW, hop=0)
     with pytest.raises(DataError, match="u has 150 samples; the record has 200"):
         sliding_scan(found, white, WINDOW, u=data.u[:150])

@@ -81,7 +81,7 @@ def test_a_healthy_window_has_none(found):
 def test_bad_input(found):
     white = window(found, 30, 0)
     for most in (-1, 1.5):
-        with pytest.raises(StructureError, match="most="):
+        with pytest.raises(StructureError, match="most must be a nonnegative integer"):
             state_jumps(found, white, most)
     with pytest.raises(StructureError, match="penalty="):
         state_jumps(found, white, penalty=float("nan"))

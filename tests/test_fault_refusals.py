@@ -15,8 +15,9 @@ from optid.faults import Fault, check_channels, diagnose, dictionary, inject, re
 from optid.models import NoiseCovariances
 
 
-@pytest.mark.parametrize(("words", "named"), [({"draws": 0}, "draws=0"), ({"calibration": 0.5}, "calibration=0.5"),
-                                              ({"window": 10**8}, "fit in memory")])
+@pytest.mark.parametrize(("words", "named"), [
+    ({"draws": 0}, "draws must be a positive integer; got 0"),
+    ({"calibration": 0.5}, "calibration must be a positive integer; got 0.5"), ({"window": 10**8}, "fit in memory")])
 def test_a_study_of_absurd_size_is_refused(words, named):
     with pytest.raises(StructureError, match=named):
         dictionary(small()).isolability(**words)

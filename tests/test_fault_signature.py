@@ -366,7 +366,7 @@ def test_bad_input(found, limits):
     with pytest.raises(StructureError, match="has no threshold"):
         signature_estimate(s, replace(limits, q=np.full(len(limits.q), np.nan)))
     for most in (0, 1.5, -1):
-        with pytest.raises(StructureError, match="max_faults="):
+        with pytest.raises(StructureError, match="max_faults must be"):
             polish(s, limits, max_faults=most)
     with pytest.raises(StructureError, match="too many for an exact search"):
         polish(s, limits, max_faults=6)

@@ -10,7 +10,7 @@ import optid
 from formulations.constraints import shape
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.errors import RankError, StructureError
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 
 ORDERS = [([-1.5, 0.7], [16 / 15, 0.8], 0), ([-0.8], [1.0], 1), ([], [0.5, 0.2, -0.3], 2)]
 FORMS = ["hammerstein_arx.exact", "hammerstein_arx.nuclear", "hammerstein_arx.overparametrised"]
@@ -48,7 +48,7 @@ def test_ratio_of_b_is_exact_for_a_function_that_is_not_odd():
 @pytest.mark.parametrize("form", FORMS)
 def test_several_inputs_each_with_its_own_basis_order_and_delay(form):
     bases = [Triangular(6), Polynomial(3), BSpline(4)]
-    true = HammersteinARX([-1.1, 0.4], ([1.0, 0.5], [0.7], [0.3, -0.2, 0.4]),
+    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.7], [0.3, -0.2, 0.4]),
                           tuple(nonlinearity(basis, seed) for seed, basis in enumerate(bases)), (0, 2, 1), 0.2)
     fit = optid.fit(noise_free(true, 500), form, na=2, nb=[2, 1, 3], nk=[0, 2, 1],
                     basis=[basis.fitted(-0.7, 1.3) for basis in bases])
@@ -68,7 +68,7 @@ def test_several_outputs_with_full_matrices(form):
 def test_exact_fits_of_random_stable_systems(seed):
     rng = np.random.default_rng(seed)
     poles = rng.uniform(-0.9, 0.9, 3)
-    true = HammersteinARX(np.poly(poles)[1:], (rng.normal(size=4),), (nonlinearity(Triangular(5), seed),), (1,), 0.1)
+    true = HammersteinTF(np.poly(poles)[1:], (rng.normal(size=4),), (nonlinearity(Triangular(5), seed),), (1,), 0.1)
     fit = optid.fit(noise_free(true), na=3, nb=4, nk=1, basis=Triangular(5).fitted(-0.7, 1.3))
     assert distance(fit.model, true) < 1e-7
     assert fit.solution.proof

@@ -11,7 +11,7 @@ from formulations.constraints import shape
 from optid.backends import Settings
 from optid.backends.step_qp import Coordinates
 from optid.bases import Triangular
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.program.solution import Status
 from optid.registry import formulation
 
@@ -94,7 +94,7 @@ def test_constraints_that_no_candidate_direction_meets():
 
 def test_three_channels_with_constraints():
     functions = tuple(nonlinearity(Triangular(4), seed, (-1, 1)) for seed in range(3))
-    true = HammersteinARX([-0.8], ([1.0, 0.5], [-0.7, 0.2], [0.4, 0.4]), functions, (0, 0, 0), 0.1)
+    true = HammersteinTF([-0.8], ([1.0, 0.5], [-0.7, 0.2], [0.4, 0.4]), functions, (0, 0, 0), 0.1)
     data = record(model=true, count=300, noise=0.5)
     free = optid.fit(data, na=1, nb=2, basis=Triangular(4).fitted(-1, 1))
     fit = optid.fit(data, na=1, nb=2, basis=Triangular(4).fitted(-1, 1), constraints=["monotone:increasing"])

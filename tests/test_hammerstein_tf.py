@@ -14,13 +14,13 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
+from optid.models import HammersteinTF, Nonlinearity, roots
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
 
 def two_inputs():
-    return HammersteinARX([-1.2, 0.5], ([1.0, 0.4], [0.3, -0.2, 0.1]),
+    return HammersteinTF([-1.2, 0.5], ([1.0, 0.4], [0.3, -0.2, 0.1]),
                           (nonlinearity(Triangular(5), 1), nonlinearity(Polynomial(3), 2)), (0, 2), 0.4, dt=0.1)
 
 
@@ -219,7 +219,7 @@ def test_words():
     titles = {name: model.title for name, model in MODELS.items()}
     assert titles["oe"] == "Hammerstein output-error model" and titles["armax"] == "Hammerstein ARMAX model"
     assert titles["bj"] == titles["ma"] == titles["ar"] == "Hammerstein Box-Jenkins model"
-    linear = HammersteinARX([-0.5], ([1.0],), (Nonlinearity(Linear(), [1.0]),), (1,), 0.0)
+    linear = HammersteinTF([-0.5], ([1.0],), (Nonlinearity(Linear(), [1.0]),), (1,), 0.0)
     assert replace(linear, d=()).title == "Linear output-error model"
     assert replace(linear, d=()).equation() == "x(k) = 0.5 x(k-1) + 1 u(k-1)\ny(k) = x(k) + e(k)"
     armax = replace(linear, c=[0.2], d=[-0.5])
@@ -230,7 +230,8 @@ def test_words():
     assert bj.coefficients()[-2:] == [("d1", 0.0), ("d2", -0.3)] and bj.orders["nd"] == 2
     assert "poles of the noise" in str(bj) and "poles of the noise" not in str(armax)
     w = np.array([0.0, 1.0])
-    direct = [(bj.noise_impulse_response(300) * np.exp(-1j * f * np.arange(300))).sum() for f in w]
+    response = lfilter([1.0, *bj.c], [1.0, *bj.d], np.eye(1, 300)[0])
+    direct = [(response * np.exp(-1j * f * np.arange(300))).sum() for f in w]
     assert bj.noise_frequency_response(w) == pytest.approx(direct, abs=1e-12)
 
 

@@ -115,7 +115,7 @@ def test_dependent_rows_are_named():
     ([np.zeros((5, 1))], 6, RankError, "experiment 1 has 5 samples"),
     ([np.zeros((9, 1)), np.zeros((5, 1))], 6, RankError, "experiment 2 has 5 samples"),
     ([np.full((9, 1), np.nan)], 6, RankError, "no window of 6 samples is complete"),
-    ([np.zeros((9, 1))], 0, StructureError, "block rows"),
+    ([np.zeros((9, 1))], 0, StructureError, "rows must be a positive integer"),
     ([np.zeros(9)], 2, ValueError, "array"),
 ])
 def test_bad_input(records, rows, error, text):

@@ -19,7 +19,8 @@ from optid.faults.rank.order_power import MARGIN, coefficients, least_order
 from optid.faults.rank.zero_tests import ZeroTest, zero_test
 from optid.identify.order.ranks import rank_test
 from optid.plants import two_mode_plant
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
+from optid.statistics.sums import windows_of
 
 N = 1500
 

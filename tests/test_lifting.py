@@ -70,7 +70,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS, constraints=rules, gauge=gauge)
     lifted = lift_exact(program, program.structure)
     assert not lifted.refused and not lifted.cones
-    rows, right, equal = lifted.linear()
+    rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     rng = np.random.default_rng(1)
     for _ in range(5):
         a, mu, b, d = rng.normal(size=2), rng.normal(size=6), rng.normal(size=2), rng.normal(size=1)
@@ -91,7 +91,7 @@ def test_products_of_two_cones():
     lifted = lift_exact(program, program.structure)
     assert set(lifted.cones) == set(lifted.directions) == {0}
     assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
-    rows, right, equal = lifted.linear()
+    rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
     z = np.concatenate([np.zeros(3), np.kron(b, mu)])

@@ -10,7 +10,7 @@ import scripts
 import optid
 from optid.data.record import Data
 from optid.errors import DataWarning, RankError
-from optid.identify.subspace.imputation import ROUNDS, count_windows, impute
+from optid.identify.subspace.imputation import ROUNDS, impute
 from optid.identify.validation import fit_percent
 from optid.registry import registered
 
@@ -116,23 +116,14 @@ def test_the_criterion_takes_the_samples_present_only(name):
     assert fit.solution.objective == pytest.approx(0.8 * 2 * 2000 * np.nanmean(errors**2), rel=0.1)
 
 
-def test_complete_windows_are_counted():
-    rng = np.random.default_rng(0)
-    record = rng.normal(size=(60, 3))
-    record[[5, 6, 30], [0, 2, 1]] = np.nan
-    wide = np.lib.stride_tricks.sliding_window_view(record, 7, axis=0).reshape(54, -1)
-    assert count_windows([record, record[:4]], 7) == (int((~np.isnan(wide).any(axis=1)).sum()), 54)
-
-
 def test_the_true_model_is_a_fixed_point():
     data = punctured(share=0.3, samples=500)
     plant = gaps.plant(CELLS["hammerstein_ss.sid 2y"])
-    found = impute(data, lambda records: plant)
-    assert found.rounds == 2 and found.change == 0 and found.missing == np.isnan(data.y).sum()
+    (found,), how = impute(data, lambda records: plant)
     lost = np.isnan(data.y)
-    assert np.array_equal(found.records[0][:, :2], data.u) and np.array_equal(found.records[0][:, 2:][~lost],
-                                                                             data.y[~lost])
-    assert found.records[0][:, 2:][lost] == pytest.approx(plant.predict(data)[lost])
+    assert f"{lost.sum()} of" in how and "by 2 preliminary models" in how and "last change 0.0e+00" in how
+    assert np.array_equal(found[:, :2], data.u) and np.array_equal(found[:, 2:][~lost], data.y[~lost])
+    assert found[:, 2:][lost] == pytest.approx(plant.predict(data)[lost])
 
 
 def test_the_estimation_ends_and_refuses_what_it_cannot_estimate():
@@ -142,7 +133,7 @@ def test_the_estimation_ends_and_refuses_what_it_cannot_estimate():
         offset = np.random.default_rng(next(seeds)).normal(size=2)
         return replace(gaps.plant(CELLS["hammerstein_ss.sid 2y"]), offset_y=offset)
 
-    assert impute(data, restless).rounds == ROUNDS
+    assert f"by {ROUNDS} preliminary models" in impute(data, restless)[1]
     y = np.array(data.y)
     y[1:, 1] = np.nan
     with pytest.raises(RankError, match="fewer than two samples"):

@@ -13,7 +13,7 @@ from optid.bases import Linear, Triangular, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 
 MODELS = [siso(), siso(nk=3), siso(Linear()), mimo(), siso(a=[]), siso(a=[-0.5], b=([1.0],))]
 
@@ -270,7 +270,7 @@ def test_offset_of_f_is_restored_where_it_can_be():
     assert siso(b=([1.0, -1.0],)).c0 is None and "sum to zero" in siso(b=([1.0, -1.0],)).offset_note
     assert mimo().c0 is None and "several inputs" in mimo().offset_note and len(mimo().f) == 3
     assert siso(Linear()).c0 is None
-    two = HammersteinARX(
+    two = HammersteinTF(
         np.zeros((0, 2, 2)), ([[1.0, 2.0], [0.0, 1.0]],), (nonlinearity(Triangular(4)),), (0,), [0.5, 1.5]
     )
     assert two.c0 == pytest.approx(0.5)
@@ -357,7 +357,7 @@ def test_orders_and_layout():
         ({"a": [np.inf]}, "not finite"),
         ({"dt": 0.0}, "positive"),
         ({"gauge": "unit"}, "gauge"),
-        ({"outputs": ("y", "z")}, "2 outputs"),
+        ({"outputs": ("y", "z")}, "2 names"),
         ({"nonlinearities": (replace(nonlinearity(Triangular(3)), offset=1.0),)}, "offset="),
     ],
 )
@@ -383,5 +383,5 @@ def test_prediction_several_steps_ahead_is_simulation_from_the_state_then(make, 
         known = k - horizon + 1  # samples before this one are known
         state = model.state(u[:known], y[:known])
         assert predicted[k] == pytest.approx(model.simulate(longer[known:], state)[k - known], abs=1e-10)
-    with pytest.raises(StructureError, match="horizon = 0"):
+    with pytest.raises(StructureError, match="horizon must be a positive integer"):
         model.predict(Data(u, y, dt=model.dt), 0)

@@ -7,7 +7,15 @@ from scipy.signal import csd
 
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.noise import _most_likely, _part, colour, estimate_noise, noise_spectrum, residuals, with_noise
+from optid.identify.noise import (
+    _most_likely,
+    _part,
+    colour,
+    noise_spectrum,
+    residuals,
+    whitening_gain,
+    with_noise,
+)
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     _equations,
@@ -74,15 +82,15 @@ def test_gain_innovations_and_spectrum_are_recovered(lengths, missing, most, see
 def test_errors_shrink_like_the_root_of_the_record():
     model, errors = truth(4), []
     for N in (1000, 16000):
-        runs = [estimate_noise(bare(model), record(model, (N,), seed)).K - model.K for seed in range(8)]
+        runs = [with_noise(bare(model), record(model, (N,), seed)).K - model.K for seed in range(8)]
         errors.append(np.sqrt(np.mean(np.square(runs))))
     assert 2.5 < errors[0] / errors[1] < 6.5  # 4 in theory
 
 
 def test_covariances_are_positive_semidefinite_and_give_the_gain_back():
     model = truth(5)
-    found = estimate_noise(bare(model), record(model, (3000,)))
-    noise = found.covariances
+    found = with_noise(bare(model), record(model, (3000,)))
+    noise = found.noise
     joint = np.block([[noise.Q, noise.S], [noise.S.T, noise.R]])
     assert np.linalg.eigvalsh(joint)[0] > -1e-12 * np.trace(joint)
     again = kalman_gain(A, C, noise.Q, noise.R, noise.S)
@@ -93,7 +101,7 @@ def test_covariances_are_positive_semidefinite_and_give_the_gain_back():
 def test_no_other_gain_predicts_better():
     model = truth(6)
     data = record(model, (1500,), missing=0.05)
-    found = estimate_noise(bare(model), data)
+    found = with_noise(bare(model), data)
     rest = residuals(bare(model), data)
 
     def loss(gain):
@@ -136,7 +144,7 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
 def test_poles_on_and_outside_the_unit_circle(radius):
     A1 = A * radius / np.max(np.abs(np.linalg.eigvals(A)))
     model = truth(8, A1)
-    found = estimate_noise(bare(model), record(model, (200,) * 8))
+    found = with_noise(bare(model), record(model, (200,) * 8))
     assert np.linalg.norm(found.K - model.K) < 0.25 * np.linalg.norm(model.K)
     assert np.max(np.abs(np.linalg.eigvals(A1 - found.K @ C))) < 1
 
@@ -145,9 +153,9 @@ def test_white_noise_at_the_outputs_needs_no_gain():
     model = HammersteinSS(A, B, C, noise=NoiseCovariances(np.zeros((3, 3)), np.diag([0.04, 1.0]), np.zeros((3, 2)),
                                                           np.diag([0.04, 1.0])))
     data = record(model, (8000,))
-    found = estimate_noise(bare(model), data)
+    found = with_noise(bare(model), data)
     assert np.abs(found.K / [5.0, 1.0]).max() < 0.05
-    assert np.diag(found.covariances.R) == pytest.approx([0.04, 1.0], rel=0.06)
+    assert np.diag(found.noise.R) == pytest.approx([0.04, 1.0], rel=0.06)
     assert all(test.passed for test in colour(bare(model), data).values())
 
 
@@ -184,8 +192,8 @@ def test_scaled_data_are_in_the_units_of_their_model():
 
 def test_without_noise_there_is_nothing_to_estimate():
     model, u = bare(truth()), np.random.default_rng(0).normal(size=(300, 2))
-    found = estimate_noise(model, Data(u, model.simulate(u)))
-    assert not found.K.any() and np.abs(found.covariances.innovation).max() < 1e-15
+    found = with_noise(model, Data(u, model.simulate(u)))
+    assert not found.K.any() and np.abs(found.noise.innovation).max() < 1e-15
     with pytest.raises(StructureError, match="no noise covariances"):
         noise_spectrum(model, [0.1])
 
@@ -215,7 +223,7 @@ def test_missing_inputs_cut_the_record():
     us = [u.copy() for u in data.u]
     us[0][[700, 2500, 2504]] = np.nan
     us[1][1] = np.nan
-    found = estimate_noise(bare(model), Data(us, data.y))
+    found = with_noise(bare(model), Data(us, data.y))
     assert np.linalg.norm(found.K - model.K) < 0.15 * np.linalg.norm(model.K)
     rest = residuals(model, Data(us, data.y))
     lost = np.flatnonzero(np.isnan(rest[0][:, 0]))
@@ -267,3 +275,18 @@ def test_a_part_that_shows_too_little_is_not_searched():
     assert _part([late], 6)[0] is late and _part([quiet[:5000]], 6)[0].shape == (5000, 2)
     silent = quiet * [1.0, 0.0]
     assert _part([silent], 6)[0] is silent
+
+
+def test_the_autoregression_of_the_errors_of_an_observer_shows_the_gain():
+    rng = np.random.default_rng(7)
+    k, e = truth(3).K, rng.standard_normal((20000, 2)) * [1.0, 0.3]
+    gain, x, predicted, errors = 0.5 * k, np.zeros(3), np.zeros(3), np.empty((20000, 2))
+    for t in range(20000):
+        errors[t] = C @ (x - predicted) + e[t]
+        x, predicted = A @ x + k @ e[t], A @ predicted + gain @ errors[t]
+    errors[15000] = np.nan
+    assert whitening_gain(A, C, gain, [errors]) == pytest.approx(k, abs=0.05)
+    with pytest.raises(StructureError, match="too few"):
+        whitening_gain(A, C, gain, [errors[:50]])
+    with pytest.raises(StructureError, match="predicted exactly"):
+        whitening_gain(A, C, gain, [errors[:15000] * [1.0, 0.0]])

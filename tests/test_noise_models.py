@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import optid
-from formulations.constraints import shape, stability
+from formulations.constraints import poles, shape
 from formulations.prediction_error import armax as linear_armax
 from formulations.prediction_error import bj as linear_bj
 from formulations.prediction_error import hammerstein_armax as armax
@@ -18,7 +18,7 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
 from optid.identify.prediction_error.noise_starts import arma
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity, roots
+from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 
 BASIS = Triangular(4).fitted(-1.0, 1.0)
@@ -27,7 +27,7 @@ A, B, C, D = np.array([-1.2, 0.5]), np.array([1.0, 0.6]), np.array([-0.6, 0.2]),
 
 
 def system(kind, a=A, b=B, mu=MU, c=C, d=D):
-    plant = HammersteinARX(a, (b / np.linalg.norm(b),), (Nonlinearity(BASIS, mu * np.linalg.norm(b)),), (1,), 0.3)
+    plant = HammersteinTF(a, (b / np.linalg.norm(b),), (Nonlinearity(BASIS, mu * np.linalg.norm(b)),), (1,), 0.3)
     return replace(plant, c=c, d=None if kind == "armax" else d)
 
 
@@ -128,7 +128,7 @@ def test_without_a_noise_model_it_is_the_output_error_fit():
 
 
 def test_linear_models():
-    plant = HammersteinARX(A, (B,), (Nonlinearity(Linear(), [1.0]),), (1,), 0.3)
+    plant = HammersteinTF(A, (B,), (Nonlinearity(Linear(), [1.0]),), (1,), 0.3)
     for pose, model, orders in ((linear_armax, replace(plant, c=C), {"nc": 2}),
                                 (linear_bj, replace(plant, c=C, d=D), {"nc": 2, "nd": 1})):
         fit = optid.fit(record(model, (8000,)), pose, na=2, nb=2, nk=1, **orders)
@@ -139,7 +139,7 @@ def test_linear_models():
 @pytest.mark.slow
 def test_two_inputs_and_one_common_noise():
     functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
-    plant = HammersteinARX(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.1)
+    plant = HammersteinTF(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.1)
     model, rng = replace(plant, c=C), np.random.default_rng(0)
     u = rng.uniform(-1, 1, (5000, 2))
     y = model.simulate(u) + lfilter(np.r_[1, C], np.r_[1, A], 0.2 * rng.standard_normal(5000))[:, None]
@@ -171,7 +171,7 @@ def test_constraints_hold_and_the_optimum_is_that_of_a_penalty_free_search(kind)
         if np.any(np.diff(values) < 0) or c[0] < -0.5 or roots.radius(c) >= 1:
             continue
         a = model.a + size * rng.normal(size=2)
-        plant = HammersteinARX(a, model.b, (Nonlinearity(BASIS, mu),), (1,), model.offset + size * rng.normal())
+        plant = HammersteinTF(a, model.b, (Nonlinearity(BASIS, mu),), (1,), model.offset + size * rng.normal())
         other = replace(plant, c=c, d=model.d)
         assert np.nansum(other.innovations(data) ** 2) >= fit.solution.objective * (1 - 1e-7)
 
@@ -179,7 +179,7 @@ def test_constraints_hold_and_the_optimum_is_that_of_a_penalty_free_search(kind)
 def test_stability_of_a_constrained_armax_plant():
     model = system("armax", a=np.array([-1.85, 0.87]))
     data = record(model, (300,), noise=0.5)
-    fit = optid.fit(data, armax, constraints=[stability.stable(0.85)], **ORDERS["armax"][1])
+    fit = optid.fit(data, armax, constraints=[poles.stable(0.85)], **ORDERS["armax"][1])
     assert np.max(np.abs(fit.model.poles)) <= 0.85 + 1e-6
     assert fit.solution.status is Status.LOCAL and fit.prices[0].active
 
@@ -320,7 +320,7 @@ def test_results_by_name():
     ({"na": True}, StructureError, "na"),
     ({"nb": 0}, StructureError, "nb of input 'u'"),
     ({"starts": 0}, StructureError, "starts"),
-    ({"gauge": "none"}, StructureError, "gauge must be one of"),
+    ({"gauge": "none"}, StructureError, "gauge='none': use one of norm, gain, b0"),
     ({"na": 60, "nb": 60}, RankError, "rows|samples"),
 ])
 def test_structure_that_will_not_do(changes, error, words):
@@ -366,7 +366,7 @@ def test_noise_with_a_zero_on_the_unit_circle():
 
 def test_without_poles():
     u = np.random.default_rng(0).uniform(-1, 1, 2000)
-    plant = HammersteinARX([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3)
+    plant = HammersteinTF([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3)
     y = plant.simulate(u) + lfilter([1, -0.5], [1], 0.2 * np.random.default_rng(1).standard_normal(2000))
     for pose, orders in ((armax, {"nc": 1}), (bj, {"nc": 1, "nd": 0})):
         model = optid.fit(Data(u, y), pose, na=0, nb=2, nk=1, basis=BASIS, **orders).model

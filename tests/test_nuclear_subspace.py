@@ -12,8 +12,7 @@ from formulations.nuclear_subspace import certify, nuclear_programme
 from optid.backends import Answer, Settings, find
 from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
-from optid.identify.subspace.low_rank import held_out_fit, order_of, structure
-from optid.identify.subspace.observability import prepared
+from optid.identify.subspace.low_rank import held_out_fit, structure
 from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
 from optid.solving.solve import solve
@@ -74,7 +73,7 @@ def test_the_missing_outputs_are_estimated():
     gone[70, 1] = True
     measured = np.where(gone, np.nan, y)
     plan = Plan("subspace.nuclear", optid.Data(u=u, y=measured, dt=1.0), 2, 6, "linear", None, "projection")
-    structured = structure(plan, *prepared(plan))
+    structured = structure(plan)
     solution = solve(nuclear_programme(structured, structured.penalty(300.0)))
     estimated = solution.values["yhat"] * structured.scale + structured.centre
     assert np.max(np.abs(estimated - clean)[gone]) < 0.25 and np.std(clean[gone]) > 0.5
@@ -118,7 +117,7 @@ def test_every_back_end_ends_at_the_same_objective(form, missing):
     if missing:
         y[[7, 20], 0] = np.nan
     plan = Plan("subspace.nuclear", optid.Data(u=u, y=y, dt=1.0), 2, 4, "linear", None, form)
-    structured = structure(plan, *prepared(plan))
+    structured = structure(plan)
     own = solve(nuclear_programme(structured, structured.penalty(20.0)), "admm")
     assert own.status is Status.OPTIMAL and own.proof and own.gap < 1e-6
     for solver, accuracy in (("clarabel", 1e-8), ("scs", 1e-6)):
@@ -130,7 +129,7 @@ def test_every_back_end_ends_at_the_same_objective(form, missing):
 
 def programme(**arguments):
     plan = Plan("subspace.nuclear", data(count=50, noise=0.2), 2, 4, "linear", None, "projection")
-    structured = structure(plan, *prepared(plan))
+    structured = structure(plan)
     return structured, nuclear_programme(structured, structured.penalty(20.0), **arguments)
 
 
@@ -205,8 +204,10 @@ def test_contradicting_regions_are_named():
 
 
 def test_the_order_is_the_number_of_singular_values_that_count():
-    assert order_of(np.array([10.0, 5.0, 0.02, 0.009, 0.0]), 9) == 3
-    assert order_of(np.full(30, 1.0), 40) == 10 and order_of(np.full(30, 1.0), 4) == 4
+    one = structure(Plan("subspace.nuclear", data(count=50, noise=0.2), 2, 4, "linear", None, "projection"))
+    found = [replace(one, problem=replace(one.problem, rows=rows), size=1.0) for rows in (10, 40, 5)]
+    assert found[0].order(np.array([10.0, 5.0, 0.02, 0.009, 0.0])) == 3
+    assert found[1].order(np.full(30, 1.0)) == 10 and found[2].order(np.full(30, 1.0)) == 4
 
 
 def test_scales_and_offsets_of_the_channels_do_not_matter():

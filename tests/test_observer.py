@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from optid.bases import Linear, Polynomial, Triangular
+from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.innovations import innovation_form
-from optid.identify.subspace.instruments import simulate_clipped
-from optid.identify.subspace.observer import ObserverForm, observer_gain, observer_problem
+from optid.identify.noise import observer_gain
+from optid.identify.subspace.observability import simulate_clipped
+from optid.identify.subspace.realisation import ObserverForm, observer_problem
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])
@@ -25,8 +26,19 @@ def records_of(rng, lengths, holes=0):
 
 def expansion_of(records, feedback=True):
     bases = [Polynomial(2).fitted(-1, 1), Linear()]
-    families = [Polynomial(3).fitted(-1, 1), None] if feedback else []
-    return expand(records, bases, families, *NAMES)
+    return expand(data_of(records), bases, [Polynomial(3).fitted(-1, 1), None] if feedback else None)
+
+
+def data_of(records):
+    return Data([r[:, :2] for r in records], [r[:, 2:4] for r in records], inputs=NAMES[0], outputs=NAMES[1])
+
+
+def gram(step):
+    return step.problem.root.T @ step.problem.root
+
+
+def energy(step):
+    return step.problem.value(np.zeros(len(step.problem.target)))
 
 
 def simulated(form, record, z, x0=None):
@@ -36,7 +48,7 @@ def simulated(form, record, z, x0=None):
     bu, du, ez = np.zeros((n, x.p)), np.zeros((l, x.p)), np.zeros((n, x.q))
     start = 0
     for i, (p, b) in enumerate(form.blocks):
-        theta = z[form.block(i)].reshape((p, b), order="F")
+        theta = form.thetas(z)[i]
         if i < 2:
             bu[:, start : start + p] = theta[:, :n].T
             du[:, start : start + p] = theta[:, n:].T if b > n else 0.0
@@ -71,18 +83,19 @@ def columns(form, record, experiment):
 @pytest.mark.parametrize("gain", [False, True])
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("offset", [False, True])
-def test_step_is_least_squares_on_the_recursion(gain, feedback, offset):
+def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypatch):
+    monkeypatch.setattr("optid.identify.subspace.realisation.CHUNK", 20)
     records = records_of(np.random.default_rng(0), [60, 45])
     expansion = expansion_of(records, feedback)
-    form = ObserverForm(A, C, observer_gain(A, C) if gain else np.zeros((2, 2)), expansion, 2, (True, False), offset,
-                        np.array([1.0, 3.0]))
-    step = observer_problem(records, form, chunk=20)
+    form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
+                        (True, False), offset, np.array([1.0, 3.0]))
+    step = observer_problem(records, form)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])
-    np.testing.assert_allclose(step.problem.H, phi.T @ phi, atol=1e-9)
-    np.testing.assert_allclose(step.problem.g, phi.T @ y, atol=1e-9)
-    assert step.problem.c == pytest.approx(y @ y) and step.rows == len(y)
+    np.testing.assert_allclose(gram(step), phi.T @ phi, atol=1e-9)
+    np.testing.assert_allclose(step.problem.root.T @ step.problem.target, phi.T @ y, atol=1e-9)
+    assert energy(step) == pytest.approx(y @ y) and step.rows == len(y)
     best = np.linalg.lstsq(phi, y, rcond=None)[0]
     np.testing.assert_allclose(step.least_squares(), best, atol=1e-8)
     bu, du, ez, d, x0 = step.matrices(best)
@@ -93,21 +106,21 @@ def test_step_is_least_squares_on_the_recursion(gain, feedback, offset):
 @pytest.mark.parametrize("kind", ["noisy", "injected", "exact"])
 def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch, kind):
     records = records_of(np.random.default_rng(6), [900, 700], holes=0 if kind == "exact" else 4)
-    gain = observer_gain(A, C) if kind == "injected" else np.zeros((2, 2))
+    gain = observer_gain(A, C, 1.0) if kind == "injected" else np.zeros((2, 2))
     form = ObserverForm(A, C, gain, expansion_of(records, kind != "exact"), 2, (True, True), True, np.array([1.0, 3.0]))
     if kind == "exact":  # the Gram matrix would know half the digits of what remains
         z = np.random.default_rng(7).normal(size=form.size)
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
     step = observer_problem(records, form)
-    monkeypatch.setattr("optid.identify.subspace.observer.MANY", np.inf)
+    monkeypatch.setattr("optid.identify.subspace.realisation.MANY", np.inf)
     stacked = observer_problem(records, form)
-    scale = np.sqrt(np.outer(np.diag(stacked.problem.H), np.diag(stacked.problem.H)))
-    np.testing.assert_allclose(step.problem.H / scale, stacked.problem.H / scale, atol=1e-11)
+    scale = np.sqrt(np.outer(np.diag(gram(stacked)), np.diag(gram(stacked))))
+    np.testing.assert_allclose(gram(step) / scale, gram(stacked) / scale, atol=1e-11)
     np.testing.assert_allclose(step.least_squares(), stacked.least_squares(), atol=1e-10)
     assert step.problem.remainder == pytest.approx(stacked.problem.remainder, rel=1e-9)
-    assert (step.problem.remainder < 1e-24 * step.problem.c) == (kind == "exact")
-    assert step.rows == stacked.rows and step.problem.c == pytest.approx(stacked.problem.c)
+    assert (step.problem.remainder < 1e-24 * energy(step)) == (kind == "exact")
+    assert step.rows == stacked.rows and energy(step) == pytest.approx(energy(stacked))
 
 
 def test_missing_outputs_without_feedback_leave_the_state_alone():
@@ -118,7 +131,7 @@ def test_missing_outputs_without_feedback_leave_the_state_alone():
     step = observer_problem(records, form)
     phi, y = columns(form, records[0], 0)
     present = ~np.isnan(y)
-    np.testing.assert_allclose(step.problem.H, phi[present].T @ phi[present], atol=1e-9)
+    np.testing.assert_allclose(gram(step), phi[present].T @ phi[present], atol=1e-9)
     assert step.rows == 115
 
 
@@ -179,7 +192,7 @@ def test_feedback_functions_are_orthonormal_on_the_record_and_lose_what_is_linea
     record = np.hstack([rng.uniform(-1, 1, (500, 2)), y])
     for basis in (Polynomial(4), Triangular(6)):
         fitted = basis.fitted(float(y[:, 0].min()), float(y[:, 0].max()))
-        expansion = expand([record[:200], record[200:]], [Linear(), Linear()], [fitted, None], *NAMES)
+        expansion = expand(data_of([record[:200], record[200:]]), Linear(), [fitted, None])
         family = expansion.feedback[0]
         values = expansion(record)[:, list(expansion.zeta)]
         np.testing.assert_allclose(values.T @ np.column_stack([np.ones(500), y]), 0.0, atol=1e-8)
@@ -208,20 +221,6 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
         x = 0.3 * A @ x + 0.1 * bu @ eta[k] + ez @ expansion.feedback[0].values(y[None])[0]
     (wild,) = simulate_clipped(records, expansion, 2 * A, C, bu, du, 50 * ez, d)
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
-
-
-def test_gain_of_an_innovation_form():
-    rng = np.random.default_rng(7)
-    k, e = np.array([[0.5, 0.1], [-0.2, -0.4]]), rng.standard_normal((20000, 2)) * [1.0, 0.3]
-    gain, x, predicted = observer_gain(A, C), np.zeros(2), np.zeros(2)
-    errors = np.empty((20000, 2))
-    for t in range(20000):
-        y = C @ x + e[t]
-        errors[t] = y - C @ predicted
-        x, predicted = A @ x + k @ e[t], A @ predicted + gain @ errors[t]
-    found, noise = innovation_form(A, C, gain, [errors[:15000], errors[15000:]])
-    np.testing.assert_allclose(found, k, atol=0.05)
-    np.testing.assert_allclose(noise.innovation, np.diag([1.0, 0.09]), atol=0.02)
 
 
 def test_block_rows_fit_the_record():

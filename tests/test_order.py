@@ -16,13 +16,15 @@ from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order import order_test, rank_test, scan_lags
-from optid.identify.order.lags import weighted_problem
-from optid.identify.order.signals import block_rows_for, with_simulated_outputs
+from optid.identify.order.lags import residual_weights
 from optid.identify.order.states import state_criteria
+from optid.identify.order.study import block_rows_for, with_simulated_outputs
 from optid.plants import EXAMPLE1, TWO_MODES
 from optid.statistics import collect
 from optid.statistics.expansion import expand
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.hankel import hankel_statistics
+from optid.statistics.sums import windows_of
+from optid.structures import lifted_regression
 
 benchmark = scripts.benchmark("order")
 
@@ -43,8 +45,7 @@ def positions(statistics, alpha, m, d):
 
 
 def linear(data):
-    return expand([np.hstack([e.u, e.y]) for e in data.experiments], fitted_bases(data, Linear()), [], data.inputs,
-                  data.outputs)
+    return expand(data, Linear())
 
 
 def records(data):
@@ -150,7 +151,7 @@ def test_nonlinear_inputs_and_feedback():
 
 def test_simulated_outputs_follow_the_inputs_alone():
     data = record(3000, noise=0.5)
-    signals = expand(records(data), fitted_bases(data, Linear()), [Polynomial(3).fitted(-9, 9)], ("u",), ("y",))
+    signals = expand(data, Linear(), Polynomial(3).fitted(-9, 9))
     (extended,), wider = with_simulated_outputs(records(data), signals, 8)
     clean = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], data.u[:, 0])
     assert np.isnan(extended[:15, 2]).all() and wider.simulated
@@ -246,7 +247,8 @@ def test_lags_equal_dense_least_squares():
 def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     u = inputs(model, 400)
     data = Data(u, by_hand(model, u, noise=0.1 * np.random.default_rng(5).normal(size=(400, model.l))), dt=model.dt)
-    problem = weighted_problem(collect(data, model.layout))
+    statistics, places = collect(data, model.layout), lifted_regression.positions(model.layout)
+    problem = lifted_regression.lifted_problem(statistics, places, weights=residual_weights(statistics))
     n = model.memory
     columns = [-data.y[n - i : -i] for i in range(1, model.na + 1)]
     for c, f in enumerate(model.nonlinearities):
@@ -256,9 +258,8 @@ def test_the_regression_of_several_outputs_equals_dense_least_squares(model):
     theta = np.linalg.lstsq(phi, data.y[n:])[0]
     residual = data.y[n:] - phi @ theta
     free = np.linalg.solve(problem.root, problem.target)
-    linear = model.na * model.l + 1
-    past = np.vstack([theta[: model.na * model.l], theta[-1:]])
-    assert free[: linear * model.l].reshape(model.l, linear).T == pytest.approx(past, abs=1e-8)
+    linear = [*range(model.na * model.l), -1]
+    assert free[places][linear] == pytest.approx(theta[linear], abs=1e-8)
     assert problem.remainder == pytest.approx(np.sum(residual**2 / (1.0 if model.l == 1 else np.mean(residual**2, 0))))
 
 
@@ -318,13 +319,13 @@ def test_short_records_say_what_they_cannot():
 
 
 @pytest.mark.parametrize("arguments, error, words", [
-    ({"block_rows": 1}, StructureError, "block_rows=1"),
+    ({"block_rows": 1}, StructureError, "block_rows must be an integer of at least 2; got 1"),
     ({"block_rows": 4, "nx": 4}, StructureError, "show orders up to 3, not 4: use block_rows=5"),
-    ({"nx": 0}, StructureError, "nx=0"),
+    ({"nx": 0}, StructureError, "nx.* must be a positive integer; got 0"),
     ({"holdout": 1.0}, StructureError, "holdout"),
     ({"level": 0.0}, StructureError, "level=0.0"),
-    ({"na": -1}, StructureError, "na: a whole number from 0"),
-    ({"nb": 0}, StructureError, "nb: a whole number from 1"),
+    ({"na": -1}, StructureError, "na must be a nonnegative integer"),
+    ({"nb": 0}, StructureError, "nb must be a positive integer"),
     ({"feedback_basis": ["polynomial:2"] * 2}, StructureError, "2 feedback bases for 1 outputs"),
     ({"block_rows": 150}, RankError, "complete windows"),
     ({"block_rows": 400}, RankError, "Experiment 1 has 800 samples"),

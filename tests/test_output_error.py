@@ -16,7 +16,7 @@ from optid.identify.prediction_error import search
 from optid.identify.prediction_error.descent import descend
 from optid.identify.prediction_error.plant_starts import plant_starts
 from optid.identify.prediction_error.transfer_errors import TransferErrors
-from optid.models import HammersteinARX, Nonlinearity, roots
+from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.models.layout import Layout
 from optid.program.solution import Status
 from optid.statistics.sensitivities import simulate
@@ -59,7 +59,7 @@ def test_noise_free_systems_are_recovered(basis, a, b, nk):
 
 def test_linear_model_of_several_inputs_is_recovered():
     linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
-    true = HammersteinARX([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), (linear, linear), (0, 2), 0.2)
+    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), (linear, linear), (0, 2), 0.2)
     fit = optid.fit(record(true, noise=0.0), "oe.exact", na=2, nb=[2, 3], nk=[0, 2])
     assert distance(fit.model, true) < 1e-8
     assert fit.model.title == "Linear output-error model"
@@ -67,7 +67,7 @@ def test_linear_model_of_several_inputs_is_recovered():
 
 def test_hammerstein_model_of_several_inputs_is_recovered():
     functions = (nonlinearity(BASIS, 1), nonlinearity(Polynomial(3), 2))
-    true = HammersteinARX([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), functions, (0, 1), 0.2)
+    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), functions, (0, 1), 0.2)
     fit = optid.fit(record(true, noise=0.0), "hammerstein_oe.exact", na=2, nb=[2, 3], nk=[0, 1],
                     basis=[f.basis for f in functions])
     assert distance(fit.model, true) < 1e-7
@@ -306,7 +306,7 @@ def test_constraints_that_hold_anyway_cost_nothing():
 @pytest.mark.slow
 def test_the_opposite_gain_is_reached_by_turning_a_sign():
     linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
-    data = record(HammersteinARX([-0.8], ([1.0],), (linear,), (0,), 0.0), noise=0.5)
+    data = record(HammersteinTF([-0.8], ([1.0],), (linear,), (0,), 0.0), noise=0.5)
     fit = optid.fit(data, "hammerstein_oe.exact", na=1, nb=1, basis="triangular:2",
                     constraints=["monotone:increasing", "gain:high=-0.1"])
     assert fit.model.static_gain(0.3) <= -0.1 + 1e-6
@@ -359,7 +359,7 @@ def test_long_records_are_searched_in_part():
     ({"nb": [1, 2]}, StructureError, "2 entries for 1 inputs"),
     ({"nk": -1}, StructureError, "nk of input 'u' must be a nonnegative integer"),
     ({"gauge": "nrom"}, StructureError, "norm, gain, b0"),
-    ({"starts": 0}, StructureError, "starts .the number of starts. must be"),
+    ({"starts": 0}, StructureError, "starts must be a positive integer"),
     ({"na": 70}, RankError, "150 output samples for 14. unknowns"),
     ({"na": 200}, RankError, "150 samples, but the lags reach back 200"),
     ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "function . of the basis of input 'u' is never excited"),

@@ -22,7 +22,10 @@ def test_parameters_are_mutually_consistent():
 
 def test_without_friction_energy_is_conserved():
     states = FREE.states(np.zeros(2000), x0=[2.5, 0.0, 40.0], substeps=40)
-    assert np.ptp(FREE.energy(states)) < 1e-6 * FREE.energy(states)[0]
+    angle, rate, speed = states.T
+    kinetic = 0.5 * FREE.inertia * rate**2 + 0.5 * FREE.wheel_inertia * (speed + rate) ** 2
+    energy = FREE.weight * (1 - np.cos(angle)) + kinetic
+    assert np.ptp(energy) < 1e-6 * energy[0]
     assert np.ptp(states[:, 0]) > 4.9  # it swings from 2.5 to -2.5
 
 
@@ -142,7 +145,6 @@ def test_feedback_systems_against_the_recursion_written_out(system):
         y = system.c @ x + system.d @ f + v[k]
         np.testing.assert_allclose(data.y[k], y, rtol=1e-10, atol=1e-12)
         g = [-np.sin(y[0]), -y[1] * abs(y[1]) / (1 + y[1] ** 2)]
-        np.testing.assert_allclose(system.feedback(y[None])[0], g)
         x = system.a @ x + system.b @ f + system.e @ g + w[k]
 
 
@@ -184,7 +186,7 @@ def test_records_that_cannot_be_simulated(call, words):
     (lambda: plants.ReactionWheelPendulum(threshold=0), "threshold = 0"),
     (lambda: plants.ReactionWheelPendulum(coulomb=-1e-3), "coulomb = -0.001"),
     (lambda: plants.pendulum_input("sine", 9), "no excitation 'sine'"),
-    (lambda: plants.pendulum_input("chirp", 0), "n = 0"),
+    (lambda: plants.pendulum_input("chirp", 0), "n must be"),
     (lambda: plants.van_der_pol(np.zeros(3), method="rk45"), "Did you mean 'rk4'"),
     (lambda: plants.van_der_pol(np.zeros(3), process=np.nan), "process = nan"),
     (lambda: plants.TWO_MODES.record(np.zeros((3, 2)), colour=1.0), "colour = 1.0"),

@@ -403,7 +403,7 @@ def test_stream_checks_time_across_chunks(tmp_path):
 
 
 def test_bad_streams(tmp_path):
-    with pytest.raises(DataError, match="chunk = 0"):
+    with pytest.raises(DataError, match="chunk must be a positive integer"):
         open_stream(write(tmp_path, CSV), chunk=0)
     with pytest.raises(DataError, match="no file"):
         open_stream(tmp_path / "missing.npy")

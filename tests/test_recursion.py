@@ -249,7 +249,8 @@ def test_the_model_is_that_of_algorithm_3_1_on_the_whole_record(split, case):
 
 def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
     """Where the Gram matrix is exactly a Kronecker product, the whitened SVD is the least-squares optimum."""
-    from optid.identify.recursive.estimates import leading_pair
+    from optid.structures.lifted_regression import leading_pairs
+    from optid.structures.rank_one import RankOne
 
     rng = np.random.default_rng(0)
     theta, left, right = (rng.standard_normal(shape) for shape in ((5, 3), (5, 5), (3, 3)))
@@ -259,6 +260,7 @@ def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
         rest = (theta - np.outer(mu, b)).ravel(order="F")
         return rest @ gram @ rest
 
+    core = RankOne(np.linalg.cholesky(gram).T, np.zeros(15), 0.0, ((5, 3),)).core
     best = np.inf
     for _ in range(20):  # alternating least squares from random starts
         b = rng.standard_normal(3)
@@ -268,8 +270,8 @@ def test_the_whitened_split_is_the_nearest_pair_in_its_metric():
             lift = np.kron(np.eye(3), mu[:, None])
             b = np.linalg.solve(lift.T @ gram @ lift, lift.T @ gram @ theta.ravel(order="F"))
         best = min(best, loss(mu, b))
-    assert loss(*leading_pair(theta, gram, 3, 1)) == pytest.approx(best, rel=1e-8)
-    assert loss(*leading_pair(theta, None, 3, 1)) > 1.01 * best
+    assert loss(*leading_pairs(core, [theta])[0]) == pytest.approx(best, rel=1e-8)
+    assert loss(*leading_pairs(core, [theta], whitened=False)[0]) > 1.01 * best
 
 
 def test_trace_holds_the_estimates_of_the_shorter_records():

@@ -16,6 +16,7 @@ from optid.data.record import Data
 from optid.data.reduction import FAN_IN, _streamed
 from optid.errors import DataError, RankError
 from optid.statistics import accumulate, collect, factorise
+from optid.statistics.blocks import Frame
 from optid.statistics.joining import total_of_parts
 from optid.statistics.sums import Sums
 
@@ -75,7 +76,7 @@ def test_joining_changes_nothing_that_it_is_given(case):
         return merge(runs)
 
     stream.reduced = reduced
-    total_of_parts(stream, layout, partial(Sums, layout), chunk, 1)
+    total_of_parts(stream, layout, partial(Sums, Frame.of(layout)), chunk, 1)
     np.testing.assert_array_equal(*seen[0])
 
 

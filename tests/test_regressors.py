@@ -13,7 +13,8 @@ from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangul
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.statistics import Layout, accumulate, collect, factorise, residuals
-from optid.statistics.sums import Sums, make_block, stretches
+from optid.statistics.blocks import Frame, make_block, stretches
+from optid.statistics.sums import Sums
 
 BASES = (Triangular(1), Triangular(5), Triangular(3, outside="extrapolate"), Trigonometric(3), Polynomial(3),
          BSpline(4), PiecewiseConstant(3), Linear())
@@ -170,7 +171,7 @@ def test_short_record_starts_no_thread(monkeypatch):
     def refuse(*_):
         raise AssertionError("a pool was started")
 
-    monkeypatch.setattr("optid.data.workers.ThreadPoolExecutor", refuse)
+    monkeypatch.setattr("optid.data.reduction.ThreadPoolExecutor", refuse)
     data = random_data(np.random.default_rng(20), [3000], 1, 1)
     layout = layout_of(data, (Triangular(3),), 1, [1], [0])
     collect(data, layout, threads=2)
@@ -178,31 +179,19 @@ def test_short_record_starts_no_thread(monkeypatch):
         collect(data, layout, chunk=100, threads=2)
 
 
-@pytest.mark.parametrize("outside", ["clamp", "extrapolate"])
-def test_compiled_hats_equal_the_others(outside):
-    u = np.random.default_rng(21).uniform(-1.3, 1.3, 20_000)
-    u[::7], u[:8] = np.nan, (-1, 1, 0, 0.25, np.nextafter(1, 0), np.nextafter(-1, 0), 1e30, -50)
-    basis = Triangular(8, outside=outside).fitted(-1, 1)
-    first, weights = basis.local(u)
-    pieces = [basis.local(piece) for piece in np.split(u, 20)]
-    assert first.dtype == pieces[0][0].dtype
-    np.testing.assert_array_equal(first, np.concatenate([piece[0] for piece in pieces]))
-    np.testing.assert_allclose(weights, np.concatenate([piece[1] for piece in pieces]), rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize("bases", [(Triangular(4),), (Polynomial(3),), (Triangular(4), Trigonometric(2))])
 def test_both_ways_of_summing_agree(bases):
     data = random_data(np.random.default_rng(1), [300], len(bases), 2, share=0.05)
     layout = layout_of(data, bases, 2, [3] * len(bases), [1] * len(bases))
     (experiment,) = data.experiments
-    both = [Sums(layout, direct) for direct in (False, True)]
-    for sums in both:
-        sums._direct_is_cheaper = sums._is_small = lambda *_: False
+    both = [Sums(Frame.of(layout)), Sums(Frame.of(layout))]
+    for sums, direct in zip(both, (False, True)):
+        sums._direct_is_cheaper, sums._is_small = lambda *_, direct=direct: direct, lambda *_: False
         for u, y in stretches([(experiment.u, experiment.y)], layout.first_row, 100):
             sums.add(make_block(u, y, None, layout))
     grams = [sums.complete() for sums in both]
     np.testing.assert_allclose(grams[0], grams[1], atol=1e-11)
-    assert both[0]._removed.any() and not both[1]._removed.any()
+    assert both[0]._stretched and not both[1]._stretched
 
 
 def test_outlier_beside_a_missing_sample_costs_no_digits():

@@ -5,7 +5,7 @@ import pytest
 
 import optid
 from optid.bases import BSpline, Linear, Polynomial, Triangular
-from optid.models import HammersteinARX, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.layout import Layout
 from optid.statistics.sensitivities import expanded, instruments, linearise, simulate
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
@@ -60,7 +60,7 @@ def test_packing_is_undone():
 def test_simulation_equals_that_of_the_model(chunk):
     data, unknowns, point = case()
     layout = unknowns.layout
-    model = HammersteinARX(point.a, point.bs, tuple(Nonlinearity(b, mu) for b, mu in zip(layout.bases, point.mus)),
+    model = HammersteinTF(point.a, point.bs, tuple(Nonlinearity(b, mu) for b, mu in zip(layout.bases, point.mus)),
                            layout.nk, point.offset)
     for ours, theirs in zip(simulate(data, unknowns, point, chunk), model.simulate(data, x0=list(point.x0))):
         assert np.max(np.abs(ours - theirs[:, 0])) < 1e-12

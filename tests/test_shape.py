@@ -10,7 +10,7 @@ import optid
 from formulations.constraints import shape
 from optid.bases import BSpline, Polynomial, Triangular, Trigonometric
 from optid.errors import StructureError
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 
 GRID = np.linspace(-1, 1, 401)
 INNER = np.linspace(-0.999, 0.999, 401)
@@ -96,7 +96,7 @@ def test_the_relaxed_theta_obeys_and_bounds_the_exact_optimum(name):
     relaxed = optid.fit(data, "hammerstein_arx.overparametrised", na=2, nb=2, basis=BASIS, constraints=[rule])
     values = relaxed.values
     total = values["Theta"].sum(axis=1)  # of a relaxation only the static characteristic has a meaning of its own
-    stand_in = HammersteinARX(values["a"], ([1.0],), (type(nonlinearity(BASIS))(BASIS, total),), (0,), values["offset"])
+    stand_in = HammersteinTF(values["a"], ([1.0],), (type(nonlinearity(BASIS))(BASIS, total),), (0,), values["offset"])
     if name == "concave":
         assert np.max(np.diff(shaped(stand_in, GRID), 2)) < 1e-8
     else:
@@ -177,7 +177,7 @@ def test_the_sign_rule_of_the_gauge_rests_where_a_constraint_fixes_a_sign():
 
 def two_channels():
     functions = (nonlinearity(Triangular(5), 0, (-1, 1)), nonlinearity(Polynomial(3), 1, (-1, 1)))
-    return HammersteinARX([-0.9, 0.2], ([1.0, 0.4], [-0.6, 0.3]), functions, (0, 1), 0.2, inputs=("valve", "pump"))
+    return HammersteinTF([-0.9, 0.2], ([1.0, 0.4], [-0.6, 0.3]), functions, (0, 1), 0.2, inputs=("valve", "pump"))
 
 
 def named_record():
@@ -209,7 +209,7 @@ def test_two_channels_share_their_dynamics():
 @pytest.mark.parametrize("build, words", [
     (lambda: shape.monotone("sideways"), "'increasing' or 'decreasing'"),
     (lambda: shape.sign("b", "up"), "'positive' or 'negative'"),
-    (lambda: shape.slope(2, 1), "low 2 lies above high 1"),
+    (lambda: shape.slope(2, 1), "low <= high; got 2, 1"),
     (lambda: shape.slope(), "low= and/or high="),
     (lambda: shape.gain(), "needs a value"),
     (lambda: shape.dead_zone(1, 1), "low < high"),

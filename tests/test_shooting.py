@@ -11,7 +11,7 @@ from formulations.constraints import shape
 from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
-from optid.models import HammersteinARX, HammersteinTF, Nonlinearity
+from optid.models import HammersteinTF, Nonlinearity
 from optid.program.solution import Status
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1, "basis": BASIS}
@@ -59,7 +59,7 @@ def test_gaps_and_several_experiments():
 
 def test_two_inputs_without_a_constant_and_the_gauges():
     functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
-    plant = HammersteinARX(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.0)
+    plant = HammersteinTF(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.0)
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, (400, 2))
     data = Data(u, plant.simulate(u) + 0.1 * rng.standard_normal((400, 1)))

@@ -26,7 +26,7 @@ def test_every_signal_has_its_length_and_stays_in_range(name, n, low, width):
 
 
 @pytest.mark.parametrize("name", MAKERS)
-@pytest.mark.parametrize(("arguments", "part"), [((0, -1, 1), "n = 0"), ((9.5, -1, 1), "n = 9.5"),
+@pytest.mark.parametrize(("arguments", "part"), [((0, -1, 1), "n must.*got 0"), ((9.5, -1, 1), "n must.*got 9.5"),
                                                  ((50, 1, 1), "low must be below high"),
                                                  ((50, 0, np.inf), "low must be below high")])
 def test_every_signal_refuses_bad_length_and_range(name, arguments, part):
@@ -142,7 +142,7 @@ def test_steps_go_up_and_down():
         (lambda: signals.multisine(100, lines=[1, 2], spectrum=[1.0]), "2 amplitudes"),
         (lambda: signals.multisine(100, lines=[1, 2], spectrum=[1.0, -1.0]), "not negative"),
         (lambda: signals.multisine(100, phases="zero"), "'zero'.*'schroeder' and 'random'"),
-        (lambda: signals.prbs(100, hold=0), "hold = 0"),
+        (lambda: signals.prbs(100, hold=0), "hold must.*got 0"),
         (lambda: signals.prbs(100, bits=40), "bits = 40"),
         (lambda: signals.chirp(100, f0=0.1, f1=0.6), "0.6 is not between 0 and half the sampling rate, 0.5"),
         (lambda: signals.chirp(100, f0=0.0, f1=0.4, method="logarithmic"), "chirp from 0.0 to 0.4"),

@@ -10,9 +10,9 @@ from systems import nonlinearity
 
 import optid
 from formulations.constraints import shape
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from optid.errors import StructureError
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.models.roots import pulled
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -122,7 +122,7 @@ def unstable_record(na):
     poles = {1: [1.01], 2: [1.01 * np.exp(0.4j), 1.01 * np.exp(-0.4j)],
              3: [1.005 * np.exp(0.4j), 1.005 * np.exp(-0.4j), 0.5],
              4: [1.005 * np.exp(0.4j), 1.005 * np.exp(-0.4j), 0.5, -0.7]}[na]
-    model = HammersteinARX(np.real(np.poly(poles))[1:], ([1.0, 0.4],), (nonlinearity(BASIS, 0, (-1, 1)),), (0,), 0.0)
+    model = HammersteinTF(np.real(np.poly(poles))[1:], ([1.0, 0.4],), (nonlinearity(BASIS, 0, (-1, 1)),), (0,), 0.0)
     return record(model=model, count=120, noise=0.3, seed=2)
 
 

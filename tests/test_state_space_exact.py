@@ -11,8 +11,8 @@ from state_systems import linear as linear_system
 
 import optid
 from formulations.constraints import shape
+from formulations.constraints.poles import stable
 from formulations.constraints.rule import Rule
-from formulations.constraints.stability import stable
 from formulations.state_space import hammerstein_ss as exact
 from formulations.state_space import ss as linear
 from optid.bases import BSpline, Linear, Polynomial, Triangular, UserFunctions
@@ -36,9 +36,8 @@ def problem(criterion, missing, fed, experiments=2, n=3, seed=0, basis=None, lat
         y[rng.uniform(size=y.shape) < missing] = np.nan
     data = Data(us, ys) if experiments > 1 else Data(us[0], ys[0])
     bases = [Triangular(4).fitted(-4, 4), Linear()]
-    feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else []
-    records = [np.hstack([e.u, e.y]) for e in data.experiments]
-    expansion = expand(records, bases, feedback, data.inputs, data.outputs)
+    feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else None
+    expansion = expand(data, bases, feedback)
     unknowns = StateUnknowns(n, expansion, experiments, (True, False), criterion, True, latent, linear_output)
     criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
     return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
@@ -148,7 +147,7 @@ def test_scipy_finds_no_better_point(criterion):
 
 
 def _expansion(data):
-    return expand([np.hstack([e.u, e.y]) for e in data.experiments], [Linear()] * data.m, [], data.inputs, data.outputs)
+    return expand(data, Linear())
 
 
 def test_linear_system_without_noise_with_missing_samples_and_two_experiments():

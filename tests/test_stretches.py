@@ -25,13 +25,13 @@ def test_stretches_of_several_experiments():
     us[1][11, 1] = np.nan
     ys[1][3] = np.nan
     data = optid.Data(us, ys, dt=0.5, input_units=("V", "A")).scale()
-    cut, places = between_gaps(data, 5)
-    assert places == [(0, slice(1, 9)), (0, slice(16, 30)), (1, slice(0, 11))]
+    cut, places = between_gaps(data, 5), [(0, slice(1, 9)), (0, slice(16, 30)), (1, slice(0, 11))]
+    assert cut.n_experiments == 3
     for e, (i, part) in zip(cut.experiments, places):
         assert np.array_equal(e.u, data.u[i][part]) and np.array_equal(e.y, data.y[i][part], equal_nan=True)
         assert e.start == data.experiments[i].start + part.start * 0.5
     assert cut.transform == data.transform and cut.input_units == ("V", "A")
-    assert between_gaps(data, 11)[1] == [(0, slice(16, 30))]  # ten outputs in the last stretch
+    assert [e.n_samples for e in between_gaps(data, 11).experiments] == [14]  # ten outputs in the last stretch
     with pytest.raises(DataError, match="no stretch of 15 samples"):
         between_gaps(data, 15)
     with pytest.warns(DataWarning, match=r"'u1' \(3 samples\), 'u2' \(2 samples\).*33 of 42 samples.*3 stretches.*; 1 "

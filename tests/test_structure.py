@@ -15,9 +15,15 @@ from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation import validate
-from optid.identify.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
 from optid.identify.validation.structure import FTest, structure_test
-from optid.identify.validation.structure_design import Design
+from optid.identify.validation.structure_design import (
+    Design,
+    Family,
+    convolved,
+    delay_of,
+    orthonormal_filters,
+    poles_of,
+)
 
 benchmark = scripts.benchmark("structure")
 

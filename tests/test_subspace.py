@@ -7,7 +7,7 @@ import pytest
 
 import optid
 from formulations.constraints import shape
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
 from optid.bases import UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
@@ -273,9 +273,9 @@ def tiny_output(u, y):
 
 @pytest.mark.parametrize("data, arguments, error, text", [
     (example1(600), {"nx": 3, "block_rows": 3}, StructureError, "3 block rows for order 3: more block rows"),
-    (example1(600), {"nx": 0}, StructureError, "nx=0"),
-    (example1(600), {"nx": "many"}, StructureError, "nx='many'"),
-    (example1(600), {"block_rows": 1}, StructureError, "block_rows=1"),
+    (example1(600), {"nx": 0}, StructureError, "nx.* must be a positive integer; got 0"),
+    (example1(600), {"nx": "many"}, StructureError, "must be a positive integer; got 'many'"),
+    (example1(600), {"block_rows": 1}, StructureError, "block_rows must be an integer of at least 2; got 1"),
     (example1(60), {"nx": 3, "block_rows": 12}, RankError, "complete windows"),
     (example1(20), {"nx": 3, "block_rows": 12}, RankError, "experiment 1 has 20 samples"),
     (broken(copy_input), {"nx": 3}, RankError, "input 'u2' is a sum of multiples of u1"),
@@ -285,7 +285,7 @@ def tiny_output(u, y):
     (example1(600), {"nx": 3, "feedback_basis": ["polynomial:1", None]}, RankError, "linear in the outputs"),
     (example1(600), {"nx": 3, "feedback_basis": [3, None]}, StructureError, "feedback basis of output 'y1'"),
     (example1(600), {"nx": 3, "noise": "pink"}, StructureError, "noise='pink'"),
-    (example1(600), {"nx": 3, "iterations": -1}, StructureError, "iterations=-1"),
+    (example1(600), {"nx": 3, "iterations": -1}, StructureError, "iterations must be a nonnegative integer"),
     (example1(600), {"nx": 3, "observer": "luenberger"}, StructureError, "observer="),
     (example1(600), {"nx": 3, "weighting": "n4"}, StructureError, "weighting="),
     (example1(600), {"nx": 3, "feedthrough": [True]}, StructureError, "feedthrough="),

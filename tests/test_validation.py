@@ -194,7 +194,7 @@ def test_notes_are_warnings():
         found = validate(model, Data(u, data.y, dt=0.1))
     assert not found.simulation and not found.simulated and "No simulation" in str(found)
     u[5] = 3.0
-    with pytest.warns(DataWarning, match=r"0.12 % of input 'u' lies outside \[-0.7, 1.3\].*'clamp'"):
+    with pytest.warns(DataWarning, match=r"0.12 % of input 'u' lies outside the interval \[-0.7, 1.3\].*'clamp'"):
         found = validate(model, Data(u, data.y, dt=0.1))
     assert found.outside["u"] == pytest.approx(1 / 800)
     with pytest.warns(DataWarning, match="unstable: its largest pole has radius 1.1"):

@@ -10,9 +10,10 @@ import time
 import numpy as np
 
 from optid import plants
-from optid.identify.design.expansion import expansion_of
-from optid.statistics.hankel import hankel_statistics, windows_of
+from optid.statistics.expansion import expand
+from optid.statistics.hankel import hankel_statistics
 from optid.statistics.rq import rq
+from optid.statistics.sums import windows_of
 
 ROWS = 6
 
@@ -34,13 +35,14 @@ def table(lengths: tuple[int, ...], runs: int) -> dict[str, float]:
         for run in range(runs + 1):  # the first warms up
             u = np.random.default_rng(run).uniform(-2, 2, n)
             data = plants.van_der_pol(u, run, process=0.005, measurement=0.02)
-            expand, record = expansion_of(data, "polynomial:4", "polynomial:4"), np.hstack([data.u, data.y])
+            expansion, record = expand(data, "polynomial:4", "polynomial:4"), np.hstack([data.u, data.y])
             start = time.process_time()
-            at = (moments := hankel_statistics([record], 2 * ROWS, expand, centre="mean")).at
-            z = np.r_[0, at(expand.eta), at(expand.zeta, past), at(expand.y, past)]
-            phi, y = np.r_[0, at(expand.eta, future), at(expand.zeta, future[:-1])], at(expand.y, future)
+            at = (moments := hankel_statistics([record], 2 * ROWS, expansion, centre="mean")).at
+            z = np.r_[0, at(expansion.eta), at(expansion.zeta, past), at(expansion.y, past)]
+            phi = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])]
+            y = at(expansion.y, future)
             fast, middle = rq(moments, z, phi, y).singular_values, time.process_time()
-            windows = windows_of(expand(record) - moments.centre, 2 * ROWS).reshape(n - 2 * ROWS + 1, -1)
+            windows = windows_of(expansion(record) - moments.centre, 2 * ROWS).reshape(n - 2 * ROWS + 1, -1)
             slow = explicit(np.insert(windows, 0, 1.0, axis=1).T, z, phi, y)
             times += np.array([time.process_time() - middle, middle - start]) * (run > 0)
         found[f"ratio, N = {n}"] = ratio = float(times[0] / times[1])

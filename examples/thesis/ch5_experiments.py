@@ -12,8 +12,9 @@ from common import feedback_error
 
 import optid
 from optid import plants
-from optid.identify.design.expansion import expanded_condition, expansion_of
+from optid.identify.design.excitation import expanded_condition
 from optid.identify.design.rules import check_lines
+from optid.statistics.expansion import expand
 
 REFERENCES = {"1 sinusoid": ("0.6/6.4", "0.7/9.5"), "2 chirp": ("6.8/3.5", "0.7/2.5"),
               "3 noise": ("5.6/5.1", "2.8/3.2"), "3 levels": ("8.6/5.7", "3.8/3.4")}
@@ -36,7 +37,7 @@ def main() -> dict[str, float]:
     found = {}
     for name, data in records.items():
         train, test = data.split(4000)
-        expansion = expansion_of(train, "polynomial:4", "polynomial:4")
+        expansion = expand(train, "polynomial:4", "polynomial:4")
         rule = check_lines("command", [train.u[:, 0]], expansion.inputs[0], 10)
         found[f"{name} condition"] = condition = expanded_condition(train, expansion, 10)
         line = f"{name:<28}"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from common import panels, run, save, styled
 
-from optid.bases import Linear, fitted_bases
+from optid.bases import Linear
 from optid.identify.order import RankTest, order_test
 from optid.plants import NOISE_CASES, TWO_MODES
 from optid.statistics.expansion import expand
@@ -21,8 +21,7 @@ REFERENCE = dict.fromkeys(NOISE_CASES, ("0.82-0.93", "0.97-1.00")) | {"determini
 def tested(case: str, n: int, seed: int) -> RankTest:
     u, (w, v) = np.random.default_rng(seed).normal(size=(n, 2)), NOISE_CASES[case]
     data = TWO_MODES.record(u, seed + 1000, process=w, measurement=v)
-    signals = expand([], fitted_bases(data, Linear()), [], data.inputs, data.outputs)
-    return order_test([np.hstack([data.u, data.y])], signals, ROWS)
+    return order_test([np.hstack([data.u, data.y])], expand(data, Linear()), ROWS)
 
 
 @styled

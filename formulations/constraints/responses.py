@@ -10,7 +10,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.constraints.rule import Rule
+from formulations.constraints.rule import Rule, label, sign_of
+from formulations.constraints.shape import slopes_at
 from optid.errors import StructureError
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -35,11 +36,8 @@ def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float
     Raises:
         StructureError: unknown sign, or a horizon below one.
     """
-
-    def rows(basis: Any) -> np.ndarray:
-        return basis.slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))[0]
-
-    return _response("impulse_response", sign, horizon, channel, output, rows, summed=False)
+    return _response("impulse_response", sign, horizon, channel, output, lambda basis: slopes_at(basis, at)[0],
+                     summed=False)
 
 
 def step_response(sign: str = "positive", horizon: float = HORIZON, low: float | None = None,
@@ -47,15 +45,12 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
     """The response to a step of the input from ``low`` up to ``high`` has one sign at every sample: no undershoot.
 
     Args:
-        sign: "positive" or "negative".
-        horizon: samples over which it is imposed.
         low: where the step starts; default the lower end of the interval.
         high: where it ends; default the upper end.
-        channel: name of the input, where there are several.
-        output: name of the output, where there are several.
-
-    Raises:
-        StructureError: unknown sign, or a horizon below one.
+        sign: as in `impulse_response`, as are the errors raised.
+        horizon: as there.
+        channel: as there.
+        output: as there.
     """
 
     def rows(basis: Any) -> np.ndarray:
@@ -135,11 +130,9 @@ def markov_rows(view: View, channel: str | None, output: str | None, count: int)
 
 def _response(word: str, sign: str, horizon: float, channel: str | None, output: str | None, rows: Any, *,
               summed: bool) -> Rule:
-    if sign not in ("positive", "negative"):
-        raise StructureError(f"the sign is 'positive' or 'negative'; got {sign!r}")
+    factor = sign_of("sign", sign, "positive", "negative")
     if horizon < 1:
         raise StructureError(f"the horizon is at least one sample; got {horizon!r}")
-    factor = 1.0 if sign == "positive" else -1.0
 
     def build(view: View) -> Any:
         _needs_realisation(view, word)
@@ -150,8 +143,7 @@ def _response(word: str, sign: str, horizon: float, channel: str | None, output:
         weights = weights[sizes > 1e-12 * np.max(sizes, initial=0.0)]
         return factor * (weights @ view[view.key("Theta", one)].T @ rows(view.bases[one])) >= 0
 
-    label = [name for name in (channel, output) if name is not None]
-    return Rule(f"{word}:{sign}" + (f"[{','.join(label)}]" if label else ""), build)
+    return Rule(label(f"{word}:{sign}", channel, output), build)
 
 
 def _needs_realisation(view: View, word: str) -> None:

@@ -21,8 +21,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.constraints.rule import Rule
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import stable
+from formulations.constraints.rule import Rule, check_bounds, label, sign_of
 from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.program.limits import Limit
@@ -32,7 +32,7 @@ __all__ = ["coefficients", "concave", "convex", "dead_zone", "even", "fixed", "g
            "shared", "sign", "slope", "stable", "through", "value_range"]
 
 RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
-SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic
+SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; imposed with every rule about it
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
@@ -47,7 +47,7 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
     Raises:
         StructureError: unknown direction or channel.
     """
-    sign = _sign(direction, "increasing", "decreasing")
+    sign = sign_of("direction", direction, "increasing", "decreasing")
     return _cone("monotone", direction, channel, lambda basis: sign * basis.increments())
 
 
@@ -118,7 +118,10 @@ def value_range(low: float | None = None, high: float | None = None, channel: st
 
     Exact for `Triangular`, on a dense grid for the other bases.
     """
-    return _static("range", low, high, channel, output, _everywhere, offset=True)
+    def rows(basis: Any) -> np.ndarray:
+        return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
+
+    return _static("range", low, high, channel, output, rows, offset=True)
 
 
 def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None,
@@ -137,14 +140,7 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
     us, ys = np.atleast_1d(np.asarray(u, dtype=float)), np.atleast_1d(np.asarray(y, dtype=float))
     if us.shape != ys.shape:
         raise StructureError(f"through needs as many outputs as inputs; got {us.size} and {ys.size}")
-
-    def build(view: View) -> Any:
-        basis, theta, size = view.basis(channel), view.static(channel, output), view.static_scale
-        curve = basis.values(us) @ theta + view.static_offset(output)
-        points = Limit(curve == cp.multiply(ys, size), size, None, step=_range_of(basis, theta, size), words=RANGE)
-        return [points, *_settles(view)]
-
-    return Rule(_label("through", channel, output), build)
+    return _static("through", ys, ys, channel, output, lambda basis: basis.values(us), offset=True)
 
 
 def gain(value: float | None = None, low: float | None = None, high: float | None = None, at: float | None = None,
@@ -164,13 +160,9 @@ def gain(value: float | None = None, low: float | None = None, high: float | Non
     """
     if value is None and low is None and high is None:
         raise StructureError("gain needs a value, or low= and/or high=")
-
-    def rows(basis: Any) -> np.ndarray:
-        return basis.slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))
-
     if value is not None:
         low = high = value
-    return _static("gain", low, high, channel, output, rows, offset=False)
+    return _static("gain", low, high, channel, output, lambda basis: slopes_at(basis, at), offset=False)
 
 
 def coefficients(name: str, low: float | None = None, high: float | None = None, index: int | None = None) -> Rule:
@@ -185,8 +177,7 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
     Raises:
         StructureError: no bound, or ``b``/``mu`` in the gauge "norm", where their scale is not a fact of the plant.
     """
-    if low is None and high is None:
-        raise StructureError("coefficients needs low= and/or high=")
+    check_bounds("coefficients", low, high)
 
     def build(view: View) -> Any:
         if view.gauge == "norm" and name not in ("a", "offset"):
@@ -196,7 +187,7 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
         return ([Limit(variable >= low, bound="low")] if low is not None else []) + (
             [Limit(variable <= high, bound="high")] if high is not None else [])
 
-    return Rule(_label(f"coefficients:{name}", None), build)
+    return Rule(f"coefficients:{name}", build)
 
 
 def fixed(name: str, value: Any) -> Rule:
@@ -215,13 +206,13 @@ def fixed(name: str, value: Any) -> Rule:
         word, _, channel = name.partition("[")
         product = "Theta[" + channel if channel else "Theta"
         scaled = product in view or "mu" + name[len(word):] in view  # f and b are known up to a factor then
+        if (not scaled or name in view) and known.shape != view[name].shape:
+            raise StructureError(f"{name!r} has shape {view[name].shape}, the known value has {known.shape}")
         if word not in ("mu", "b") or not scaled:
-            _check_shape(name, known, view[name].shape)
             return view[name] == known
         direction = np.ravel(known, order="F") / np.linalg.norm(known)
         rest = _independent(np.eye(direction.size) - np.outer(direction, direction))
         if name in view:
-            _check_shape(name, known, view[name].shape)
             return rest @ (view[name] if view[name].ndim == 1 else cp.vec(view[name], order="F")) == 0
         return rest @ (view[product] if word == "mu" else view[product].T) == 0
 
@@ -240,77 +231,62 @@ def shared(name: str, first: str, second: str) -> Rule:
 
 def sign(name: str = "b", direction: str = "positive") -> Rule:
     """All entries of a named variable have one sign; for ``b`` or ``mu`` this also fixes the sign of the other."""
-    factor = _sign(direction, "positive", "negative")
+    factor = sign_of("direction", direction, "positive", "negative")
     return Rule(f"sign:{name}:{direction}", lambda view: factor * view[name] >= 0)
 
 
-def _sign(word: str, positive: str, negative: str) -> float:
-    if word not in (positive, negative):
-        raise StructureError(f"the direction is {positive!r} or {negative!r}; got {word!r}")
-    return 1.0 if word == positive else -1.0
+def slopes_at(basis: Any, at: float | None) -> np.ndarray:
+    """Return the slopes (1, P) of the functions at an operating point, None for the middle of the interval."""
+    return basis.slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))
 
 
-def _label(word: str, channel: str | None, output: str | None = None) -> str:
-    named = [name for name in (channel, output) if name is not None]
-    return f"{word}[{','.join(named)}]" if named else word
-
-
-def _every(view: View, channel: str | None, build: Callable[[str], Any]) -> list[Any]:
-    """Build for one input, or for every input where none is named."""
-    parts = [build(c) for c in ([channel] if channel is not None else view.channels)]
-    return [member for part in parts for member in (part if isinstance(part, list) else [part])]
+def _inputs(view: View, channel: str | None) -> Sequence[str]:
+    return view.channels if channel is None else [channel]
 
 
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
           ) -> Rule:
     """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
 
-    def build(view: View, one: str) -> Any:
-        basis = view.basis(one)
-        matrix = rows(basis)
-        return [Limit(matrix @ curve >= 0, bound=one, step=_range_of(basis, curve) if heights else None,
-                      words=RANGE if heights else "") for curve in view.curves(one)]
+    def build(view: View) -> Any:
+        return [Limit(rows(view.basis(one)) @ curve >= 0, bound=one,
+                      step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
+                for one in _inputs(view, channel) for curve in view.curves(one)]
 
-    return Rule(_label(f"{word}:{direction}" if direction else word, channel),
-                lambda view: _every(view, channel, lambda one: build(view, one)))
+    return Rule(label(f"{word}:{direction}" if direction else word, channel), build)
 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
-    def build(view: View, one: str) -> Any:
-        basis, coefficients = view.basis(one), view.function(one)
+    def limit(basis: Any, coefficients: Any) -> Limit:
         whole = rows(basis)
         matrix = _independent(whole)
         return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(basis, coefficients),
                      words=RANGE)
 
-    return Rule(_label(word, channel), lambda view: _every(view, channel, lambda one: build(view, one)))
+    return Rule(label(word, channel),
+                lambda view: [limit(view.basis(one), view.function(one)) for one in _inputs(view, channel)])
 
 
-def _static(word: str, low: float | None, high: float | None, channel: str | None, output: str | None,
+def _static(word: str, low: Any, high: Any, channel: str | None, output: str | None,
             rows: Callable[[Any], np.ndarray], *, offset: bool) -> Rule:
-    if low is None and high is None:
-        raise StructureError(f"{word} needs low= and/or high=")
-    if low is not None and high is not None and low > high:
-        raise StructureError(f"{word}: low {low:g} lies above high {high:g}")
+    """Bounds on rows of the static characteristic; arrays give every row its own."""
+    check_bounds(word, low, high)
 
     def build(view: View) -> Any:
         basis, theta, size = view.basis(channel), view.static(channel, output), view.static_scale
         curve = rows(basis) @ theta
         if offset:
             curve = curve + view.static_offset(output)
+        settles = [Limit(size >= SETTLES, bound="settles")] if "a" in view else []
         meaning: dict[str, Any] = {"step": _range_of(basis, theta, size, 0 if offset else 1),
                                    "words": RANGE if offset else f"{RANGE} over the width of its interval"}
-        if low == high:
-            return [Limit(curve - low * size == 0, size, "value", **meaning), *_settles(view)]
+        if np.all(low == high):
+            equal = curve - cp.multiply(low, size) == 0
+            return [Limit(equal, size, None if np.ndim(low) else "value", **meaning), *settles]
         return ([Limit(curve - low * size >= 0, size, "low", **meaning)] if low is not None else []) + (
-            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + _settles(view)
+            [Limit(curve - high * size <= 0, size, "high", **meaning)] if high is not None else []) + settles
 
-    return Rule(_label(word, channel), build)
-
-
-def _settles(view: View) -> list[Any]:
-    """Return the constraint ``1 + sum(a) > 0``, without which there is no static characteristic."""
-    return [Limit(view.static_scale >= SETTLES, bound="settles")] if "a" in view else []
+    return Rule(label(word, channel, output), build)
 
 
 def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) -> Callable[[], float]:
@@ -324,11 +300,6 @@ def _range_of(basis: Any, coefficients: Any, size: Any = 1.0, power: int = 0) ->
         return 0.01 * float(np.ptp(curve)) / abs(scale) / (high - low) ** power
 
     return step
-
-
-def _everywhere(basis: Any) -> np.ndarray:
-    """Values of f at the nodes of a piecewise linear basis, which are enough, or on a dense grid."""
-    return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
@@ -361,8 +332,3 @@ def _flat(basis: Any, low: float, high: float) -> np.ndarray:
         raise StructureError(f"the zone lies outside the interval [{lo:g}, {hi:g}] of the input")
     points = np.linspace(low, high, max(64, 8 * basis.size))
     return basis.values(points) - basis.values(np.array([low]))
-
-
-def _check_shape(name: str, value: np.ndarray, shape: tuple[int, ...]) -> None:
-    if value.shape != shape:
-        raise StructureError(f"{name!r} has shape {shape}, the known value has {value.shape}")

@@ -12,7 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
 from optid.program.program import Program
-from optid.program.solution import Status
+from optid.program.solution import Status, tolerance
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
 
 RELAXATION = 1.7
@@ -31,13 +31,12 @@ def run(program: Program, settings: Settings) -> Answer:
     if not isinstance(form, NuclearNormStructure):
         return Answer(Status.FAILED, "the programme carries no nuclear-norm structure")
     weight = float(np.asarray(program.parameters[form.weight].value))
-    # half of what the judgement allows at this accuracy
-    found = minimise(form.problem, weight, tolerance=0.5 * max(100.0 * settings.accuracy, 1e-7),
-                     limit=int(dict(settings.options).get("limit", 20_000)))
+    allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
+    found = minimise(form.problem, weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     values = {"yhat": found.v} | ({"T": found.theta} if form.problem.parameters else {})
     misfit = (found.v - form.problem.data)[form.problem.known]
     duals = {"structure": -np.ravel(found.multipliers, order="F"), "residual": -2.0 * weight * misfit}
-    if found.converged:
+    if found.gap <= allowed:
         return Answer(Status.LOCAL, "duality gap closed", values, duals, found.iterations)
     return Answer(Status.LIMIT, f"iteration limit at a relative gap of {found.gap:.1e}", values, duals,
                   found.iterations)
@@ -54,7 +53,6 @@ class Minimum:
         value: objective at (v, theta).
         bound: value of the dual at the multipliers.
         iterations: number of them.
-        converged: whether the gap is within the tolerance.
     """
 
     v: Array
@@ -63,7 +61,6 @@ class Minimum:
     value: float
     bound: float
     iterations: int
-    converged: bool
 
     @property
     def gap(self) -> float:
@@ -71,22 +68,19 @@ class Minimum:
         return (self.value - self.bound) / max(abs(self.value), np.finfo(float).tiny)
 
 
-def minimise(problem: NuclearProblem, weight: float, *, tolerance: float = 1e-7, limit: int = 20_000,
-             start: Minimum | None = None) -> Minimum:
+def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: int = 20_000) -> Minimum:
     """Minimise the objective for one weight.
 
     Args:
         problem: the numbers.
         weight: of the misfit, positive.
-        tolerance: relative duality gap at which to stop.
+        gap: relative duality gap at which to stop.
         limit: number of iterations at most.
-        start: the minimum for a neighbouring weight.
     """
-    v, theta = (problem.data, problem.explained(problem.hankel(problem.data))) if start is None else (
-        start.v, start.theta)
+    v, theta = problem.data, problem.explained(problem.hankel(problem.data))
     reached = problem.matrix(v, theta)
     step = problem.shape[0] / max(float(np.linalg.norm(reached)) * np.sqrt(problem.shape[0]), 1e-300)
-    scaled = np.zeros(problem.shape) if start is None else start.multipliers / step
+    scaled = np.zeros(problem.shape)
     low_rank, best = reached, None
     for count in range(1, limit + 1):
         before = low_rank
@@ -97,10 +91,11 @@ def minimise(problem: NuclearProblem, weight: float, *, tolerance: float = 1e-7,
         reached = problem.matrix(v, theta)
         if count % CHECK and count < limit:
             continue
-        found = _measured(problem, v, theta, scaled * step, weight, count, tolerance)
+        bound, multipliers = problem.dual(scaled * step, weight)
+        found = Minimum(v, theta, multipliers, problem.value(v, theta, weight), bound, count)
         if best is None or found.gap < best.gap:
             best = found
-        if found.converged or count == limit:
+        if found.gap <= gap or count == limit:
             break
         outside, moved = np.linalg.norm(reached - low_rank), np.linalg.norm(low_rank - before)
         sizes = np.linalg.norm(scaled) / max(float(np.linalg.norm(low_rank)), 1e-300)
@@ -122,14 +117,6 @@ def shrunk(matrix: Array, threshold: float) -> Array:
     kept = values > threshold**2
     factors = 1.0 - threshold / np.sqrt(values[kept])
     return (vectors[:, kept] * factors) @ (vectors[:, kept].T @ matrix)
-
-
-def _measured(problem: NuclearProblem, v: Array, theta: Array, multipliers: Array, weight: float, count: int,
-              tolerance: float) -> Minimum:
-    value = problem.value(v, theta, weight)
-    bound, point = problem.dual(multipliers, weight)
-    found = Minimum(v, theta, point, value, bound, count, False)
-    return Minimum(v, theta, point, value, bound, count, found.gap <= tolerance)
 
 
 def _rebalanced(outside: float, moved: float, change: float) -> float:

@@ -13,7 +13,7 @@ from numba import njit
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
 from optid.program.program import Program
-from optid.program.solution import Status
+from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
 ENTER = 40
@@ -38,11 +38,10 @@ def run(program: Program, settings: Settings) -> Answer:
     if not penalty > 0:
         return Answer(Status.FAILED, f"the penalty is {penalty}; this method needs a positive one")
     start = form.flat(program.start) if settings.warm and program.start else None
-    found = minimise(form.problem, penalty, tolerance=settings.accuracy,
-                     limit=int(dict(settings.options).get("limit", 2000)), start=start)
+    found = minimise(form.problem, penalty, settings.accuracy, int(dict(settings.options).get("limit", 2000)), start)
     values = form.shaped(found.a)
     duals = {form.residual: -found.point}
-    if found.converged or found.gap <= max(100 * settings.accuracy, 1e-7):  # what the judgement allows
+    if found.gap <= tolerance(settings.accuracy):
         return Answer(Status.LOCAL, "duality gap closed", values, duals, found.rounds)
     return Answer(Status.LIMIT, f"stopped at a relative gap of {found.gap:.1e}", values, duals, found.rounds)
 
@@ -57,7 +56,6 @@ class Minimum:
         value: objective at a.
         bound: value of the dual at the point.
         rounds: number of rounds of descent and Newton step.
-        converged: whether the gap is within the tolerance.
     """
 
     a: Array
@@ -65,7 +63,6 @@ class Minimum:
     value: float
     bound: float
     rounds: int
-    converged: bool
 
     @property
     def gap(self) -> float:
@@ -73,14 +70,14 @@ class Minimum:
         return max(self.value - self.bound, 0.0) / max(self.value, np.finfo(float).tiny)
 
 
-def minimise(problem: GroupProblem, penalty: float, *, tolerance: float = 1e-9, limit: int = 2000,
+def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,
              start: Array | None = None) -> Minimum:
     """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``.
 
     Args:
         problem: the numbers.
         penalty: lambda, positive.
-        tolerance: relative duality gap at which to stop.
+        gap: relative duality gap at which to stop.
         limit: number of rounds at most.
         start: (p,) a point to start from.
     """
@@ -88,24 +85,19 @@ def minimise(problem: GroupProblem, penalty: float, *, tolerance: float = 1e-9, 
     active = np.flatnonzero(problem.norms(a) > 0)
     best, since, lowest = None, 0, np.inf
     for count in range(limit + 1):
-        found = _measured(problem, a, penalty, count, tolerance)
+        bound, point = problem.dual(problem.target - problem.design @ a, penalty)
+        found = Minimum(a.copy(), point, problem.value(a, penalty), bound, count)
         since = 0 if found.value < lowest * (1 - 1e-14) or best is None or found.gap < 0.9 * best.gap else since + 1
         lowest = min(lowest, found.value)
         if best is None or found.gap < best.gap:
             best = found
-        if found.converged or count == limit or since > STALLED:
+        if found.gap <= gap or count == limit or since > STALLED:
             break
         active = _entered(problem, a, penalty, active)
         a = _descended(problem, a, penalty, active)
         active = active[problem.norms(a)[active] > 0]
     assert best is not None
     return best
-
-
-def _measured(problem: GroupProblem, a: Array, penalty: float, count: int, tolerance: float) -> Minimum:
-    value = problem.value(a, penalty)
-    bound, point = problem.dual(problem.target - problem.design @ a, penalty)
-    return Minimum(a.copy(), point, value, bound, count, value - bound <= tolerance * value)
 
 
 def _entered(problem: GroupProblem, a: Array, penalty: float, active: np.ndarray) -> np.ndarray:
@@ -126,7 +118,7 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
     gram, pull = part.T @ part, part.T @ problem.target
     own = a[columns].copy()
     levels = penalty * problem.weights[active]
-    _sweep(gram, edges, problem.lengths[active] ** 2, levels, pull - gram @ own, own, SWEEPS, 0.0)
+    _sweep(gram, edges, problem.lengths[active] ** 2, levels, pull - gram @ own, own)
     own = _newton(gram, pull, edges, levels, own)
     result = np.zeros_like(a)
     result[columns] = own
@@ -176,7 +168,7 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
 
 @njit(cache=True)
 def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.ndarray, slope: np.ndarray,
-           a: np.ndarray, sweeps: int, tolerance: float) -> int:
+           a: np.ndarray) -> None:
     """Minimise over one group at a time, in place.
 
     Args:
@@ -186,14 +178,9 @@ def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.
         levels: (g,) lambda times the weight of a group.
         slope: (q,) M'(r - M a), kept up to date.
         a: (q,) coefficients.
-        sweeps: at most.
-        tolerance: stop when no coefficient moves by more, measured in the fit.
-
-    Returns:
-        The number of sweeps.
     """
-    for count in range(sweeps):
-        moved = 0.0
+    for _ in range(SWEEPS):
+        moved = False
         for g in range(edges.size - 1):
             lo, hi, square = edges[g], edges[g + 1], squares[g]
             if square == 0.0:
@@ -210,7 +197,6 @@ def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.
                     for i in range(slope.size):
                         slope[i] -= gram[i, j] * step
                     a[j] = new
-                    moved = max(moved, abs(step) * np.sqrt(square))
-        if moved <= tolerance:
-            return count + 1
-    return sweeps
+                    moved = True
+        if not moved:
+            return

@@ -12,12 +12,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import casadi as ca
 import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Smooth, by_name, cache, smooth
+from optid.backends.dnlp import Smooth, kept, smooth
 from optid.errors import StructureError
 from optid.program.gradients import MOVES, sources
 from optid.program.program import Program
@@ -43,51 +44,40 @@ def translate(form: Smooth) -> dict[str, Any]:
     Raises:
         StructureError: an atom without a translation, by name.
     """
-    import casadi as ca
-
     x = ca.MX.sym("x", sum(v.size for v in form.variables))
     p = ca.MX.sym("p", sum(v.size for v in form.parameters))
     known: dict[int, Any] = {}
     for vector, leaves in ((x, form.variables), (p, form.parameters)):
         edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
         known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
-    graph = _Graph(known)
-    rows = [ca.densify(graph.column(row.expression)) for row in form.rows]
-    return {"x": x, "p": p, "f": ca.densify(graph.column(form.problem.objective.expr)),
+    done: dict[int, tuple[Any, Any]] = {}
+
+    def column(expr: Any) -> Any:
+        """Translate an expression, each once; it is kept, so that its id stays its own."""
+        if id(expr) not in done:
+            done[id(expr)] = (expr, _column(expr, known, column))
+        return done[id(expr)][1]
+
+    rows = [ca.densify(column(row.expression)) for row in form.rows]
+    return {"x": x, "p": p, "f": ca.densify(column(form.problem.objective.expr)),
             "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
 
 
-class _Graph:
-    """Translated expressions, each translated once."""
-
-    def __init__(self, leaves: dict[int, Any]) -> None:
-        self.leaves = leaves
-        self.done: dict[int, tuple[Any, Any]] = {}
-
-    def column(self, expr: Any) -> Any:
-        """Return the CasADi column of an expression."""
-        if id(expr) not in self.done:
-            self.done[id(expr)] = (expr, self._column(expr))  # the expression is kept, so that its id stays its own
-        return self.done[id(expr)][1]
-
-    def _column(self, expr: Any) -> Any:
-        if isinstance(expr, cp.Variable | cp.Parameter):
-            return self.leaves[expr.id]
-        if expr.is_constant() and not expr.parameters():
-            return constant(expr.value, (int(expr.size), 1))
-        name = type(expr).__name__
-        columns = [self.column(arg) for arg in expr.args]
-        if name in MOVES:
-            return _move(expr, columns)
-        if name not in ATOMS:
-            raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
-        return ATOMS[name](expr, columns)
+def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> Any:
+    if isinstance(expr, cp.Variable | cp.Parameter):
+        return leaves[expr.id]
+    if expr.is_constant() and not expr.parameters():
+        return constant(expr.value, (int(expr.size), 1))
+    name, columns = type(expr).__name__, [column(arg) for arg in expr.args]
+    if name in MOVES:
+        return _move(expr, columns)
+    if name not in ATOMS:
+        raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
+    return ATOMS[name](expr, columns)
 
 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
     """Return a CasADi matrix of a number, array or sparse matrix, column by column, without its zeros."""
-    import casadi as ca
-
     if sp.issparse(value):
         value = sp.csc_array(sp.csc_array(value).reshape(shape, order="F"))
         value.sum_duplicates()
@@ -99,8 +89,6 @@ def constant(value: Any, shape: tuple[int, int]) -> Any:
 
 def _move(expr: Any, columns: list) -> Any:
     """Apply an atom that only moves entries."""
-    import casadi as ca
-
     moved, column = sources(expr), columns[0] if len(columns) == 1 else ca.vertcat(*columns)
     if np.all(moved >= 0):
         return column if np.array_equal(moved, np.arange(column.numel())) else column[moved.tolist(), 0]
@@ -111,8 +99,6 @@ def _move(expr: Any, columns: list) -> Any:
 
 def _matrix(column: Any, shape: tuple[int, ...], *, row: bool = False) -> Any:
     """Give a column the shape of a matrix; a vector is a column, or a row where it stands on the left."""
-    import casadi as ca
-
     if len(shape) > 2:
         raise StructureError(f"an array of {len(shape)} dimensions has no translation for CasADi's solvers")
     if len(shape) == 2:
@@ -121,8 +107,6 @@ def _matrix(column: Any, shape: tuple[int, ...], *, row: bool = False) -> Any:
 
 
 def _matmul(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
     left, right = expr.args
     if left.ndim == 0 or right.ndim == 0:
         return columns[0] * columns[1]
@@ -130,8 +114,6 @@ def _matmul(expr: Any, columns: list) -> Any:
 
 
 def _sum(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
     if expr.axis is None:
         return ca.sum1(columns[0])
     shape = expr.args[0].shape
@@ -149,27 +131,15 @@ def _cumsum(expr: Any, columns: list) -> Any:
     axis = expr.axis if expr.axis is not None else 0
     if len(shape) > 2 or (expr.axis is None and len(shape) == 2):
         raise StructureError(f"{expr}: a cumulative sum needs an axis and at most two dimensions")
-    import casadi as ca
-
     return ca.vec(ca.cumsum(ca.densify(_matrix(columns[0], shape)), axis % max(len(shape), 1)))
 
 
-def _trace(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return ca.trace(_matrix(columns[0], expr.args[0].shape))
-
-
 def _kron(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
     left, right = (_matrix(column, arg.shape) for column, arg in zip(columns, expr.args))
     return ca.vec(ca.kron(ca.densify(left), ca.densify(right)))
 
 
 def _convolve(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
     short, long = (columns[0], columns[1]) if expr.args[0].size <= expr.args[1].size else (columns[1], columns[0])
     terms = [ca.vertcat(ca.MX(i, 1), short[i] * long, ca.MX(short.numel() - 1 - i, 1)) for i in range(short.numel())]
     return sum(terms[1:], terms[0])
@@ -182,18 +152,6 @@ def _power(expr: Any, columns: list) -> Any:
     return 1 / columns[0] if exponent == -1.0 else columns[0] ** exponent
 
 
-def _quad_over_lin(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return ca.sumsqr(columns[0]) / columns[1]
-
-
-def _quad_form(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return ca.dot(columns[0], ca.mtimes(_matrix(columns[1], expr.args[1].shape), columns[0]))
-
-
 def _prod(expr: Any, columns: list) -> Any:
     if expr.axis is not None:
         raise StructureError(f"{expr}: a product along an axis has no translation for CasADi's solvers")
@@ -204,36 +162,7 @@ def _prod(expr: Any, columns: list) -> Any:
 
 
 def _of_one(function: str) -> Callable[[Any, list], Any]:
-    def apply(expr: Any, columns: list) -> Any:
-        import casadi as ca
-
-        return getattr(ca, function)(ca.densify(columns[0]))
-
-    return apply
-
-
-def _entr(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return -columns[0] * ca.log(columns[0])
-
-
-def _rel_entr(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return columns[0] * ca.log(columns[0] / columns[1])
-
-
-def _logistic(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return ca.log1p(ca.exp(ca.densify(columns[0])))
-
-
-def _normcdf(expr: Any, columns: list) -> Any:
-    import casadi as ca
-
-    return 0.5 * (1.0 + ca.erf(ca.densify(columns[0]) / np.sqrt(2.0)))
+    return lambda _, columns: getattr(ca, function)(ca.densify(columns[0]))
 
 
 ATOMS: dict[str, Callable[[Any, list], Any]] = {
@@ -241,9 +170,15 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
     "NegExpression": lambda _, columns: -columns[0],
     "multiply": lambda _, columns: columns[0] * columns[1],
     "DivExpression": lambda _, columns: columns[0] / columns[1],
-    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "Trace": _trace, "kron": _kron, "convolve": _convolve,
-    "conv": _convolve, "Power": _power, "PowerApprox": _power, "quad_over_lin": _quad_over_lin, "QuadForm": _quad_form,
-    "Prod": _prod, "entr": _entr, "rel_entr": _rel_entr, "logistic": _logistic, "normcdf": _normcdf,
+    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "kron": _kron, "convolve": _convolve, "conv": _convolve,
+    "Power": _power, "PowerApprox": _power, "Prod": _prod,
+    "Trace": lambda expr, columns: ca.trace(_matrix(columns[0], expr.args[0].shape)),
+    "quad_over_lin": lambda _, columns: ca.sumsqr(columns[0]) / columns[1],
+    "QuadForm": lambda expr, columns: ca.dot(columns[0], _matrix(columns[1], expr.args[1].shape) @ columns[0]),
+    "entr": lambda _, columns: -columns[0] * ca.log(columns[0]),
+    "rel_entr": lambda _, columns: columns[0] * ca.log(columns[0] / columns[1]),
+    "logistic": lambda _, columns: ca.log1p(ca.exp(ca.densify(columns[0]))),
+    "normcdf": lambda _, columns: 0.5 * (1.0 + ca.erf(ca.densify(columns[0]) / np.sqrt(2.0))),
     **{name: _of_one(name) for name in ("exp", "log", "log1p", "sin", "cos", "tan", "sinh", "tanh", "asinh", "atanh")},
 }
 
@@ -295,7 +230,9 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     chosen = options(name, settings)
     if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
         chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
-    solver = _compiled(name, form, chosen)
+    graph = kept(program.problem, "casadi", lambda: translate(form))
+    solver = kept(program.problem, (name, repr(sorted(chosen.items()))),
+                  lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
     lower, upper = form.bounds
     row_lower, row_upper = form.row_bounds
@@ -305,9 +242,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     iterations = int(statistics.get("iter_count", -1))
     if status in (Status.INFEASIBLE, Status.UNBOUNDED):
         return Answer(status, word, iterations=iterations, compile=compiling)
-    values, duals = form.restore(np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
-    named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
-    return Answer(status, word, named, by_name(program.constraints, duals), iterations, compiling)
+    values, duals = form.restore(program, np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
+    return Answer(status, word, values, duals, iterations, compiling)
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
@@ -319,15 +255,3 @@ def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
         return "success", Status.LOCAL
     stopped = int(statistics.get("iter_count", 0)) >= LIMIT
     return ("iteration limit", Status.LIMIT) if stopped else (f"no success ({word})", Status.INACCURATE)
-
-
-def _compiled(name: str, form: Smooth, chosen: dict[str, Any]) -> Any:
-    import casadi as ca
-
-    kept = cache(form.original)
-    if "casadi" not in kept:
-        kept["casadi"] = translate(form)
-    key = ("casadi", name, repr(sorted(chosen.items())))
-    if key not in kept:
-        kept[key] = ca.nlpsol("solver", name, kept["casadi"], chosen)
-    return kept[key]

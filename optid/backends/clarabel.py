@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from optid.backends.back_end import Settings
+from optid.backends.back_end import Answer, Settings
 from optid.backends.conic import tolerances
 from optid.program.solution import Status
 
@@ -19,29 +19,9 @@ STATUS = {
     "AlmostPrimalInfeasible": Status.INFEASIBLE, "DualInfeasible": Status.UNBOUNDED,
     "AlmostDualInfeasible": Status.UNBOUNDED, "MaxIterations": Status.LIMIT, "MaxTime": Status.LIMIT,
 }
-USABLE = (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT)
-
-
-class Solved(NamedTuple):
-    """What Clarabel answered.
-
-    Attributes:
-        status: its status in our words.
-        word: its own word.
-        x: (n,), None without a usable point.
-        multipliers: of the equalities, then of the inequalities, for ``L = f + multipliers' (rows x - right)``.
-        iterations: how many it took.
-    """
-
-    status: Status
-    word: str
-    x: np.ndarray | None
-    multipliers: np.ndarray
-    iterations: int
-
 
 def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[Side], below: Sequence[Side],
-                        settings: Settings) -> Solved:
+                        settings: Settings) -> Answer:
     """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``.
 
     The residuals are variables, so that the matrix is not squared.
@@ -52,6 +32,10 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
         equal: equalities.
         below: inequalities.
         settings: accuracy, time limit and native options.
+
+    Returns:
+        "x" (n,), where there is a usable point; "rows": multipliers of the equalities, then of the inequalities, for
+        ``L = f + multipliers' (rows x - right)``.
     """
     clarabel: Any = import_module("clarabel")  # compiled, without types
     k, n = matrix.shape
@@ -68,5 +52,7 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
     found = clarabel.DefaultSolver(weights, np.zeros(n + k), sp.csc_array(rows), right,
                                    cones if inequalities else cones[:1], options).solve()
     status = STATUS.get(str(found.status), Status.FAILED)
-    x = np.asarray(found.x)[:n] if status in USABLE else None
-    return Solved(status, str(found.status), x, np.asarray(found.z)[k:], int(found.iterations))
+    if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT):
+        return Answer(status, str(found.status))
+    return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]}, {"rows": np.asarray(found.z)[k:]},
+                  int(found.iterations))

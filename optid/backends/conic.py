@@ -1,6 +1,7 @@
 """Every conic and QP solver that CVXPY knows, by name, with one requested accuracy translated per solver."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
@@ -89,20 +90,16 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
                           **options)
     except Exception as error:  # a solver that crashes is an outcome
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
-    status = STATUS.get(problem.status, Status.FAILED)
-    statistics = problem.solver_stats
+    status, statistics = STATUS.get(problem.status, Status.FAILED), problem.solver_stats
     compiling = float("nan") if problem.compilation_time is None else float(problem.compilation_time)
     iterations = getattr(statistics, "num_iters", None)
+    answer = Answer(status, problem.status, iterations=-1 if iterations is None else int(iterations), compile=compiling)
     if status is Status.INFEASIBLE and name in AMBIGUOUS and not _has_no_point(problem, name, options):
         return Answer(Status.FAILED, "infeasible_or_unbounded", compile=compiling)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT) or any(
-        v.value is None for v in program.variables.values()
-    ):
-        return Answer(status, problem.status, iterations=iterations if iterations is not None else -1,
-                      compile=compiling)
-    duals = {} if name in WITHOUT_DUALS else program.duals()
-    return Answer(status, problem.status, program.values(), duals,
-                  int(iterations) if iterations is not None else -1, compiling)
+            v.value is None for v in program.variables.values()):
+        return answer
+    return replace(answer, values=program.values(), duals={} if name in WITHOUT_DUALS else program.duals())
 
 
 def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bool:

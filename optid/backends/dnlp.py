@@ -5,7 +5,7 @@ variables); what comes out, `Smooth`, is what every NLP back end works on. The w
 through the inverse data of the same chain, never by position.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,7 @@ from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.errors import StructureError
+from optid.program.program import Program
 
 CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
@@ -99,27 +100,28 @@ class Smooth:
         self.attributes.update_parameters(self.original)
         return _flat([parameter.value for parameter in self.parameters])
 
-    def restore(self, x: np.ndarray, multipliers: np.ndarray) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-        """Map a flat point and the flat multipliers of the rows back to the original problem.
+    def restore(self, program: Program, x: np.ndarray, multipliers: np.ndarray
+                ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Map a flat point and the flat multipliers of the rows back to the programme.
 
         Args:
+            program: whose problem this is.
             x: (unknowns,) point of the smooth problem.
             multipliers: (rows,) in the convention ``L = f + multipliers * row``; empty where there are none.
 
         Returns:
-            ``({variable id: value}, {constraint id: dual})``, arrays flattened column by column for the duals.
+            ({variable: value}, {constraint: flat multipliers}); groups without multipliers are absent.
         """
-        primal, at = {}, 0
-        for variable in self.variables:
-            primal[variable.id] = np.reshape(x[at : at + variable.size], variable.shape, order="F")
-            at += variable.size
-        dual, at = {}, 0
-        for row in self.rows if multipliers.size else ():
-            dual[row.id] = multipliers[at : at + row.expression.size]
-            at += row.expression.size
+        primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, _split(
+            x, [v.size for v in self.variables]))}
+        dual = dict(zip((row.id for row in self.rows), _split(multipliers, [row.expression.size for row in self.rows]))
+                    ) if multipliers.size else {}
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
-        return solution.primal_vars, solution.dual_vars
+        values, duals = solution.primal_vars, solution.dual_vars
+        return ({name: values[v.id] for name, v in program.variables.items() if v.id in values},
+                {name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
+                 for name, group in program.constraints.items() if all(member.id in duals for member in group)})
 
 
 def smooth(problem: cp.Problem) -> Smooth:
@@ -128,23 +130,27 @@ def smooth(problem: cp.Problem) -> Smooth:
     Raises:
         StructureError: a part that the smooth chain does not carry over faithfully.
     """
-    kept = cache(problem)
-    if "smooth" not in kept:
-        kept["smooth"] = _apply(problem)
-    return kept["smooth"]
+    return kept(problem, "smooth", lambda: _apply(problem))
 
 
-def cache(problem: cp.Problem) -> dict[Any, Any]:
-    """Return our part of the problem's cache of compiled solvers, which lives and dies with the problem."""
-    return problem._solver_cache.setdefault(CACHE, {})
+def kept(problem: cp.Problem, key: Any, make: Callable[[], Any]) -> Any:
+    """Return what is kept under a key with the problem, in whose cache of compiled solvers it lives; made once."""
+    found = problem._solver_cache.setdefault(CACHE, {})
+    if key not in found:
+        found[key] = make()
+    return found[key]
 
 
 class Derivatives:
     """Values and exact derivatives of a smooth problem, from CVXPY's compiled derivative engine.
 
-    The engine differentiates at the point of its last evaluation, whatever point it is asked for; every call here
-    evaluates first when the point is a new one. Attributes: ``jacobian_pattern`` and ``hessian_pattern`` (lower
-    triangle) as (rows, columns).
+    The engine differentiates at the point of its last evaluation, whatever point it is asked for: it is reached through
+    `at`, which evaluates first where the point is a new one.
+
+    Attributes:
+        jacobian_pattern, hessian_pattern: (rows, columns) of the non-zeros, of the Hessian in the lower triangle.
+        value: the objective at the last point.
+        rows: the rows there.
     """
 
     def __init__(self, form: Smooth) -> None:
@@ -152,8 +158,8 @@ class Derivatives:
 
         self._problem = cp.Problem(form.problem.objective, [Zero(row.expression) for row in form.rows])
         self._oracles = Oracles(self._problem, verbose=False)
-        self._rows = sum(row.expression.size for row in form.rows)
         self._x: np.ndarray | None = None
+        self.rows = np.zeros(sum(row.expression.size for row in form.rows))
         self.jacobian_pattern = self._oracles.jacobianstructure()
         self.hessian_pattern = self._oracles.hessianstructure()
 
@@ -163,44 +169,19 @@ class Derivatives:
             self._oracles.update_params(self._problem)
         self._x = None
 
-    def objective(self, x: np.ndarray) -> float:
-        """Return the objective at x."""
-        self._move(x)
-        return self._value
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradient of the objective at x."""
-        self._move(x)
-        return self._oracles.gradient(x)
-
-    def rows(self, x: np.ndarray) -> np.ndarray:
-        """Return the rows at x."""
-        self._move(x)
-        return self._levels
-
-    def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the non-zeros of the Jacobian of the rows at x."""
-        self._move(x)
-        return self._oracles.jacobian(x)
-
-    def hessian(self, x: np.ndarray, factor: float, multipliers: np.ndarray) -> np.ndarray:
-        """Return the non-zeros of the lower triangle of the Hessian of ``factor f + multipliers * rows``."""
-        self._move(x)
-        return self._oracles.hessian(x, multipliers, factor)
-
-    def _move(self, x: np.ndarray) -> None:
+    def at(self, x: Any) -> Any:
+        """Return the engine at a point: its gradient(x), jacobian(x) and hessian(x, multipliers, factor)."""
         if self._x is None or not np.array_equal(x, self._x):
             self._x = np.array(x, dtype=float)
-            self._value = float(self._oracles.objective(self._x))
-            self._levels = np.array(self._oracles.constraints(self._x)) if self._rows else np.zeros(0)
+            self.value = float(self._oracles.objective(self._x))
+            if self.rows.size:
+                self.rows = np.array(self._oracles.constraints(self._x))
+        return self._oracles
 
 
 def derivatives(form: Smooth) -> Derivatives:
     """Return the compiled derivatives of a smooth problem; made once and kept with the problem."""
-    kept = cache(form.original)
-    if "derivatives" not in kept:
-        kept["derivatives"] = Derivatives(form)
-    return kept["derivatives"]
+    return kept(form.original, "derivatives", lambda: Derivatives(form))
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -228,52 +209,32 @@ class _SmoothChain(Dnlp2Smooth):
     def __init__(self) -> None:
         super().__init__()
         originals = self.smooth_canon_methods
-        self.smooth_canon_methods = {
-            **originals,
-            DivExpression: _divide(originals[DivExpression]),
-            quad_over_lin: _quad_over_lin(originals[quad_over_lin]),
-            cp.log_sum_exp: _log_sum_exp(originals[cp.log_sum_exp]),
-            cp.rel_entr: _refuse_parameters(originals[cp.rel_entr]),
-            cp.kl_div: _refuse_parameters(originals[cp.kl_div]),
-        }
 
+        def divide(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            return originals[DivExpression](expr, args) if args[1].variables() else (expr.copy(args), [])
 
-def _divide(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        return original(expr, args) if args[1].variables() else (expr.copy(args), [])
+        def squares(expr: Any, args: list) -> tuple[Any, list]:
+            if args[1].variables():
+                if expr.axis is not None:
+                    raise StructureError(
+                        f"{expr} along an axis with a variable denominator: write the columns one by one")
+                return originals[quad_over_lin](expr, args)
+            total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
+            unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
+            return (total if unit else total / args[1]), []
 
-    return canonicalise
+        def level(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            found, constraints = originals[cp.log_sum_exp](expr, args)
+            found.value = expr.copy(args).value
+            return found, constraints
 
+        def entropy(expr: cp.Expression, args: list) -> tuple[Any, list]:
+            if expr.parameters():
+                raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
+            return originals[type(expr)](expr, args)
 
-def _quad_over_lin(original: Any) -> Any:
-    def canonicalise(expr: Any, args: list) -> tuple[Any, list]:
-        if args[1].variables():
-            if expr.axis is not None:
-                raise StructureError(f"{expr} along an axis with a variable denominator: write the columns one by one")
-            return original(expr, args)
-        total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
-        unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
-        return (total if unit else total / args[1]), []
-
-    return canonicalise
-
-
-def _log_sum_exp(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        level, constraints = original(expr, args)
-        level.value = expr.copy(args).value
-        return level, constraints
-
-    return canonicalise
-
-
-def _refuse_parameters(original: Any) -> Any:
-    def canonicalise(expr: cp.Expression, args: list) -> tuple[Any, list]:
-        if expr.parameters():
-            raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
-        return original(expr, args)
-
-    return canonicalise
+        self.smooth_canon_methods = {**originals, DivExpression: divide, quad_over_lin: squares,
+                                     cp.log_sum_exp: level, cp.rel_entr: entropy, cp.kl_div: entropy}
 
 
 def _row(constraint: Constraint) -> Row:
@@ -294,16 +255,5 @@ def _flat(arrays: list) -> np.ndarray:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def by_name(program_constraints: Mapping[str, tuple[Constraint, ...]], duals: Mapping[int, np.ndarray]
-            ) -> dict[str, np.ndarray]:
-    """Collect the multipliers of every named group of constraints; groups without multipliers are absent.
-
-    Args:
-        program_constraints: {name: constraints}.
-        duals: {constraint id: dual}.
-    """
-    found = {}
-    for name, group in program_constraints.items():
-        if all(member.id in duals for member in group):
-            found[name] = np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-    return found
+def _split(x: np.ndarray, sizes: list[int]) -> list[np.ndarray]:
+    return np.split(x, np.cumsum(sizes)[:-1])

@@ -7,7 +7,6 @@ step that the tangents misled is corrected by solving for everything but b, whic
 
 import cvxpy as cp
 import numpy as np
-from scipy.optimize import nnls
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.choice import find
@@ -24,6 +23,7 @@ from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
 from optid.structures.least_squares import RankOneStructure, rank_one_of
+from optid.structures.multipliers import fit_multipliers
 from optid.structures.rank_one import Point, reduce
 
 STEPS = 100
@@ -60,34 +60,21 @@ def _unconstrained(program: Program, form: RankOneStructure, count: int, seed: i
 
 def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:
     """Descend from the programme's start, and from others where the instant proof fails there."""
-    found = minimise(form.problem, start_point(form, program.start)) if program.start else None
+    found = minimise(form.problem, form.point(program.start)) if program.start else None
     if found is not None and certify(form.problem, found.point, effort="instant").bound.proved:
         return found
     others = minimise(form.problem, count=count, seed=seed)
     return found if found is not None and found.value <= others.value else others
 
 
-def start_point(form: RankOneStructure, start: Values) -> Point:
-    """Read a point from named values."""
-    w = np.concatenate([np.ravel(start[name], order="F") for name in form.linear] or [np.zeros(0)])
-    return Point(w, tuple(np.asarray(start[mu], dtype=float) for mu, _ in form.blocks),
-                 tuple(np.ravel(start[b], order="F") for _, b in form.blocks))
-
-
 def to_values(program: Program, form: RankOneStructure, point: Point) -> dict[str, np.ndarray]:
     """Name the parts of a point, in the programme's gauge."""
-    values: dict[str, np.ndarray] = {}
-    position = 0
-    for name in form.linear:
-        variable = program.variables[name]
-        values[name] = np.reshape(point.w[position : position + variable.size], variable.shape, order="F")
-        position += variable.size
-    for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
-        size = float(np.linalg.norm(b)) or 1.0  # the sign stays: constraints may depend on it
+    values = form.named(point, program.variables)
+    for (mu, b), direction in zip(form.blocks, point.bs):
+        size = float(np.linalg.norm(direction)) or 1.0  # the sign stays: constraints may depend on it
         if form.gauge != "norm":
-            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), np.asarray(b, dtype=float), mu_name)
-        values[mu_name] = mu * size
-        values[b_name] = np.reshape(b / size, program.variables[b_name].shape, order="F")
+            size = gauge_factor(form.gauge, values.get("a", np.zeros(0)), np.asarray(direction, dtype=float), mu)
+        values[mu], values[b] = values[mu] * size, values[b] / size
     return values
 
 
@@ -98,7 +85,7 @@ class _Constrained:
         self.program, self.form, self.problem = program, form, form.problem
         self.inner, self.settings = find(inner), Settings(accuracy=min(settings.accuracy, 1e-11), warm=False)
         self.at = Coordinates(program, form)
-        point = minimise(form.problem, start_point(form, program.start)).point
+        point = minimise(form.problem, form.point(program.start)).point
         sizes = self.at.sizes(self.at.pack(to_values(program, form, point)))
         self.half, self.full = StepQP(self.at, sizes, pinned=True), StepQP(self.at, sizes, pinned=False)
 
@@ -112,7 +99,10 @@ class _Constrained:
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
-            return self._no_start()
+            if not satisfiable(self.program, list(self.program.user_constraints)):
+                return Answer(Status.INFEASIBLE, "the constraints contradict each other")
+            return Answer(Status.FAILED,
+                          "no start satisfies the constraints, although they do not contradict each other")
         tried.sort(key=lambda pair: pair[0])
         distinct: list[np.ndarray] = []
         for _, x in tried:
@@ -135,7 +125,7 @@ class _Constrained:
     def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
         core = reduce(self.problem)
-        points = [start_point(self.form, self.program.start)] if self.program.start else []
+        points = [self.form.point(self.program.start)] if self.program.start else []
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
             points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
                       for i, b in enumerate(free.bs) for axis in np.eye(b.size)] + points
@@ -231,7 +221,8 @@ class _Constrained:
                 before, after = self._merit(x, weight), self._merit(new, weight)
                 slack = 1e-11 * (before + floor)
                 # measured on the lifted vector: b means nothing where mu is zero
-                size = _distance(self._lift(x), self._lift(new))
+                old, reached = self._lift(x), self._lift(new)
+                size = float(np.linalg.norm(reached - old) / (1e-300 + np.linalg.norm(reached)))
                 rises = after > before + slack and size > 1e-7
                 # the tangents may mislead along a curved constraint: return to it by solving for all but b
                 settled = self._settle(self.at.point(new)) if rises else None
@@ -271,19 +262,11 @@ class _Constrained:
             sizes[name] = given[-1].size
         matrix, held = np.vstack(rows), np.array(equal)
         active = np.concatenate(touched) | held
-        both = np.vstack([matrix[active], -matrix[held]])
-        weights, rest = nnls(both.T, -slope * units, maxiter=30 * len(both))
+        fitted = np.zeros(len(matrix))
+        fitted[active], rest = fit_multipliers(matrix[active], -slope * units, held[active])
         if rest >= np.linalg.norm(matrix.T @ np.concatenate(given) + slope * units):
             return found
-        fitted = np.zeros(len(matrix))
-        fitted[active] = weights[: active.sum()]
-        fitted[held] -= weights[active.sum() :]
         return dict(zip(sizes, np.split(fitted, np.cumsum([*sizes.values()])[:-1])))
-
-    def _no_start(self) -> Answer:
-        if not satisfiable(self.program, list(self.program.user_constraints)):
-            return Answer(Status.INFEASIBLE, "the constraints contradict each other")
-        return Answer(Status.FAILED, "no start satisfies the constraints, although they do not contradict each other")
 
 
 def _signed(point: Point) -> list[Point]:
@@ -294,7 +277,3 @@ def _signed(point: Point) -> list[Point]:
         found.append(Point(point.w, tuple(s * m for s, m in zip(signs, point.mus)),
                            tuple(s * b for s, b in zip(signs, point.bs))))
     return found
-
-
-def _distance(z: np.ndarray, reached: np.ndarray) -> float:
-    return float(np.linalg.norm(reached - z) / (1e-300 + np.linalg.norm(reached)))

@@ -6,7 +6,7 @@ constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapte
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy as np
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
-from optid.program.gradients import affine_parts, flat_value, jacobians
+from optid.program.expressions import flat
+from optid.program.gradients import affine_parts, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Status
@@ -65,15 +66,19 @@ class Coordinates:
         for name, value in self.unpack(x).items():
             self.program.variables[name].value = value
 
+    @cached_property
+    def blocks(self) -> list[tuple[slice, slice, slice]]:
+        """Where vec(mu_i b_iᵀ) stands in z, and mu_i and b_i in x."""
+        found, at = [], self.form.problem.linear
+        for where, (p, q) in zip(self.form.problem.slices, self.form.problem.blocks):
+            found.append((where, slice(at, at + p), slice(at + p, at + p + q)))
+            at += p + q
+        return found
+
     def point(self, x: np.ndarray) -> Point:
         """Return x as a point of the rank-one problem."""
-        position = self.form.problem.linear
-        mus, bs = [], []
-        for p, q in self.form.problem.blocks:
-            mus.append(x[position : position + p])
-            bs.append(x[position + p : position + p + q])
-            position += p + q
-        return Point(x[: self.form.problem.linear], tuple(mus), tuple(bs))
+        return Point(x[: self.form.problem.linear], tuple(x[mu] for _, mu, _ in self.blocks),
+                     tuple(x[b] for _, _, b in self.blocks))
 
     def sizes(self, x: np.ndarray) -> dict[str, float]:
         """Natural size of every variable around x: how much of it would account for the whole record.
@@ -82,39 +87,27 @@ class Coordinates:
         """
         problem = self.form.problem
         energy = np.linalg.norm(problem.root @ self.slope_of_lift(x), axis=0)
-        reach, found, position = float(np.sqrt(problem.scale)), {}, 0
-        for name, variable in zip(self.names, self.variables):
-            largest = float(np.max(energy[position : position + variable.size]))
-            found[name] = reach / largest if largest > 0 and reach > 0 else 1.0
-            position += variable.size
-        return found
+        reach, largest = float(np.sqrt(problem.scale)), {n: float(np.max(e)) for n, e in self.unpack(energy).items()}
+        return {name: reach / one if one > 0 and reach > 0 else 1.0 for name, one in largest.items()}
 
     def slope_of_lift(self, x: np.ndarray) -> np.ndarray:
         """Jacobian (n, size) of the lifted vector z(x)."""
-        point, linear = self.point(x), self.form.problem.linear
+        linear = self.form.problem.linear
         found = np.zeros((len(self.form.problem.target), self.size))
         found[:linear, :linear] = np.eye(linear)
-        row = at = linear
-        for mu, b in zip(point.mus, point.bs):
-            p, q = mu.size, b.size
-            found[row : row + p * q, at : at + p] = np.kron(b[:, None], np.eye(p))
-            found[row : row + p * q, at + p : at + p + q] = np.kron(np.eye(q), mu[:, None])
-            row, at = row + p * q, at + p + q
+        for where, mu, b in self.blocks:
+            found[where, mu] = np.kron(x[b][:, None], np.eye(x[mu].size))
+            found[where, b] = np.kron(np.eye(x[b].size), x[mu][:, None])
         return found
 
     def curvature(self, x: np.ndarray, pull: np.ndarray) -> np.ndarray:
         """Second derivatives of ``pullᵀ z(x)``, made definite along the scale between mu and b."""
-        point = self.point(x)
         found = np.zeros((self.size, self.size))
-        row = at = self.form.problem.linear
-        for mu, b in zip(point.mus, point.bs):
-            p, q = mu.size, b.size
-            own, other = slice(at, at + p), slice(at + p, at + p + q)
-            found[own, other] = pull[row : row + p * q].reshape(p, q, order="F")
-            found[other, own] = found[own, other].T
+        for where, mu, b in self.blocks:
+            found[mu, b] = pull[where].reshape(x[mu].size, -1, order="F")
+            found[b, mu] = found[mu, b].T
             if self.form.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
-                found[other, other] += np.outer(b, b) * float(mu @ mu)
-            row, at = row + p * q, at + p + q
+                found[b, b] += np.outer(x[b], x[b]) * float(x[mu] @ x[mu])
         return found
 
 
@@ -145,11 +138,6 @@ class _Rows:
         """Whether it is an equality."""
         return isinstance(self.member, EQUALITIES)
 
-    @property
-    def affine(self) -> bool:
-        """Whether slope and level are those of the constraint everywhere, and not of its tangent."""
-        return self.member.is_dcp()
-
 
 class StepQP:
     """``minimise ‖U x - t‖²`` over the programme's own variables and constraints, with matrices that change.
@@ -168,11 +156,8 @@ class StepQP:
         self.rows: list[_Rows] = []
         self.cones: list[tuple[str, slice, cp.Constraint]] = []
         self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
-        self._pins = np.zeros(at.size, dtype=bool)
-        position = 0
-        for name, variable in zip(at.names, at.variables):
-            self._pins[position : position + variable.size] = pinned and name in [b for _, b in at.form.blocks]
-            position += variable.size
+        bs = [b for _, b in at.form.blocks] if pinned else []
+        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in zip(at.names, at.variables)])
         self._slopes: dict[int, np.ndarray] = {}
         self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
@@ -189,7 +174,7 @@ class StepQP:
         if parts is None or {v.id for v in parts[0]} - {v.id for v in self.at.variables}:
             self.cones.append((name, span, member))
             return
-        slope, level = self._laid_out(parts[0], member.size), parts[1]
+        slope, level = side_by_side(parts[0], self.at.variables, member.size), parts[1]
         unit = float(np.max(np.abs(slope) @ self._scale + np.abs(level), initial=0.0)) or 1.0
         self.rows.append(_Rows(name, span, member, unit, slope, level))
 
@@ -228,7 +213,7 @@ class StepQP:
         for row in self.rows:
             if row.lifted is not None:
                 row.slope, value = row.lifted[0] @ lift, row.lifted[0] @ z - row.lifted[1]
-            elif not row.affine:
+            elif not row.member.is_dcp():  # its tangent
                 row.slope, value = self.slope(row.member.expr), flat_value(row.member.expr)
             else:
                 continue
@@ -237,18 +222,20 @@ class StepQP:
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
         if back_end.name == "clarabel" and not self.cones:
-            return self._directly(settings)
-        program, matrices = self._programme
-        for parameter, value in zip(matrices, self._matrices()):
-            parameter.value = value
-        answer = back_end.run(program, settings)
-        values = {name: self.sizes[name] * answer.values[name] for name in self.sizes if name in answer.values}
-        duals = {name: self._unit**2 * answer.duals[name] for name, _, _ in self.cones if name in answer.duals}
-        for row in self.rows:
-            if row.name in answer.duals:
-                duals.setdefault(row.name, self._unit**2 * answer.duals[row.name])[row.span] /= row.unit
+            answer = self._directly(settings)
+        else:
+            program, matrices = self._programme
+            for parameter, value in zip(matrices, self._matrices()):
+                parameter.value = value
+            answer = back_end.run(program, settings)
         usable = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT)
-        return Answer(answer.status, answer.word, values if usable else {}, duals)
+        values = {name: size * answer.values[name] for name, size in self.sizes.items() if name in answer.values}
+        known = self.at.program.constraints
+        duals = {name: self._unit**2 * dual for name, dual in answer.duals.items() if name in known}
+        for row in self.rows:
+            if row.name in duals:
+                duals[row.name][row.span] /= row.unit
+        return replace(answer, values=values if usable else {}, duals=duals)
 
     def _directly(self, settings: Settings) -> Answer:
         matrix, target, held, *sides = self._matrices()
@@ -257,16 +244,15 @@ class StepQP:
         equal = [(slope, -level) for row, slope, level in pairs if row.equality]
         below = [(slope, -level) for row, slope, level in pairs if not row.equality]
         found = solve_least_squares(matrix, target, [(pins, held), *equal], below, settings)
-        if found.x is None:
-            return Answer(found.status, found.word)
+        if not found.values:
+            return found
         duals, position = {}, len(pins)
         for row in sorted(self.rows, key=lambda row: not row.equality):  # as they were given: a stable order
             size = row.span.stop - row.span.start
             total = max(other.span.stop for other in self.rows if other.name == row.name)
-            part = self._unit**2 * found.multipliers[position : position + size] / row.unit
-            duals.setdefault(row.name, np.zeros(total))[row.span] = part
+            duals.setdefault(row.name, np.zeros(total))[row.span] = found.duals["rows"][position : position + size]
             position += size
-        return Answer(found.status, found.word, self.at.unpack(found.x * self._scale), duals, found.iterations)
+        return replace(found, values=self.at.unpack(found.values["x"]), duals=duals)
 
     def _matrices(self) -> list[np.ndarray]:
         """Model, target and held values, then slope and level of all rows, in the units of the QP."""
@@ -279,7 +265,7 @@ class StepQP:
         at = self.at
         stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
         swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
-        x = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="F") for v in stand_ins.values()])
+        x = cp.hstack([flat(v) for v in stand_ins.values()])
         matrices = [cp.Parameter(value.shape, value=value) for value in self._matrices()]
         r = cp.Variable(at.size)
         groups: dict[str, list] = {"model": [r == matrices[0] @ x - matrices[1]]}
@@ -312,18 +298,11 @@ class StepQP:
 
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
-        if expression.is_affine():
-            if expression.id not in self._slopes:
-                self._slopes[expression.id] = self._jacobian(expression)
-            return self._slopes[expression.id]
-        return self._jacobian(expression)
-
-    def _jacobian(self, expression: cp.Expression) -> np.ndarray:
-        return self._laid_out(jacobians(expression) or {}, expression.size)
-
-    def _laid_out(self, slopes: Mapping[cp.Variable, Any], rows: int) -> np.ndarray:
-        """Put Jacobians by variable side by side."""
-        return np.hstack([slopes[v].toarray() if v in slopes else np.zeros((rows, v.size)) for v in self.at.variables])
+        if not expression.is_affine():
+            return side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
+        if expression.id not in self._slopes:
+            self._slopes[expression.id] = side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
+        return self._slopes[expression.id]
 
 
 def _spans(group: tuple[cp.Constraint, ...]) -> list[slice]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Derivatives, Smooth, by_name, derivatives, smooth
+from optid.backends.dnlp import Smooth, derivatives, smooth
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -37,26 +37,21 @@ def run(program: Program, settings: Settings) -> Answer:
     unopy: Any = import_module("unopy")
     clock = time.perf_counter()
     form = smooth(program.problem)
-    start, _ = form.start(), form.parameter_values()
-    engine = derivatives(form)
-    engine.update()
     solver = unopy.UnoSolver()
     chosen = options(settings)
     solver.set_preset(chosen.pop("preset"))
     for name, value in chosen.items():
         solver.set_option(name, value)
-    model = _model(unopy, form, engine, start)
+    model = _model(unopy, form)
     compiling = time.perf_counter() - clock
     result = solver.optimize(model)
     word, status = _status(str(result.optimization_status), str(result.solution_status))
     iterations = int(result.number_iterations)
     if status in (Status.INFEASIBLE, Status.UNBOUNDED):
         return Answer(status, word, iterations=iterations, compile=compiling)
-    x = np.array(list(result.primal_solution))
-    multipliers = np.array(list(result.constraint_dual_solution))
-    values, duals = form.restore(x, multipliers)
-    named = {key: values[variable.id] for key, variable in program.variables.items() if variable.id in values}
-    return Answer(status, word, named, by_name(program.constraints, duals), iterations, compiling)
+    values, duals = form.restore(program, np.array(list(result.primal_solution)),
+                                 np.array(list(result.constraint_dual_solution)))
+    return Answer(status, word, values, duals, iterations, compiling)
 
 
 def options(settings: Settings) -> dict[str, Any]:
@@ -70,23 +65,30 @@ def options(settings: Settings) -> dict[str, Any]:
     return {**chosen, **settings.options}
 
 
-def _model(unopy: Any, form: Smooth, engine: Derivatives, start: np.ndarray) -> Any:
-    lower, upper = form.bounds
-    model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, lower, upper, unopy.ZERO_BASED_INDEXING)
+def _model(unopy: Any, form: Smooth) -> Any:
+    start, _ = form.start(), form.parameter_values()
+    engine = derivatives(form)
+    engine.update()
+    model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
-    def gradient(x: Any, out: np.ndarray) -> None:
-        out[:] = engine.gradient(np.asarray(x))
+    def objective(x: Any) -> float:
+        engine.at(x)
+        return engine.value
 
     def rows(x: Any, out: np.ndarray) -> None:
-        out[:] = engine.rows(np.asarray(x))
+        engine.at(x)
+        out[:] = engine.rows
+
+    def gradient(x: Any, out: np.ndarray) -> None:
+        out[:] = engine.at(x).gradient(np.asarray(x))
 
     def jacobian(x: Any, out: np.ndarray) -> None:
-        out[:] = engine.jacobian(np.asarray(x))
+        out[:] = engine.at(x).jacobian(np.asarray(x))
 
     def hessian(x: Any, factor: float, multipliers: Any, out: np.ndarray) -> None:
-        out[:] = engine.hessian(np.asarray(x), factor, np.asarray(multipliers))
+        out[:] = engine.at(x).hessian(np.asarray(x), np.asarray(multipliers), factor)
 
-    model.set_objective(unopy.MINIMIZE, lambda x: engine.objective(np.asarray(x)), gradient)
+    model.set_objective(unopy.MINIMIZE, objective, gradient)
     row_lower, row_upper = form.row_bounds
     if row_lower.size:
         row, column = engine.jacobian_pattern

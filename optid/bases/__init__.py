@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BSpline",
+    "Bases",
     "Basis",
+    "FeedbackBases",
     "Linear",
     "PiecewiseConstant",
     "Polynomial",
@@ -28,6 +30,12 @@ __all__ = [
     "from_dict",
     "parse",
 ]
+
+Bases = Basis | str | Sequence[Basis | str]
+"""One basis, or its name as for `parse`, for all inputs, or one per input."""
+
+FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
+"""One basis for all outputs, or one per output; None or "none" where nothing is fed back."""
 
 _CLASSES: dict[str, Callable[..., Basis]] = {
     "triangular": Triangular,
@@ -117,12 +125,12 @@ def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = No
         raise StructureError(f"Basis {name!r} cannot be built from {sorted(arguments)}: {error}.") from error
 
 
-def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | str]") -> tuple[Basis, ...]:
+def fitted_bases(data: "Data | Stream", basis: Bases) -> tuple[Basis, ...]:
     """Return one basis per input; a basis without an interval takes the range of its input.
 
     Args:
         data: the record.
-        basis: one basis (or its name, as for `parse`) for all inputs, or one per input.
+        basis: of the inputs.
 
     Raises:
         StructureError: a wrong number of bases, or an entry that is not a basis.
@@ -139,12 +147,12 @@ def fitted_bases(data: "Data | Stream", basis: "Basis | str | Sequence[Basis | s
     return tuple(fitted)
 
 
-def feedback_bases(data: "Data", given: "Basis | str | None | Sequence[Basis | str | None]") -> list[Basis | None]:
+def feedback_bases(data: "Data", given: FeedbackBases) -> list[Basis | None]:
     """Return one basis with an interval, or None, per output; a basis without one takes the range of its output.
 
     Args:
         data: the record.
-        given: one basis (or its name) for all outputs, or one per output; None or "none" where nothing is fed back.
+        given: of the outputs.
 
     Raises:
         StructureError: a wrong number of bases, or an entry that is not a basis.

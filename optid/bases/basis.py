@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
 
 Outside = Literal["clamp", "linear", "extrapolate", "error"]
@@ -21,7 +21,7 @@ class Basis:
     """A family of P functions eta(u) without the constant, on an interval of the input.
 
     A frozen dataclass that inherits from it has the fields `interval` and `outside`, and supplies `full_size`,
-    `_evaluate`, `_derivative` and `_quadrature`, and better shape matrices where it has them.
+    `_derivative`, `_quadrature` and, where functions vanish, `_evaluate`, and better shape matrices where it has them.
 
     Attributes:
         interval: (lower, upper) in units of the input; None until `fitted`.
@@ -40,9 +40,7 @@ class Basis:
 
     def __post_init__(self) -> None:
         for name, (smallest, meaning) in self._sizes.items():
-            p = getattr(self, name)
-            if isinstance(p, bool) or not isinstance(p, (int, np.integer)) or p < smallest:
-                raise StructureError(f"The number of {meaning} must be an integer >= {smallest}; got {p!r}.")
+            check_integer(getattr(self, name), f"The number of {meaning}", smallest)
         if self.outside not in OUTSIDE:
             raise StructureError(f"outside={self.outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
         if self.interval is None:
@@ -78,10 +76,8 @@ class Basis:
         if not (np.isfinite(lo) and np.isfinite(hi)):
             raise DataError(f"The range of the input is [{lo}, {hi}]: it needs finite samples.")
         if hi <= lo:
-            raise DataError(
-                f"The input is constant at {lo:g}: a nonlinearity cannot be identified from it. "
-                "Use a record in which the input moves, or give the basis its interval."
-            )
+            raise DataError(f"The input is constant at {lo:g}: a nonlinearity cannot be identified from it. Use a "
+                            "record in which the input moves, or give the basis its interval.")
         return replace(cast(Any, self), interval=(float(lo), float(hi)))
 
     def mapped(self, scale: float, offset: float) -> tuple["Basis", Array, Array]:
@@ -133,11 +129,7 @@ class Basis:
     def values(self, u: ArrayLike) -> Array:
         """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN; errors as `local`."""
         u = samples(u)
-        first, weights = self.local(u)
-        complete = weights
-        if weights.shape[1] < self.full_size:
-            complete = np.zeros((u.size, self.full_size))
-            np.put_along_axis(complete, first[:, None] + np.arange(weights.shape[1]), weights, axis=1)
+        complete = spread(*self.local(u), self.full_size)
         complete[np.isnan(u)] = np.nan
         return self._reduced(complete)
 
@@ -204,28 +196,24 @@ class Basis:
 
     def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
         """Evaluate the complete family as `local` does, at finite x to which the rule for outside was applied."""
-        raise NotImplementedError
+        return np.zeros(x.size, np.int32), self._derivative(x, 0)
 
     def _derivative(self, x: Array, order: int) -> Array:
-        """Evaluate the derivatives of eta of order 1 or 2 at finite x, (N, P)."""
+        """Evaluate the derivatives of eta of order 1, 2 (and 0, where no function vanishes) at finite x, (N, P)."""
         raise NotImplementedError
 
     def _quadrature(self) -> tuple[Array, int]:
         """Ends (c + 1,) of the cells, and Gauss-Legendre points in each, by which `penalty` integrates."""
         raise NotImplementedError
 
-    def _clipped(self, u: Array) -> Array:
-        """Apply the rule for values outside the interval; NaN stays NaN."""
+    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
+        """Apply the rule for outside, put the lower end (or 0) where a sample is missing, and mark those, if any."""
         if self.outside == "error" and (out := self.is_outside(u)).any():
             k, (lo, hi) = int(np.argmax(out)), span(self)
             raise DataError(f"Sample {k} of the input is {u[k]:g}, outside the interval [{lo:g}, {hi:g}] of the basis "
                             f"({int(out.sum())} such samples). Use data inside it, or outside='clamp', "
                             "'linear' or 'extrapolate'.")
-        return u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
-
-    def _inside(self, u: Array) -> tuple[Array, NDArray[np.bool_] | None]:
-        """Clip u, put the lower end (or 0) where a sample is missing, and mark them (None: no sample is missing)."""
-        x = self._clipped(u)
+        x = u if self.interval is None or self.outside == "extrapolate" else np.clip(u, *self.interval)
         missing = np.isnan(x)
         if not missing.any():
             return x, None
@@ -234,6 +222,15 @@ class Basis:
     def _reduced(self, complete: Array) -> Array:
         """Multiply the complete family by the contrast: remove the column that is redundant."""
         return complete if self.dropped is None else np.delete(complete, self.dropped, axis=1)
+
+
+def spread(first: NDArray[np.int32], weights: Array, size: int) -> Array:
+    """Return all values (N, size) of a family from those that do not vanish, as `Basis.local` returns them."""
+    if weights.shape[1] == size:
+        return weights
+    values = np.zeros((len(weights), size))
+    np.put_along_axis(values, first[:, None] + np.arange(weights.shape[1]), weights, axis=1)
+    return values
 
 
 def samples(u: ArrayLike) -> Array:
@@ -247,7 +244,6 @@ def samples(u: ArrayLike) -> Array:
 def span(basis: Basis) -> tuple[float, float]:
     """Return the interval of a basis, or refuse when it has none yet."""
     if basis.interval is None:
-        raise StructureError(
-            f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give interval=(lower, upper)."
-        )
+        raise StructureError(f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give "
+                             "interval=(lower, upper).")
     return basis.interval

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.bases.basis import Basis, Outside, span
@@ -17,15 +17,8 @@ from optid.errors import StructureError
 Function = Callable[[Array], ArrayLike]
 
 
-class _Dense(Basis):
-    """Functions given by their derivatives of order 0, 1 and 2, all of them at every sample."""
-
-    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
-        return np.zeros(x.size, np.int32), self._derivative(x, 0)
-
-
 @dataclass(frozen=True)
-class Polynomial(_Dense):
+class Polynomial(Basis):
     """Legendre polynomials of degrees 1..p on the interval mapped to [-1, 1]; extrapolation continues them.
 
     Attributes:
@@ -56,7 +49,7 @@ class Polynomial(_Dense):
 
 
 @dataclass(frozen=True)
-class Trigonometric(_Dense):
+class Trigonometric(Basis):
     """Columns cos(pi j v), sin(pi j v), j = 1..p, v = (u - middle) / (half_range * half width) (thesis eq. 3.19).
 
     A half_range above 1 makes the period longer than the interval: with 1 the two ends of f meet, and an odd f rings
@@ -102,7 +95,7 @@ class Trigonometric(_Dense):
 
 
 @dataclass(frozen=True)
-class Linear(_Dense):
+class Linear(Basis):
     """The identity, eta(u) = u: turns a Hammerstein model into a linear one. It needs no interval and extrapolates."""
 
     interval: tuple[float, float] | None = None
@@ -137,7 +130,7 @@ class Linear(_Dense):
 
 
 @dataclass(frozen=True)
-class UserFunctions(_Dense):
+class UserFunctions(Basis):
     """Functions given by the user, each vectorised over an array (N,) and none of them constant.
 
     A file stores their names only; loading it asks for the functions again.

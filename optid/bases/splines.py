@@ -1,4 +1,4 @@
-"""Local bases: hats, piecewise constants and B-splines on equal cells.
+"""Local bases: B-splines on equal cells, of degree 0 (piecewise constants), 1 (hats) and above.
 
 The complete family of each sums to one, so one function is dropped: the one nearest u = 0 (nearest the middle when 0 is
 outside the interval). The other coefficients are then differences to the dropped one.
@@ -8,20 +8,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.bases.basis import Basis, Outside, samples, span
-
-COMPILED = 16384
-"""Samples from which on loading the compiled loops pays."""
+from optid.bases.basis import Basis, Outside, span
 
 
-class _Cells(Basis):
-    """Functions on p equal cells; the shape matrices compare neighbouring coefficients of the complete family."""
+class _Splines(Basis):
+    """Splines on p equal cells; the shape matrices compare neighbouring control points of the complete family."""
 
     p: int
+    degree: Any
+    shape_exact = True
     _points: Any  # where the functions sit, one point each
+
+    @property
+    def full_size(self) -> int:
+        """Number of control points, p + degree: cells, nodes, or more."""
+        return self.p + self.degree
+
+    @property
+    def knots(self) -> Array:
+        """(p + 2 degree + 1,) ends of the cells, those of the interval repeated."""
+        return np.pad(np.linspace(*span(self), self.p + 1), self.degree, mode="edge")
 
     @property
     def dropped(self) -> int:
@@ -34,16 +43,16 @@ class _Cells(Basis):
         return np.diff(self.contrast, axis=0)
 
     def slope_rows(self) -> Array:
-        """(full_size - 1, P) differences over the width of a cell."""
-        return self.increments() / self._width
+        """(full_size - 1, P) control points of f', whose values lie between them; of steps, differences per cell."""
+        return self._control_points(1) if self.degree else self.increments() / self._width
 
     def curvature(self) -> Array:
         """(full_size - 2, P) changes of the slope rows."""
         return np.diff(self.slope_rows(), axis=0)
 
     def penalty(self, order: int = 2) -> Array:
-        """Integral of (f^(order))^2, exact for hats and order 1; else squared differences over the cell width."""
-        if order not in (1, 2):
+        """Integral of (f^(order))^2, exact up to the degree; beyond it squared differences over the cell width."""
+        if order not in (1, 2) or order <= self.degree:
             return super().penalty(order)
         rows = self.slope_rows() * np.sqrt(self._width) if order == 1 else self.curvature() / np.sqrt(self._width)
         return rows.T @ rows
@@ -53,19 +62,44 @@ class _Cells(Basis):
         lo, hi = span(self)
         return (hi - lo) / self.p
 
-    @property
-    def _edges(self) -> Array:
-        return np.linspace(*span(self), self.p + 1)
-
     def _split(self, u: Array) -> tuple[NDArray[np.int32], Array]:
         """Return the cell (N,) of each finite sample, and its position in cells from the lower end."""
         lo, hi = span(self)
         x = (u - lo) * (self.p / (hi - lo))
         return np.clip(x, 0, self.p - 1).astype(np.int32), x
 
+    def _quadrature(self) -> tuple[Array, int]:
+        return np.linspace(*span(self), self.p + 1), self.degree
+
+    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
+        cell, position = self._split(x)
+        if self.degree != 1:
+            return cell, _not_vanishing(x, cell, self.knots, self.degree)
+        weights = np.empty((x.size, 2))
+        np.subtract(position, cell, out=weights[:, 1])
+        np.subtract(1.0, weights[:, 1], out=weights[:, 0])
+        return cell, weights
+
+    def _derivative(self, x: Array, order: int) -> Array:
+        if order > self.degree:
+            return np.zeros((x.size, self.size))
+        cell, control, degree = self._split(x)[0], self._control_points(order), self.degree - order
+        if degree == 0:
+            return control[cell]
+        weights = _not_vanishing(x, cell, self.knots[order : len(self.knots) - order], degree)
+        return sum((weights[:, [i]] * control[cell + i] for i in range(degree + 1)), np.zeros((x.size, self.size)))
+
+    def _control_points(self, order: int) -> Array:
+        """Control points of the derivative of an order as rows that act on mu."""
+        rows, knots = self.contrast, self.knots
+        for degree in range(self.degree, self.degree - order, -1):
+            knots = knots[1:-1]
+            rows = np.diff(rows, axis=0) * (degree / (knots[degree:] - knots[:-degree]))[:, None]
+        return rows
+
 
 @dataclass(frozen=True)
-class Triangular(_Cells):
+class Triangular(_Splines):
     """Hats on p equal cells: f is piecewise linear and mu_j = f(u_j) - f(u_ref) at the p other nodes (thesis eq. 3.14).
 
     u_ref is the node nearest 0, or nearest the middle when 0 is outside the interval. Extrapolation continues the end
@@ -79,43 +113,18 @@ class Triangular(_Cells):
     interval: tuple[float, float] | None = None
     outside: Outside = "clamp"
     _sizes = {"p": (1, "cells")}
-    shape_exact = True
-
-    @property
-    def full_size(self) -> int:
-        """Number of nodes, p + 1."""
-        return self.p + 1
+    degree = 1
 
     @property
     def nodes(self) -> Array:
         """(p + 1,) nodes, in units of the input."""
-        return self._edges
+        return np.linspace(*span(self), self.p + 1)
 
     _points = nodes
 
-    def local(self, u: ArrayLike) -> tuple[NDArray[np.int32], Array]:
-        """Evaluate the two hats of the cell of each sample; compiled for long records."""
-        u = samples(u)
-        if u.size < COMPILED:
-            return super().local(u)
-        from optid.bases import kernels
-
-        lo, hi = span(self)
-        return kernels.hats(self._clipped(u), lo, self.p / (hi - lo), self.p)
-
-    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
-        cell, position = self._split(x)
-        weights = np.empty((x.size, 2))
-        np.subtract(position, cell, out=weights[:, 1])
-        np.subtract(1.0, weights[:, 1], out=weights[:, 0])
-        return cell, weights
-
-    def _derivative(self, x: Array, order: int) -> Array:
-        return self.slope_rows()[self._split(x)[0]]
-
 
 @dataclass(frozen=True)
-class PiecewiseConstant(_Cells):
+class PiecewiseConstant(_Splines):
     """Steps on p equal cells: f has one level a cell, mu the levels less that of the reference cell.
 
     The last cell contains its right end. `slopes` is zero; the shape matrices and the penalty compare levels between
@@ -129,29 +138,18 @@ class PiecewiseConstant(_Cells):
     interval: tuple[float, float] | None = None
     outside: Outside = "clamp"
     _sizes = {"p": (2, "cells")}
-    shape_exact = True
-
-    @property
-    def full_size(self) -> int:
-        """Number of cells."""
-        return self.p
+    degree = 0
 
     @property
     def centres(self) -> Array:
         """(p,) middles of the cells."""
-        return (self._edges[:-1] + self._edges[1:]) / 2
+        return (self.knots[:-1] + self.knots[1:]) / 2
 
     _points = centres
 
-    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
-        return self._split(x)[0], np.ones((x.size, 1))
-
-    def _derivative(self, x: Array, order: int) -> Array:
-        return np.zeros((x.size, self.size))
-
 
 @dataclass(frozen=True)
-class BSpline(_Cells):
+class BSpline(_Splines):
     """B-splines of a degree on p equal cells with repeated end knots; extrapolation continues the end polynomials.
 
     The rows of `increments`, `curvature` and `slope_rows` act on control points: sufficient for every degree, and also
@@ -169,55 +167,14 @@ class BSpline(_Cells):
     _sizes = {"p": (1, "cells"), "degree": (1, "degrees of a B-spline")}
 
     @property
-    def shape_exact(self) -> bool:
+    def shape_exact(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """True up to degree 2."""
         return self.degree <= 2
 
     @property
-    def full_size(self) -> int:
-        """Number of control points, p + degree."""
-        return self.p + self.degree
-
-    @property
-    def knots(self) -> Array:
-        """(p + 2 degree + 1,) knots, the ends repeated."""
-        return np.pad(self._edges, self.degree, mode="edge")
-
-    @property
     def _points(self) -> Array:
         """Greville abscissae of the control points."""
-        knots = self.knots
-        return np.array([knots[i + 1 : i + self.degree + 1].sum() for i in range(self.full_size)]) / self.degree
-
-    def slope_rows(self) -> Array:
-        """(full_size - 1, P) control points of f'; its values lie between their extremes."""
-        return self._control_points(1)
-
-    def penalty(self, order: int = 2) -> Array:
-        """Integral of (f^(order))^2, exact; for degree 1 and order 2 squared changes of slope over the cell width."""
-        return super().penalty(order) if self.degree == 1 and order == 2 else Basis.penalty(self, order)
-
-    def _quadrature(self) -> tuple[Array, int]:
-        return self._edges, self.degree
-
-    def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
-        cell, _ = self._split(x)
-        return cell, _not_vanishing(x, cell, self.knots, self.degree)
-
-    def _derivative(self, x: Array, order: int) -> Array:
-        lower, degree = self.knots[order : len(self.knots) - order], self.degree - order
-        cell, _ = self._split(x)
-        weights = _not_vanishing(x, cell, lower, degree)
-        control = self._control_points(order)
-        return sum((weights[:, [i]] * control[cell + i] for i in range(degree + 1)), np.zeros((x.size, self.size)))
-
-    def _control_points(self, order: int) -> Array:
-        """Control points of the derivative of an order as rows that act on mu."""
-        rows, knots = self.contrast, self.knots
-        for degree in range(self.degree, self.degree - order, -1):
-            knots = knots[1:-1]
-            rows = np.diff(rows, axis=0) * (degree / (knots[degree:] - knots[:-degree]))[:, None]
-        return rows
+        return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
 
 def _not_vanishing(x: Array, cell: NDArray[np.int32], knots: Array, degree: int) -> Array:

@@ -5,8 +5,7 @@ x bounds the optimum from below, however inaccurate w is: bad multipliers give a
 
 * Least squares ``F = ‖R z - s‖² + remainder``: with the constraints taken by their tangents at z0, which bound convex
   ones from below, the minimum is known in closed form, ``L(z0) - ‖R^-T grad L(z0)‖² / 4`` for any z0. Where the solver
-  gives no multipliers, or poor ones, those of linear constraints are computed here by least-distance programming
-  (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
+  gives no multipliers, or poor ones, those of linear constraints are computed here by least-distance programming.
 * Any other smooth convex F: L is convex, so that its tangent at the point bounds it from below; what is left of its
   gradient there counts over a box of `REACH` times the size of every variable around the point, as far as bounds that
   the variable carries let it go. Of a quadratic F in few variables only the part of the gradient counts that its
@@ -16,16 +15,15 @@ x bounds the optimum from below, however inaccurate w is: bad multipliers give a
 import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import nnls
 
+from optid.arrays import Array
 from optid.certificate.lifting import lift_linear
-from optid.program.gradients import flat_value, jacobians
-from optid.program.judging import Lagrangian, has_bounds
+from optid.program.gradients import flat_value
+from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
 from optid.structures.least_squares import LeastSquaresStructure
-
-Array = np.ndarray
+from optid.structures.multipliers import least_distance
 
 CLOSED = 1e-6
 """Relative gap up to which a convex programme counts as solved to its optimum."""
@@ -80,11 +78,11 @@ def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: V
 
 def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float | None:
     """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
-    lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.user_constraints if name in duals})
-    if any(name not in duals for name in program.user_constraints) or not lagrangian.known:
+    lagrangian = Lagrangian.of(program, duals, program.user_constraints)
+    if lagrangian is None:
         return None
     root = form.problem.root
-    z = np.concatenate([*(flat_value(program.variables[name]) for name in form.linear), np.zeros(0)])
+    z = form.flat({name: program.variables[name].value for name in form.linear})
     pull = 2.0 * root.T @ (root @ z - form.problem.target)
     gradient, inner = lagrangian.total, {program.variables[name].id for name in form.linear}
     pull = pull + np.concatenate([*(gradient[program.variables[name].id] for name in form.linear), np.zeros(0)])
@@ -95,13 +93,9 @@ def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Value
 
 
 def _tangent_bound(program: Program, duals: Values, objective: float) -> float | None:
-    if any(name not in duals for name in program.constraints):
-        return None
-    lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
-    if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
-        return None
-    variables = list(program.variables.values())
-    if any(lagrangian.free_part(variable) is None for variable in variables):
+    lagrangian, variables = Lagrangian.of(program, duals, program.constraints), list(program.variables.values())
+    if lagrangian is None or not lagrangian.add(program.objective.expr, np.ones(1)) or any(
+            lagrangian.free_part(variable) is None for variable in variables):
         return None
     plain = sum(_descent(lagrangian, variable) for variable in variables)
     gradient = np.concatenate([lagrangian.total[v.id] for v in variables])
@@ -118,23 +112,18 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> float |
 def _hessian(program: Program) -> Array:
     """Second derivatives of a quadratic objective: differences of its gradient, which are exact."""
     variables = list(program.variables.values())
-    point = [np.array(v.value, dtype=float) for v in variables]
-    edges = np.cumsum([0, *(v.size for v in variables)])
 
     def gradient() -> Array:
-        found = np.zeros(edges[-1])
-        for variable, slope in (jacobians(program.objective.expr) or {}).items():
-            place = next(i for i, v in enumerate(variables) if v.id == variable.id)
-            found[edges[place] : edges[place + 1]] = slope.toarray().ravel()
-        return found
+        lagrangian = Lagrangian(program)
+        lagrangian.add(program.objective.expr, np.ones(1))
+        return np.concatenate([lagrangian.total[v.id] for v in variables])
 
     columns, base = [], gradient()
-    for variable, value in zip(variables, point):
+    for variable in variables:
+        value = np.array(variable.value, dtype=float)
         size = float(np.max(np.abs(value), initial=0.0)) or 1.0
-        for j in range(variable.size):
-            moved = np.ravel(value, order="F")
-            moved[j] += size
-            variable.save_value(moved.reshape(variable.shape, order="F"))
+        for step in size * np.eye(variable.size):
+            variable.save_value(value + step.reshape(variable.shape, order="F"))
             columns.append((gradient() - base) / size)
         variable.save_value(value)
     matrix = np.array(columns)
@@ -152,44 +141,30 @@ def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
     if variable.attributes["symmetric"]:
         gradient = (gradient + gradient.T) / 2
     room = np.full(variable.shape, _width(variable))
-    if has_bounds(variable):
-        lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+    if (bounds := bounds_of(variable)) is not None:
         value = np.asarray(variable.value, dtype=float)
-        room = np.clip(np.where(gradient > 0, value - lower, upper - value), 0.0, room)
+        room = np.clip(np.where(gradient > 0, value - bounds[0], bounds[1] - value), 0.0, room)
     return float(np.sum(np.abs(gradient) * room))
 
 
 def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
     problem = form.problem
-    found = lift_linear(program, form.linear, len(problem.target))
-    linear = found.linear()
-    if found.refused or linear is None:
+    lifted = lift_linear(program, form.linear, len(problem.target))
+    linear = lifted.linear
+    if lifted.refused or not len(linear.right):
         return None
-    rows, right, equal = linear
     estimate = solve_triangular(problem.root, problem.target)
-    slopes = solve_triangular(problem.root, rows.T, trans=1).T
+    slopes = solve_triangular(problem.root, linear.rows.T, trans=1).T
     lengths = np.linalg.norm(slopes, axis=1)
     lengths[lengths == 0] = 1.0
-    slopes, need = slopes / lengths[:, None], (rows @ estimate - right) / lengths
-    size = float(np.max(np.abs(need), initial=0.0))
+    need = (linear.rows @ estimate - linear.right) / lengths
+    size = float(np.max(np.abs(need), initial=0.0)) or 1.0
+    try:  # x = R (z - estimate): minimise |x|² subject to slopes x + need <= 0
+        weights = least_distance(slopes / lengths[:, None], need / size, linear.equality)
+    except RuntimeError:
+        return None
+    if weights is None:
+        return None
     counts = [sum(member.size for member in group) for group in program.user_constraints.values()]
-    if not size:
-        return {name: np.zeros(count) for name, count in zip(program.user_constraints, counts)}
-    # x = R (z - estimate): minimise |x|² subject to slopes x + need <= 0, equalities as two inequalities
-    both = np.vstack([-slopes, slopes[equal]])
-    wanted = np.concatenate([need, -need[equal]]) / size
-    target = np.zeros(both.shape[1] + 1)
-    target[-1] = 1.0
-    try:
-        weights, _ = nnls(np.vstack([both.T, wanted]), target, maxiter=30 * len(both))
-    except RuntimeError:  # its iterations did not suffice
-        return None
-    residual = target - np.vstack([both.T, wanted]) @ weights
-    if not residual[-1] > 1e-12:  # the polyhedron is empty as far as the rounding tells
-        return None
-    weights = 2.0 * size * weights / residual[-1]
-    multipliers = weights[: len(slopes)].copy()
-    multipliers[equal] -= weights[len(slopes) :]
-    return dict(zip(program.user_constraints, np.split(multipliers / lengths, np.cumsum(counts)[:-1])))
-
+    return dict(zip(program.user_constraints, np.split(2.0 * size * weights / lengths, np.cumsum(counts)[:-1])))

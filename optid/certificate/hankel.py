@@ -8,23 +8,21 @@ stands in at most alpha of its columns. Hence (Eckart and Young on the projected
     ‖y - yhat‖² >= (1/alpha) sum_{i>n} sigma_i²( H(y) Pi_perp )        for every number alpha of block rows.
 
 It holds for that simulator alone. Predictors that use y through an observer gain (one-step and innovation forms) reach
-errors below it, and a free run feeds its own outputs back, for which phi is not known: both are refused.
+errors below it, and a free run feeds its own outputs back, for which phi is not known.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import RankError, StructureError
-from optid.program.solution import Bound, relative_gap
+from optid.errors import OptidError, RankError, StructureError
+from optid.program.solution import Bound
+from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import Expand, hankel_statistics
 
-CRITERIA = ("measured feedback", "simulation", "one-step", "innovation", "free run")
-"""What an error may have been measured with; "simulation" is that of a model without feedback."""
-
-MOST_ROWS = 60  # block rows tried where none are given
+WORK = 2e9  # operations of the statistics beyond which a bound is not worth its time
 ROUNDING = {"qr": 1e-13, "gram": 1e-15}  # of the projected energy, the second per squared condition number
 
 
@@ -37,13 +35,11 @@ class HankelBounds:
         values: (len(block_rows), orders) squared error, in squared units of the (weighted) outputs; column n is for
             models of order n; NaN where alpha is too small to say anything about n.
         energy: squared norm of the weighted outputs over the samples in complete windows, the yardstick.
-        feedback: whether functions of the output are among the regressors.
     """
 
     block_rows: tuple[int, ...]
     values: Array
     energy: float
-    feedback: bool
 
     def value(self, n: int) -> tuple[float, int]:
         """Return the largest bound for order n and its number of block rows.
@@ -64,51 +60,25 @@ class HankelBounds:
         allowed = [n for n in range(self.values.shape[1]) if self.value(n)[0] <= error]
         return allowed[0] if allowed else self.values.shape[1]
 
-    def bound(self, n: int, error: float, criterion: str = "measured feedback") -> Bound:
-        """Return the certificate of a fit of order n.
-
-        Args:
-            n: order of the model.
-            error: squared error it reached over the whole record, in the units of the bound.
-            criterion: how that error was measured, one of `CRITERIA`.
+    def bound(self, n: int, error: float) -> Bound:
+        """Return the certificate of a fit of order n with a squared simulation error, in the units of the bound.
 
         Raises:
-            StructureError: a criterion the bound does not hold for, or a model that does better than the bound, which
-                then was measured otherwise than stated.
+            StructureError: an error below the bound, which then is no error of the simulator with measured feedback.
         """
-        check_criterion(criterion, self.feedback)
         value, rows = self.value(n)
         if error < value * (1 - 1e-9) - 1e-12 * self.energy:
             raise StructureError(f"an error of {error:.6g} lies below the bound {value:.6g} for order {n}: it was not "
-                                 f"measured by the simulator with {criterion} on this record and these functions")
-        gap = relative_gap(error, value, self.energy)
-        proved = gap < 1e-6
+                                 "measured by the simulator with measured feedback on this record and these functions")
         need = self.smallest_order(error)
         reason = f"no model of order {n} with these functions simulates with a squared error below {value:.4g}"
         if need == n and n:
             reason += f"; order {n - 1} cannot reach what order {n} reached"
-        return Bound(value, proved, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
-
-
-def check_criterion(criterion: str, feedback: bool) -> None:
-    """Refuse errors the bound says nothing about.
-
-    Raises:
-        StructureError: an unknown criterion, one-step or innovation form, or a free run with feedback.
-    """
-    if criterion not in CRITERIA:
-        raise StructureError(f"the criterion is one of {', '.join(CRITERIA)}; got {criterion!r}")
-    if criterion in ("one-step", "innovation"):
-        raise StructureError(f"the Hankel bound does not hold for {criterion} errors: a predictor that corrects its "
-                             "state by measured outputs can do better. Give the error of the simulation with measured "
-                             "feedback")
-    if feedback and criterion in ("free run", "simulation"):
-        raise StructureError("the Hankel bound does not hold for a free run with nonlinear feedback, which feeds its "
-                             "own outputs back. Give the error of the simulation with measured feedback")
+        return Bound(value, False, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
 
 
 def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Sequence[int], outputs: Sequence[int],
-                  feedback: Sequence[int] = (), largest: int = 10, block_rows: Sequence[int] | None = None,
+                  block_rows: Sequence[int], feedback: Sequence[int] = (), largest: int = 10,
                   weights: Array | None = None) -> HankelBounds:
     """Bound the simulation error of every model of order 0 to ``largest``.
 
@@ -119,18 +89,17 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         expand: raw channels -> signals, as in `optid.statistics.hankel.hankel_statistics`; None for the channels.
         inputs: positions of the functions of the inputs among the signals.
         outputs: positions of the outputs.
+        block_rows: the alphas to try.
         feedback: positions of the functions of the outputs that are fed back; a linear function of the outputs among
             them makes the bound zero.
         largest: largest order of interest.
-        block_rows: the alphas to try; by default up to six that the record supports.
         weights: (l,) by which the outputs are multiplied in the error.
 
     Raises:
         StructureError: a number of block rows below two.
         RankError: the record is too short for any of them.
     """
-    signals = (expand or (lambda raw: raw))(np.asarray(records[0], dtype=float)[:1]).shape[1]
-    tried = _alphas(records, signals, largest) if block_rows is None else tuple(sorted({int(a) for a in block_rows}))
+    tried = tuple(sorted({int(a) for a in block_rows}))
     if not tried or tried[0] < 2:
         raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
     scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
@@ -150,12 +119,38 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         values[position, left.size :] = np.nan
         energy = max(energy, whole)
     if np.all(np.isnan(values)):
-        raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of {signals} "
-                        "signals; use a longer record or fewer functions")
-    return HankelBounds(tried, values, energy, bool(len(feedback)))
+        raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of "
+                        f"{len(inputs) + len(outputs) + len(feedback)} signals; use a longer record or fewer functions")
+    return HankelBounds(tried, values, energy)
 
 
-def _alphas(records: Sequence[Array], signals: int, largest: int) -> tuple[int, ...]:
-    length = max(len(record) for record in records)
-    most = max(2, min(MOST_ROWS, length // (3 * max(signals, 1))))
-    return tuple(int(a) for a in np.unique(np.round(np.geomspace(min(largest + 2, most), most, 6))))
+def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, weights: Array, error: float,
+                     block_rows: int, said: str, applies: bool = True) -> Bound:
+    """Return the bound that holds for every model of the order with these functions, or none with the reason.
+
+    Args:
+        records: raw channels [u | y] per experiment.
+        expansion: the signals.
+        n: order of the model.
+        weights: (l,) by which every output was multiplied in the error.
+        error: its value, a squared error of the simulator with measured feedback.
+        block_rows: of the fit; the bound is the best of one, two and four times as many.
+        said: what else there is to say about optimality.
+        applies: whether no observer gain corrects the state and no instruments stand for the feedback; for anything
+            else the bound does not hold and is not given.
+    """
+    if not applies:
+        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
+    x = expansion.with_simulated(False)
+    count, signals = sum(len(record) for record in records), x.p + x.q + x.l
+    longest = max(len(record) for record in records)
+    tried = [a for a in (block_rows, 2 * block_rows, 4 * block_rows)
+             if a > 1 and 2 * a * signals < longest and count * (a * signals) ** 2 <= WORK]
+    if not tried:
+        return Bound.none(said)
+    try:
+        found = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=n, block_rows=tried,
+                              weights=weights).bound(n, error)
+    except OptidError as reason:
+        return Bound.none(f"{said}; no Hankel bound: {reason}")
+    return replace(found, reason=f"{said}; {found.reason}")

@@ -7,6 +7,7 @@ from typing import Any
 import cvxpy as cp
 
 from optid.certificate.lifting import lift_exact, places
+from optid.program.expressions import flat
 from optid.program.gradients import flat_value, jacobians
 from optid.program.limits import EQUALITIES
 from optid.program.program import Program
@@ -67,12 +68,12 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
         found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
     if form is not None and where is not None:
         lifted = lift_exact(program.without(*(set(program.user_constraints) - set(names))), form)
-        lifted.rows, lifted.right, lifted.equality = [], [], []  # these are there already
+        count = len(lifted.linear.right)  # these are there already
         lifted.add_products(form.problem)
-        rows = lifted.linear()
-        if rows is not None:
-            thetas = [cp.vec(theta, order="F") for theta in where.stand_in.values()]
-            found.append(rows[0][:, form.problem.linear :] @ cp.hstack(thetas) <= rows[1])
+        rows = lifted.linear.rows[count:]
+        if len(rows):
+            thetas = [flat(theta) for theta in where.stand_in.values()]
+            found.append(rows[:, form.problem.linear :] @ cp.hstack(thetas) <= lifted.linear.right[count:])
     if not found:
         return True
     problem = cp.Problem(cp.Minimize(0), found)
@@ -88,7 +89,5 @@ def _linearised(member: Any) -> Any:
         return cp.Constant(0.0) <= 0
     linear: Any = flat_value(expression)
     for variable, slope in slopes.items():
-        flat = variable if variable.ndim == 1 else cp.vec(variable, order="F")
-        linear = linear + slope @ (flat - flat_value(variable))
-    equal = isinstance(member, EQUALITIES)
-    return linear == 0 if equal else linear <= 0
+        linear = linear + slope @ (flat(variable) - flat_value(variable))
+    return linear == 0 if isinstance(member, EQUALITIES) else linear <= 0

@@ -6,28 +6,19 @@ constraints, products of constraints), whose moment matrix proposes a better poi
 recomputed in closed form from its multipliers after a Cholesky check; nothing is copied from a solver.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
-from optid.certificate.ascent import ascend, rotation
-from optid.certificate.minors import Block, Lagrangian, free_mask, project_minors, tangent_minors
+from optid.certificate.minors import Block, Lagrangian, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
-from optid.certificate.shape_duals import (
-    ACTIVE,
-    Linear,
-    Multipliers,
-    align_cuts,
-    as_cones,
-    as_linear,
-    kkt_multipliers,
-    sign_free_cut,
-)
+from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_constraints, kkt_multipliers, sign_free_cut
 from optid.errors import StructureError
-from optid.program.solution import Bound
+from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
+from optid.structures.whitening import block_slices
 
 TOLERANCE = 1e-8
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
@@ -40,7 +31,7 @@ class Evidence:
     """Multipliers of a bound, in the whitened coordinates of ``core``.
 
     Attributes:
-        core: coordinates; ``core.whitening.matrix()`` is the change K.
+        core: coordinates; ``core.whitening.columns`` is the change of coordinates.
         minors: (k, k) combination of minors.
         cuts: by block, weights (r, r, nb, nb): ``cuts[j, k]`` is the matrix W >= 0 of the product of rows j and k.
         linear: (r,) multipliers of the constraints on the lifted vector.
@@ -50,11 +41,6 @@ class Evidence:
     minors: Array
     cuts: dict[int, Array]
     linear: Array
-
-    def forms(self) -> Array:
-        """The quadratic form of the minors in the original coordinates of the core (k, k)."""
-        change = self.core.whitening.matrix()
-        return change.T @ self.minors @ change
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +69,8 @@ class Case:
         bs: (nb_i,) each, of unit length.
         objective: the objective around the point.
         cones: constraint matrices by block.
-        multipliers: KKT multipliers.
+        nu: KKT multipliers (r_i,) of the cones, by block.
+        lam: KKT multipliers (r,) of the linear constraints.
         linear: constraints on the lifted vector.
         began: clock at the start.
     """
@@ -94,15 +81,15 @@ class Case:
     bs: list[Array]
     objective: Lagrangian
     cones: dict[int, Array]
-    multipliers: Multipliers
-    linear: Linear | None
+    nu: dict[int, Array]
+    lam: Array
+    linear: Linear
     began: float
 
     @property
     def blocks(self) -> list[Block]:
         """Position and shape of every block of the core."""
-        edges = np.cumsum([self.core.linear, *(p * nb for p, nb in self.core.shapes)])
-        return [(slice(int(a), int(b)), shape) for a, b, shape in zip(edges[:-1], edges[1:], self.core.shapes)]
+        return list(zip(block_slices(self.core.shapes, self.core.linear), self.core.shapes))
 
     @property
     def vanishing(self) -> list[bool]:
@@ -122,17 +109,13 @@ class Case:
         for i, cone in self.cones.items():
             terms = np.abs(cone) @ np.abs(self.mus[i])
             found.append(-(cone @ self.mus[i]) / np.maximum(terms, np.finfo(float).tiny))
-        if self.linear is not None:
-            slack, terms = self.linear.slack(self.objective.z)
-            excess = np.where(self.linear.equality, np.abs(slack), -slack)
-            found.append(excess / np.maximum(terms, np.finfo(float).tiny))
+        slack, terms = self.linear.slack(self.objective.z)
+        found.append(np.where(self.linear.equality, np.abs(slack), -slack) / np.maximum(terms, np.finfo(float).tiny))
         return float(np.concatenate(found).max())
 
     def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
         """The objective with the linear terms, at the KKT multipliers or others."""
-        if self.linear is None:
-            return self.objective
-        chosen = self.multipliers.linear if multipliers is None else multipliers
+        chosen = self.lam if multipliers is None else multipliers
         return self.objective.with_linear(self.linear.rows, self.linear.slack(self.objective.z)[0], chosen)
 
     def cut_form(self, cuts: dict[int, Array]) -> Array | None:
@@ -148,19 +131,18 @@ class Case:
         return form
 
 
-def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = None, effort: str = "sdp",
-            steps: int = 100, max_size: int = 700, core: Core | None = None) -> Certification:
+def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None = None, linear: Linear | None = None,
+            effort: str = "sdp", steps: int = 100, max_size: int = 700) -> Certification:
     """Bound the global optimum from below and try to prove that a local solution attains it.
 
     Args:
         problem: the least-squares problem.
         point: a local solution, of the constrained problem where there are constraints.
-        cones: by block, None or C_i (r_i, P_i): C_i mu_i >= 0 while the sign of b_i is free.
-        linear: (E, f, equality) on the lifted vector z = [w; vec Theta]: E z <= f, or = where the mask is set.
+        cones: by block C_i (r_i, P_i): C_i mu_i >= 0 while the sign of b_i is free.
+        linear: constraints on the lifted vector z = [w; vec Theta].
         effort: last rung of the ladder: "instant", "ascent" or "sdp".
         steps: of the ascent, one eigenvalue decomposition each.
         max_size: number of multipliers above which the SDP is not attempted.
-        core: the reduced problem if at hand; used only without constraints.
 
     Returns:
         The bound, its gap and, after an SDP that did not prove the point, points to restart from.
@@ -170,8 +152,10 @@ def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = 
     """
     if effort not in EFFORTS:
         raise StructureError(f"effort must be one of {EFFORTS}, not {effort!r}")
-    case = prepare(problem, point, as_cones(cones, problem), as_linear(linear, problem), core)
-    if not case.core.shapes and case.linear is None:
+    cones, linear = cones or {}, linear or Linear.none(len(problem.target))
+    check_constraints(cones, linear, problem)
+    case = prepare(problem, point, cones, linear)
+    if not case.core.shapes and not len(linear.right):
         return conclude(case, "exact", "linear least squares", case.objective.gram, {})
     cuts = instant_cuts(case)
     minors = tangent(case, cuts)
@@ -181,7 +165,7 @@ def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = 
     risen, taken = rise(case, minors, cuts, steps)
     if risen is None:
         found = max((conclude(case, "ascent", "multipliers shrunk until positive definite", part * minors,
-                              {i: part * weights for i, weights in cuts.items()}, part * case.multipliers.linear)
+                              {i: part * weights for i, weights in cuts.items()}, part * case.lam)
                      for part in PARTS), key=lambda attempt: attempt.bound.value)
     else:
         found = conclude(case, "ascent", f"{taken} projections", risen, cuts)
@@ -194,33 +178,31 @@ def certify(problem: RankOne, point: Point, *, cones: Any = None, linear: Any = 
     return relaxed(case, found, steps)
 
 
-def prepare(problem: RankOne, point: Point, cones: dict[int, Array], linear: Linear | None,
-            core: Core | None = None) -> Case:
+def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear) -> Case:
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
     began = perf_counter()
-    keep_linear = linear is not None and bool(linear.rows[:, :problem.linear].any())
-    if core is None or cones or linear is not None:
-        keep = tuple(cones) if linear is None else tuple(range(len(problem.blocks)))
-        core = reduce(problem, keep, keep_linear)
+    keep_linear = bool(linear.rows[:, :problem.linear].any())
+    core = reduce(problem, tuple(range(len(problem.blocks)) if len(linear.right) else cones), keep_linear)
     w, mus, bs = core.factors(point)
     white = {core.kept.index(i): core.whitening.cone(core.kept.index(i), cone) for i, cone in cones.items()}
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]
-    z = np.concatenate([w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
+    z = np.concatenate([w, *(np.outer(b, mu).ravel() for mu, b in zip(mus, bs))])
     residual = core.root @ z - core.target
     slope = core.root.T @ residual
     value = float(residual @ residual) + problem.remainder
-    if linear is not None:
-        rows = linear.rows if keep_linear else linear.rows[:, problem.linear:]
-        linear = Linear(core.whitening.columns(rows), linear.right, linear.equality)
-    multipliers = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, multipliers, linear, began)
+    if len(linear.right):
+        linear = replace(linear, rows=core.whitening.columns(linear.rows[:, 0 if keep_linear else problem.linear:]))
+    else:
+        linear = Linear.none(len(z))
+    nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
+    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
     """Sign-free cuts at the KKT multipliers: they cancel what the constraints leave of the gradient."""
-    return {i: np.multiply.outer(sign_free_cut(case.multipliers.cones[i], cone, case.mus[i]),
+    return {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]),
                                  np.outer(case.bs[i], case.bs[i])) for i, cone in case.cones.items()}
 
 
@@ -260,21 +242,21 @@ def onto_minors(case: Case, matrix: Array) -> Array:
 def relaxed(case: Case, found: Certification, steps: int) -> Certification:
     """The SDP: its bound made valid by shrinking, then its multipliers aligned with the point for an exact proof."""
     method = "product cuts" if case.cones else "sdp"
-    relaxation = relax(case.objective, case.blocks, case.cones, case.linear)
-    if relaxation is None:
+    solved = relax(case.objective, case.blocks, case.cones, case.linear)
+    if solved is None:
         return replace(found, bound=replace(found.bound, reason=f"{found.bound.reason}; the SDP solver failed"))
-    better = tuple(_candidate(case, moment) for moment in relaxation.moments.T)
-    minors = onto_minors(case, relaxation.minors)
+    raw, weights_by_block, linear, moments = solved
+    better, minors = tuple(_candidate(case, moment) for moment in moments.T), onto_minors(case, raw)
     for shrink in SHRINKS:
-        cuts = {i: (1 - shrink) * weights for i, weights in relaxation.cuts.items()}
-        bound = conclude(case, method, "relaxation", (1 - shrink) * minors, cuts, relaxation.linear, better)
+        cuts = {i: (1 - shrink) * weights for i, weights in weights_by_block.items()}
+        bound = conclude(case, method, "relaxation", (1 - shrink) * minors, cuts, linear, better)
         if np.isfinite(bound.bound.value):
             found = bound if bound.bound.value > found.bound.value else replace(found, better=better)
             break
     if found.bound.proved:
         return found
-    cuts = {i: align_cuts(weights, case.cones[i], case.mus[i], case.bs[i], case.multipliers.cones[i])
-            for i, weights in relaxation.cuts.items()}
+    cuts = {i: align_cuts(weights, case.cones[i], case.mus[i], case.bs[i], case.nu[i])
+            for i, weights in weights_by_block.items()}
     aligned = tangent(case, cuts) + free_part(case, minors)
     risen, taken = rise(case, aligned, cuts, steps)
     if risen is not None:
@@ -306,9 +288,9 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     """Recompute the bound from its multipliers and say what it proves."""
     value = case.objective.value
     bound = float(case.lagrangian(linear).bound(minors, case.cut_form(cuts)))
-    gap = float(case.problem.gap(value, bound))
+    gap = relative_gap(value, bound, case.problem.scale)
     broken = case.violation()
-    undercut = case.problem.gap(bound, value) > TOLERANCE
+    undercut = relative_gap(bound, value, case.problem.scale) > TOLERANCE
     proved = gap <= TOLERANCE and not undercut and broken <= ACTIVE
     if broken > ACTIVE or undercut:
         reason = f"not proved: the point violates its constraints (relative violation {broken:.1e})"
@@ -318,6 +300,6 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
         reason = f"not proved, relative gap {gap:.1e}: {how}"
     else:
         reason = f"not proved, no finite bound: {how}"
-    evidence = Evidence(case.core, minors, cuts, case.multipliers.linear if linear is None else linear)
+    evidence = Evidence(case.core, minors, cuts, case.lam if linear is None else linear)
     return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
                          () if proved else better)

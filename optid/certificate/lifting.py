@@ -5,17 +5,18 @@ carries. Anything else leaves the fit without a proof, and the reason names the 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
-from optid.program.gradients import affine_parts
+from optid.certificate.shape_duals import Linear
+from optid.program.gradients import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
-from optid.program.solution import Bound
+from optid.program.solution import Bound, relative_gap
 from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.rank_one import Point, RankOne
 
@@ -26,25 +27,26 @@ class Lifted:
 
     Attributes:
         size: length of z.
-        rows: rows E of ``E z <= f`` (or ``=``), their right-hand sides and whether they are equalities.
+        linear: the rows on z.
         cones: {block: rows C of ``C mu >= 0``}.
         directions: {block: rows B of ``B b >= 0``}.
         refused: name of the first constraint that has neither form, "" where all have.
     """
 
     size: int
-    rows: list[np.ndarray] = field(default_factory=list)
-    right: list[float] = field(default_factory=list)
-    equality: list[bool] = field(default_factory=list)
+    linear: Linear = field(init=False)
     cones: dict[int, np.ndarray] = field(default_factory=dict)
     directions: dict[int, np.ndarray] = field(default_factory=dict)
     refused: str = ""
 
+    def __post_init__(self) -> None:
+        self.linear = Linear.none(self.size)
+
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
-        self.rows += list(rows)
-        self.right += [float(value) for value in right]
-        self.equality += [equal] * len(rows)
+        old = self.linear
+        self.linear = Linear(np.vstack([old.rows, rows]), np.append(old.right, right),
+                             np.append(old.equality, np.full(len(rows), equal)))
 
     def add_products(self, problem: RankOne) -> list[int]:
         """Turn constraints on both factors of a block into rows on Theta, and return the blocks with some on b alone.
@@ -56,18 +58,11 @@ class Lifted:
             if i not in self.cones:
                 alone.append(i)
                 continue
-            start, (p, q) = _block_starts(problem)[i], problem.blocks[i]
             cone = self.cones[i]  # it stays: the products alone also hold where b has no component along them
             products = np.zeros((len(rows) * len(cone), self.size))
-            products[:, start : start + p * q] = np.kron(-rows, cone)
+            products[:, problem.slices[i]] = np.kron(-rows, cone)
             self.add(products, np.zeros(len(products)), False)
         return alone
-
-    def linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return (E, f, equality mask), or None without rows."""
-        if not self.rows:
-            return None
-        return np.array(self.rows), np.array(self.right), np.array(self.equality, dtype=bool)
 
 
 def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
@@ -90,52 +85,30 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     if lifted.refused:
         return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, offset) and not a cone "
                           "on mu"), None
-    problem, point, swapped = _oriented(form.problem, _point(form, values), lifted)
-    found = certify(problem, point, cones=lifted.cones or None, linear=lifted.linear(), max_size=max_size)
+    problem, point, swapped = _oriented(form.problem, form.point(values), lifted)
+    found = certify(problem, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
-    return found.bound, _named(program, form, found.better[0])
-
-
-def _point(form: RankOneStructure, values: Values) -> Point:
-    w = np.concatenate([np.ravel(values[name], order="F") for name in form.linear] or [np.zeros(0)])
-    return Point(w, tuple(np.asarray(values[mu]) for mu, _ in form.blocks),
-                 tuple(np.ravel(values[b], order="F") for _, b in form.blocks))
-
-
-def _named(program: Program, form: RankOneStructure, point: Point) -> Values:
-    found, position = {}, 0
-    for name in form.linear:
-        size = program.variables[name].size
-        found[name] = np.reshape(point.w[position : position + size], program.variables[name].shape, order="F")
-        position += size
-    for (mu_name, b_name), mu, b in zip(form.blocks, point.mus, point.bs):
-        found[mu_name], found[b_name] = mu, np.reshape(b, program.variables[b_name].shape, order="F")
-    return found
+    return found.bound, form.named(found.better[0], program.variables)
 
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:
     """Settle constraints on b: products with those on mu are linear in Theta; alone, the block is transposed."""
-    transposed, starts = lifted.add_products(problem), _block_starts(problem)
+    transposed = lifted.add_products(problem)
     if not transposed:
         return problem, point, False
     order, blocks = np.arange(lifted.size), list(problem.blocks)
     mus, bs = list(point.mus), list(point.bs)
     for i in transposed:
-        p, q = blocks[i]
-        span = slice(starts[i], starts[i] + p * q)
+        (p, q), span = blocks[i], problem.slices[i]
         order[span] = order[span].reshape(q, p).T.ravel()
         blocks[i], mus[i], bs[i] = (q, p), bs[i], mus[i]
         lifted.cones[i] = lifted.directions[i]
-    lifted.rows = [row[order] for row in lifted.rows]
+    lifted.linear = replace(lifted.linear, rows=lifted.linear.rows[:, order])
     triangle = np.triu(np.linalg.qr(np.column_stack([problem.root[:, order], problem.target]), mode="r"))
     turned = RankOne(triangle[: lifted.size, :-1], triangle[: lifted.size, -1], problem.remainder, tuple(blocks),
                      problem.linear, problem.scale)
     return turned, Point(point.w, tuple(mus), tuple(bs)), True
-
-
-def _block_starts(problem: RankOne) -> list[int]:
-    return [int(v) for v in problem.linear + np.cumsum([0, *(p * q for p, q in problem.blocks)])]
 
 
 def _columns(program: Program, names: Sequence[str]) -> dict[int, int]:
@@ -180,10 +153,10 @@ def places(program: Program, form: RankOneStructure) -> Places:
     """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
     problem = form.problem
     columns, stand_in = _columns(program, form.linear), {}
-    for shape, start, (mu, _) in zip(problem.blocks, _block_starts(problem), form.blocks):
+    for shape, where, (mu, _) in zip(problem.blocks, problem.slices, form.blocks):
         theta = cp.Variable(shape)
         stand_in[id(program.view.inner["Theta" + mu[len("mu"):]])] = theta
-        columns[theta.id] = start
+        columns[theta.id] = where.start
     return Places(len(problem.target), columns, stand_in)
 
 
@@ -191,7 +164,6 @@ def lift_exact(program: Program, form: RankOneStructure) -> Lifted:
     """Bring the user constraints of a bilinear programme into lifted form."""
     problem = form.problem
     lifted, where = Lifted(len(problem.target)), places(program, form)
-    starts = _block_starts(problem)
     mus = {program.variables[mu].id: i for i, (mu, _) in enumerate(form.blocks)}
     bs = {program.variables[b].id: i for i, (_, b) in enumerate(form.blocks)}
     for name, group in program.user_constraints.items():
@@ -200,12 +172,13 @@ def lift_exact(program: Program, form: RankOneStructure) -> Lifted:
                 lifted.refused = lifted.refused or name
                 continue
             equal = isinstance(member, EQUALITIES)
-            ids = {v.id for v in member.variables()}
+            ids, affine = {v.id for v in member.variables()}, member.expr.is_affine()
             only = next(iter(ids)) if len(ids) == 1 else None
-            if only in mus and member.expr.is_affine():
-                fits = _lift_mu(lifted, member, problem, starts, mus[only], equal, form.gauge)
-            elif only in bs and member.expr.is_affine():
-                fits = _lift_b(lifted, member, problem, starts, bs[only], equal)
+            if affine and (only in mus or only in bs):
+                variable = member.variables()[0]
+                found = _rows(member, {variable.id: 0}, variable.size)
+                lift, i = (_lift_mu, mus[only]) if only in mus else (_lift_b, bs[only])
+                fits = found is not None and lift(lifted, form, i, *found, equal)
             else:
                 found = where.rows(member)
                 fits = found is not None
@@ -222,50 +195,37 @@ def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np
         return None
     slopes, constant = found
     rows = np.zeros((constant.size, size))
-    for variable, slope in slopes.items():
-        rows[:, columns[variable.id] : columns[variable.id] + variable.size] = slope.toarray()
+    for v in slopes:
+        rows[:, columns[v.id] : columns[v.id] + v.size] = side_by_side(slopes, [v], constant.size)
     return rows, -constant
 
 
-def _of_one_variable(member: Constraint) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian (rows, size) and constant of an affine constraint in one variable."""
-    found = affine_parts(member.expr)
-    assert found is not None
-    slopes, constant = found
-    (slope,) = slopes.values()
-    return slope.toarray(), constant
-
-
-def _lift_mu(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[int], i: int, equal: bool,
-             gauge: str) -> bool:
-    jacobian, constant = _of_one_variable(member)
-    p, q = problem.blocks[i]
-    homogeneous = not np.any(constant)
+def _lift_mu(lifted: Lifted, form: RankOneStructure, i: int, rows: np.ndarray, right: np.ndarray, equal: bool) -> bool:
+    p, q = form.problem.blocks[i]
+    homogeneous = not np.any(right)
     if homogeneous and not equal:
-        lifted.cones[i] = np.vstack([lifted.cones.get(i, np.zeros((0, p))), -jacobian])
+        lifted.cones[i] = np.vstack([lifted.cones.get(i, np.zeros((0, p))), -rows])
         return True
-    if not homogeneous and gauge != "b0":
+    if not homogeneous and form.gauge != "b0":
         return False
     # S mu = 0 means S Theta = 0; with b_0 = 1 the first column of Theta is mu itself
-    lags = range(q) if homogeneous else range(1)
-    for j in lags:
-        rows = np.zeros((len(jacobian), lifted.size))
-        rows[:, starts[i] + j * p : starts[i] + (j + 1) * p] = jacobian
-        lifted.add(rows, -constant, equal)
+    for lag in np.eye(q)[: q if homogeneous else 1]:
+        wide = np.zeros((len(rows), lifted.size))
+        wide[:, form.problem.slices[i]] = np.kron(lag, rows)
+        lifted.add(wide, right, equal)
     return True
 
 
-def _lift_b(lifted: Lifted, member: Constraint, problem: RankOne, starts: list[int], i: int, equal: bool) -> bool:
-    jacobian, constant = _of_one_variable(member)
-    p, q = problem.blocks[i]
-    if np.any(constant):
+def _lift_b(lifted: Lifted, form: RankOneStructure, i: int, rows: np.ndarray, right: np.ndarray, equal: bool) -> bool:
+    p, q = form.problem.blocks[i]
+    if np.any(right):
         return False
     if not equal:
-        lifted.directions[i] = np.vstack([lifted.directions.get(i, np.zeros((0, q))), -jacobian])
+        lifted.directions[i] = np.vstack([lifted.directions.get(i, np.zeros((0, q))), -rows])
         return True
-    rows = np.zeros((len(jacobian) * p, lifted.size))
-    rows[:, starts[i] : starts[i] + p * q] = np.kron(jacobian, np.eye(p))
-    lifted.add(rows, np.zeros(len(rows)), True)
+    wide = np.zeros((len(rows) * p, lifted.size))
+    wide[:, form.problem.slices[i]] = np.kron(rows, np.eye(p))
+    lifted.add(wide, np.zeros(len(wide)), True)
     return True
 
 
@@ -294,26 +254,20 @@ def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, val
     multipliers = [duals[name] for name in program.user_constraints]
     z = np.concatenate([np.ravel(values[name], order="F") for name in names])
     nu = 2.0 * (problem.root @ z - problem.target)
-    linear = lifted.linear()
-    pull, cost = np.zeros(len(z)), 0.0
-    lam = np.concatenate(multipliers) if multipliers else np.zeros(0)
-    if linear is not None:
-        lam = np.where(linear[2], lam, np.maximum(lam, 0.0))
-        pull, cost = linear[0].T @ lam, float(lam @ linear[1])
+    lam = np.concatenate([np.zeros(0), *multipliers])
+    lam = np.where(lifted.linear.equality, lam, np.maximum(lam, 0.0))
+    pull, cost = lifted.linear.rows.T @ lam, float(lam @ lifted.linear.right)
     free = len(z) if not np.any(taus) else problem.linear
     nu = nu - np.linalg.lstsq(problem.root[:, :free].T, problem.root[:, :free].T @ nu + pull[:free], rcond=None)[0]
-    shrink = 1.0
-    position = problem.linear
-    if np.any(taus):
-        for (p, q), tau in zip(problem.blocks, taus):
-            part = (problem.root[:, position : position + p * q].T @ nu + pull[position : position + p * q])
-            shrink = min(shrink, 2.0 * tau / max(float(np.linalg.norm(part.reshape(q, p), 2)), 1e-300))
-            position += p * q
+    parts = [(problem.root[:, where].T @ nu + pull[where]).reshape(q, p)
+             for where, (p, q) in zip(problem.slices, problem.blocks)]
+    shrink = min([1.0, *(2.0 * tau / max(float(np.linalg.norm(part, 2)), 1e-300) for part, tau in zip(parts, taus))]
+                 ) if np.any(taus) else 1.0
     bound = problem.remainder - shrink * float(nu @ problem.target) - shrink**2 * float(nu @ nu) / 4 - shrink * cost
     matrices = [values[name] for name in names if name.startswith("Theta")]
     value = problem.value(z) + 2.0 * sum(tau * float(np.linalg.norm(matrix, "nuc"))
                                          for tau, matrix in zip(taus, matrices))
-    gap = problem.gap(value, bound)
+    gap = relative_gap(value, bound, problem.scale)
     proved = gap <= 1e-6
     kind = "the penalised convex problem, not the rank-one problem behind it"
     reason = f"optimal for {kind}: relative gap {gap:.1e}" if proved else f"not proved for {kind}: gap {gap:.1e}"

@@ -4,13 +4,18 @@ Adding such a form ``z^T M z`` to a least-squares objective changes nothing on t
 unrestricted minimum of the sum bounds the objective from below (Lagrangian dual of rank(Theta_i) <= 1; Shor's
 relaxation is its dual). The forms of one block are the symmetric matrices that change sign when the row indices of
 ``X[(j, i), (l, k)]``, the lags j and l, are exchanged; this makes projection onto them one transposition.
+
+The bound is raised by alternating projections with memory (Dykstra; equivalently ADMM) between the positive
+semidefinite matrices and the affine set H + M_tangent + span(free minors), in coordinates where the point is the first
+unit vector of every block: entries of different minors never overlap there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import block_diag, get_lapack_funcs
 
 from optid.structures.rank_one import Array
 
@@ -35,7 +40,7 @@ def tangent_minors(gradient: Array, mu: Array, b: Array) -> Array:
         b: (nb,) of unit length.
     """
     size = float(mu @ mu)
-    outer = np.outer(gradient.T.ravel(), np.kron(b, mu)) / size
+    outer = np.outer(gradient.T.ravel(), np.outer(b, mu)) / size
     return 2 * project_minors(outer + outer.T, gradient.shape)  # pyright: ignore[reportArgumentType]
 
 
@@ -108,3 +113,36 @@ class Lagrangian:
         half, _ = _trtrs(factor, self.slope + extra @ self.z, trans=1)
         at_point = self.linear_terms - (0.0 if cuts is None else float(self.z @ cuts @ self.z))
         return self.value + at_point - float(half @ half)
+
+
+def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
+    """Orthogonal matrix whose columns turn every block so that mu_i and b_i become first unit vectors."""
+    parts = [np.kron(basis_from(b), basis_from(mu / np.linalg.norm(mu)) if mu.any() else np.eye(len(mu)))
+             for mu, b in zip(mus, bs)]
+    return block_diag(np.eye(linear), *parts)
+
+
+def ascend(matrix: Array, blocks: Sequence[Block], masks: Sequence[np.ndarray],
+           steps: int) -> tuple[Array | None, int]:
+    """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken.
+
+    Args:
+        matrix: (k, k) H + M_tangent (- cuts) in rotated coordinates.
+        blocks: position and shape of every block.
+        masks: entries, as (P nb, P nb), of the minors that are free.
+        steps: eigenvalue decompositions at most.
+    """
+    current, memory = matrix, np.zeros_like(matrix)
+    aim = 0.1 * float(np.trace(matrix)) / len(matrix)  # inside the cone: its boundary is reached only in the limit
+    for step in range(1, steps + 1):
+        values, vectors = np.linalg.eigh(current + memory)
+        positive = (vectors * np.maximum(values, aim)) @ vectors.T
+        memory = memory + current - positive
+        aim *= 0.95
+        wanted = positive - memory - matrix
+        current = matrix.copy()
+        for (where, shape), mask in zip(blocks, masks):
+            current[where, where] += project_minors(wanted[where, where], shape) * mask
+        if cholesky(current) is not None:
+            return current - matrix, step
+    return None, steps

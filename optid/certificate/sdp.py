@@ -9,7 +9,6 @@ where a better point may be. CVXPY poses it and Clarabel solves it; both are imp
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,23 +16,6 @@ import numpy as np
 from optid.certificate.minors import Block, Lagrangian
 from optid.certificate.shape_duals import Linear
 from optid.structures.rank_one import Array
-
-
-@dataclass(frozen=True, eq=False)
-class Relaxation:
-    """Multipliers found by the solver, before any check, and the moments that go with them.
-
-    Attributes:
-        minors: (k, k) combination of minors.
-        cuts: by block (r, r, nb, nb), positive semidefinite for each pair of rows up to the solver's accuracy.
-        linear: (r,) multipliers of constraints on the lifted vector.
-        moments: (k, 4) candidates for z: the mean and the leading directions of the moment matrix.
-    """
-
-    minors: Array
-    cuts: dict[int, Array]
-    linear: Array
-    moments: Array
 
 
 def relaxation_size(blocks: Sequence[Block], cones: Mapping[int, Array]) -> int:
@@ -75,7 +57,7 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
 
 
 def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Array],
-          linear: Linear | None) -> Relaxation | None:
+          linear: Linear) -> tuple[Array, dict[int, Array], Array, Array] | None:
     """Solve the relaxation around a point; None where the solver returns no multipliers.
 
     Args:
@@ -83,6 +65,11 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
         blocks: position and shape of every block.
         cones: constraint matrices by block.
         linear: constraints on the lifted vector.
+
+    Returns:
+        What the solver found, before any check: the combination (k, k) of minors; by block the weights (r, r, nb, nb),
+        positive semidefinite for each pair of rows up to its accuracy; the multipliers (r,) of the linear constraints;
+        and (k, 4) candidates for z, the mean and the leading directions of the moment matrix.
     """
     import cvxpy as cp
     from scipy.sparse import csc_array, hstack
@@ -104,7 +91,7 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
             cut_value = cut_value + (form.T @ np.kron(z, z)) @ stacked
     slope = objective.slope / unit + _times(z / unit, k) @ extra
     multipliers = None
-    if linear is not None:
+    if len(linear.right):
         multipliers = cp.Variable(len(linear.right))
         slope = slope + linear.rows.T @ multipliers / (2 * unit)
         cut_value = cut_value + linear.slack(z)[0] @ multipliers
@@ -127,10 +114,10 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     cuts = {i: _pair_weights([np.asarray(w.value) for w in found], len(cones[i]), blocks[i][1][1])
             for i, found in pairs.items()}
     prices = np.zeros(0)
-    if linear is not None and multipliers is not None:
+    if multipliers is not None:
         prices = np.asarray(multipliers.value, float)
         prices = np.where(linear.equality, prices, np.maximum(prices, 0.0))
-    return Relaxation(minors, cuts, prices, _moments(np.asarray(lifted.dual_value), z, unit))
+    return minors, cuts, prices, _moments(np.asarray(lifted.dual_value), z, unit)
 
 
 def _times(z: Array, k: int) -> Any:

@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
 from optid.errors import StructureError
+from optid.structures.multipliers import fit_multipliers
 from optid.structures.rank_one import Array, RankOne
 
 ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of the size of its terms
@@ -37,49 +39,31 @@ class Linear:
         return self.right - self.rows @ z, np.abs(self.rows) @ np.abs(z) + np.abs(self.right)
 
 
-def as_linear(linear, problem: RankOne) -> Linear | None:
-    """Check the triple (E, f, equality mask) that callers give.
+    @classmethod
+    def none(cls, n: int) -> "Linear":
+        """No constraints on n unknowns."""
+        return cls(np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=bool))
+
+
+def check_constraints(cones: Mapping[int, Array], linear: Linear, problem: RankOne) -> None:
+    """Refuse constraints whose shapes do not fit the problem.
 
     Raises:
-        StructureError: shapes that do not fit the lifted vector.
+        StructureError: constraints that are not on the lifted vector, or a matrix C_i whose width is not P_i.
     """
-    if linear is None:
-        return None
-    rows, right, equality = (np.asarray(part) for part in linear)
-    n = len(problem.target)
-    if rows.ndim != 2 or rows.shape[1] != n or right.shape != rows.shape[:1] or equality.shape != right.shape:
+    n, r = len(problem.target), linear.rows.shape[:1]
+    if linear.rows.shape != (*r, n) or linear.right.shape != r or linear.equality.shape != r:
         raise StructureError(f"linear constraints need E (r, {n}), f (r,) and an equality mask (r,), not "
-                             f"{rows.shape}, {right.shape}, {equality.shape}")
-    return Linear(rows.astype(float), right.astype(float), equality.astype(bool)) if len(rows) else None
-
-
-def as_cones(cones, problem: RankOne) -> dict[int, Array]:
-    """Check the constraint matrices C_i (r_i, P_i), given as a sequence with None or as a mapping from block to C.
-
-    Raises:
-        StructureError: a matrix whose width is not P_i.
-    """
-    if cones is None:
-        return {}
-    pairs = cones.items() if isinstance(cones, Mapping) else enumerate(cones)
-    found = {i: np.asarray(cone, float) for i, cone in pairs if cone is not None and len(cone)}
-    for i, cone in found.items():
+                             f"{linear.rows.shape}, {linear.right.shape}, {linear.equality.shape}")
+    for i, cone in cones.items():
         if not 0 <= i < len(problem.blocks) or cone.ndim != 2 or cone.shape[1] != problem.blocks[i][0]:
             raise StructureError(f"cone {i} has shape {cone.shape}; block {i} of {problem.blocks} needs (r, P)")
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class Multipliers:
-    """KKT multipliers of a local solution: nu of the cones (by block) and lam of the linear constraints."""
-
-    cones: dict[int, Array]
-    linear: Array
 
 
 def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int, mus: Sequence[Array],
-                    bs: Sequence[Array], cones: dict[int, Array], linear: Linear | None, z: Array) -> Multipliers:
-    """Nonnegative least squares for the multipliers that make the gradient along the manifold vanish.
+                    bs: Sequence[Array], cones: dict[int, Array], linear: Linear, z: Array
+                    ) -> tuple[dict[int, Array], Array]:
+    """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 
     Args:
         slope: (k,) half the gradient of the objective, in the coordinates of all the rest.
@@ -91,43 +75,31 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
         linear: constraints on the lifted vector (k,).
         z: the lifted point (k,).
     """
-    sizes = [np.linalg.norm(mu) for mu in mus]
-    tangent = [np.eye(offset)] if offset else []
-    tangent += [np.hstack([np.kron(b[:, None], np.eye(len(mu))),
-                           np.kron(np.eye(len(b)), (mu / size if size else mu)[:, None])])
-                for mu, b, size in zip(mus, bs, sizes)]
-    heights = np.cumsum([0, *(t.shape[0] for t in tangent)])
-    widths = np.cumsum([0, *(t.shape[1] for t in tangent)])
-    jacobian = np.zeros((heights[-1], widths[-1]))
-    for i, part in enumerate(tangent):
-        jacobian[heights[i]:heights[i + 1], widths[i]:widths[i + 1]] = part
-    first = 1 if offset else 0
-    columns, owners = [], []
+    if not cones and not len(linear.right):
+        return {}, np.zeros(0)
+    units = [mu / (np.linalg.norm(mu) or 1.0) for mu in mus]
+    jacobian = np.asarray(block_diag(np.eye(offset), *(
+        np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
+        for mu, b in zip(units, bs))))
+    firsts = np.cumsum([offset, *(p + nb for p, nb in shapes)])  # of every mu in the tangent coordinates
+    active, parts = {}, []
     for i, cone in cones.items():
-        values, terms = cone @ mus[i], np.abs(cone) @ np.abs(mus[i])
-        for row in np.flatnonzero(np.abs(values) <= ACTIVE * terms):
-            column = np.zeros(widths[-1])
-            column[widths[first + i]:widths[first + i] + len(mus[i])] = cone[row]
-            columns.append(column)
-            owners.append((i, row, 1.0))
-    if linear is not None:
-        slack, terms = linear.slack(z)
-        for row in np.flatnonzero((np.abs(slack) <= ACTIVE * terms) | linear.equality):
-            column = jacobian.T @ linear.rows[row]
-            columns.append(-column)
-            owners.append((-1, row, 1.0))
-            if linear.equality[row]:
-                columns.append(column)
-                owners.append((-1, row, -1.0))
+        active[i] = np.flatnonzero(np.abs(cone @ mus[i]) <= ACTIVE * (np.abs(cone) @ np.abs(mus[i])))
+        parts.append(np.zeros((len(active[i]), jacobian.shape[1])))
+        parts[-1][:, firsts[i] : firsts[i] + len(mus[i])] = cone[active[i]]
+    slack, terms = linear.slack(z)
+    held = np.flatnonzero((np.abs(slack) <= ACTIVE * terms) | linear.equality)
+    rows = np.vstack([*parts, -linear.rows[held] @ jacobian])
+    equality = np.append(np.zeros(len(rows) - len(held), dtype=bool), linear.equality[held])
+    lengths = np.maximum(np.linalg.norm(rows, axis=1), np.finfo(float).tiny)
+    weights = fit_multipliers(rows / lengths[:, None], jacobian.T @ (2 * slope), equality)[0] / lengths
+    *pieces, last = np.split(weights, np.cumsum([len(part) for part in parts]))
     nu: dict[int, Array] = {i: np.zeros(len(cone)) for i, cone in cones.items()}
-    lam = np.zeros(0 if linear is None else len(linear.right))
-    if columns:
-        design = np.column_stack(columns)
-        lengths = np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
-        weights = nnls(design / lengths, jacobian.T @ (2 * slope))[0] / lengths
-        for (i, row, sign), weight in zip(owners, weights):
-            (lam if i < 0 else nu[i])[row] += sign * weight
-    return Multipliers(nu, lam)
+    lam = np.zeros(len(linear.right))
+    for i, piece in zip(cones, pieces):
+        nu[i][active[i]] = piece
+    lam[held] = last
+    return nu, lam
 
 
 def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:

@@ -1,10 +1,10 @@
 """A zoo of small programmes with known value, point and multipliers, on which every back end is tried.
 
 Each entry is known in closed form or by a route that shares nothing with a solver (eigenvalues, a one-dimensional
-search). Multipliers follow ``L = f + dual (lhs - rhs)``; they are given where they are unique.
+search, the literature). Multipliers follow ``L = f + dual (lhs - rhs)``; they are given where they are unique.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -27,34 +27,31 @@ class Case:
     """One programme and what is known about it.
 
     Attributes:
+        name: name of the case and of its programme.
         build: makes a fresh programme.
-        outcome: "solved", "infeasible" or "unbounded".
         value: optimal value (``nan`` unless solved).
         point: {variable: array}, the unique minimiser or parts of it.
         duals: {constraint: flat multipliers}, where unique.
+        outcome: "solved", "infeasible" or "unbounded".
         hard: badly scaled or degenerate: an honest "inaccurate" or "failed" is acceptable, a wrong claim is not.
     """
 
+    name: str
     build: Callable[[], Program]
-    outcome: str = SOLVED
     value: float = float("nan")
     point: Mapping[str, Any] = field(default_factory=dict)
     duals: Mapping[str, Any] = field(default_factory=dict)
+    outcome: str = SOLVED
     hard: bool = False
-
-    @property
-    def name(self) -> str:
-        """Name of the case."""
-        return self.build.__name__
 
 
 @cache
 def cases() -> tuple[Case, ...]:
     """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one, nuclear and group-sparse among them."""
-    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), *_nuclear(), *_group_sparse())
+    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), _nuclear(), _group_sparse())
 
 
-def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: list[cp.Variable],
+def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: Sequence[cp.Variable],
          start: Mapping[str, Any] | None = None, expressions: Mapping[str, cp.Expression] | None = None,
          **parts: Any) -> Program:
     """Make a programme of plain parts: named constraints (or lists of them), variables under their own names.
@@ -74,231 +71,134 @@ def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: l
     return Program(name, cp.Minimize(objective), groups, named, dict(start or {}), dict, view, **parts)
 
 
+def _case(name: str, shapes: Mapping[str, Any], statement: Callable[..., tuple], start: Mapping[str, Any] | None = None,
+          **known: Any) -> Case:
+    """State a case.
+
+    Args:
+        name: its name.
+        shapes: {variable: shape, or the arguments of `cp.Variable`}.
+        statement: variables -> (objective, constraints), and further arguments of `pose` where there are any.
+        start: as in `pose`.
+        known: what is known about it, as in `Case`.
+    """
+    def build() -> Program:
+        variables = [cp.Variable(name=key, **(shape if isinstance(shape, dict) else {"shape": shape}))
+                     for key, shape in shapes.items()]
+        objective, constraints, *more = statement(*variables)
+        return pose(name, objective, constraints, variables, start, **(more[0] if more else {}))
+
+    return Case(name, build, **known)
+
+
 def _linear() -> list[Case]:
-    def lp_vertex() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("lp_vertex", -3 * x[0] - 5 * x[1], {
-            "plants": cp.hstack([x[0], 2 * x[1], 3 * x[0] + 2 * x[1]]) <= np.array([4.0, 12.0, 18.0]), "sign": x >= 0,
-        }, [x])
-
     cost = np.array([3.0, 1.0, 2.0, 5.0])
-
-    def lp_simplex() -> Program:
-        x = cp.Variable(4, name="x")
-        return pose("lp_simplex", cost @ x, {"total": cp.sum(x) == 1, "sign": x >= 0}, [x])
-
-    def lp_bounds_as_attributes() -> Program:
-        x = cp.Variable(4, name="x", nonneg=True)
-        return pose("lp_bounds_as_attributes", cost @ x, {"total": cp.sum(x) == 1}, [x])
-
-    def lp_degenerate() -> Program:
-        x = cp.Variable(2, name="x")
-        rows = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [2.0, 2.0], [1.0, 2.0]])
-        return pose("lp_degenerate", -x[0] - x[1], {
-            "rows": rows @ x <= np.array([2.0, 1.0, 1.0, 4.0, 3.0]), "sign": x >= 0}, [x])
-
-    def lp_badly_scaled() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("lp_badly_scaled", -3e-3 * x[0] - 5e3 * x[1], {
-            "plants": cp.hstack([x[0], 2e3 * x[1], 3e-3 * x[0] + 2e3 * x[1]]) <= np.array([4e3, 12.0, 18.0]),
-            "sign": x >= 0}, [x], start={"x": np.zeros(2)})
-
-    def lp_infeasible() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("lp_infeasible", cp.sum(x), {"low": x[0] + x[1] >= 3, "high": x <= 1}, [x])
-
-    def lp_unbounded() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("lp_unbounded", -x[0], {"band": x[1] <= 1, "sign": x >= 0}, [x])
-
     simplex: dict[str, Any] = {"value": 1.0, "point": {"x": [0.0, 1.0, 0.0, 0.0]}}
+    rows = np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0], [2.0, 2.0], [1.0, 2.0]])
     return [
-        Case(lp_vertex, value=-36.0, point={"x": [2.0, 6.0]}, duals={"plants": [0.0, 1.5, 1.0], "sign": [0.0, 0.0]}),
-        Case(lp_simplex, **simplex, duals={"total": [-1.0], "sign": [2.0, 0.0, 1.0, 4.0]}),
-        Case(lp_bounds_as_attributes, **simplex, duals={"total": [-1.0]}),
-        Case(lp_degenerate, value=-2.0, point={"x": [1.0, 1.0]}, hard=True),
-        Case(lp_badly_scaled, value=-36.0, point={"x": [2e3, 6e-3]}, hard=True),
-        Case(lp_infeasible, INFEASIBLE), Case(lp_unbounded, UNBOUNDED),
+        _case("lp_vertex", {"x": 2}, lambda x: (-3 * x[0] - 5 * x[1], {
+            "plants": cp.hstack([x[0], 2 * x[1], 3 * x[0] + 2 * x[1]]) <= np.array([4.0, 12.0, 18.0]), "sign": x >= 0}),
+              value=-36.0, point={"x": [2.0, 6.0]}, duals={"plants": [0.0, 1.5, 1.0], "sign": [0.0, 0.0]}),
+        _case("lp_simplex", {"x": 4}, lambda x: (cost @ x, {"total": cp.sum(x) == 1, "sign": x >= 0}),
+              **simplex, duals={"total": [-1.0], "sign": [2.0, 0.0, 1.0, 4.0]}),
+        _case("lp_bounds_as_attributes", {"x": {"shape": 4, "nonneg": True}},
+              lambda x: (cost @ x, {"total": cp.sum(x) == 1}), **simplex, duals={"total": [-1.0]}),
+        _case("lp_degenerate", {"x": 2}, lambda x: (-x[0] - x[1], {
+            "rows": rows @ x <= np.array([2.0, 1.0, 1.0, 4.0, 3.0]), "sign": x >= 0}),
+              value=-2.0, point={"x": [1.0, 1.0]}, hard=True),
+        _case("lp_badly_scaled", {"x": 2}, lambda x: (-3e-3 * x[0] - 5e3 * x[1], {
+            "plants": cp.hstack([x[0], 2e3 * x[1], 3e-3 * x[0] + 2e3 * x[1]]) <= np.array([4e3, 12.0, 18.0]),
+            "sign": x >= 0}), start={"x": np.zeros(2)}, value=-36.0, point={"x": [2e3, 6e-3]}, hard=True),
+        _case("lp_infeasible", {"x": 2}, lambda x: (cp.sum(x), {"low": x[0] + x[1] >= 3, "high": x <= 1}),
+              outcome=INFEASIBLE),
+        _case("lp_unbounded", {"x": 2}, lambda x: (-x[0], {"band": x[1] <= 1, "sign": x >= 0}), outcome=UNBOUNDED),
     ]
 
 
 def _quadratic() -> list[Case]:
-    target = np.array([2.0, -0.5, 0.25])
-
-    def qp_box() -> Program:
-        x = cp.Variable(3, name="x")
-        return pose("qp_box", cp.sum_squares(x - target), {"upper": x <= 1, "lower": x >= 0}, [x])
-
-    normal = np.array([1.0, 2.0, 2.0])
-
-    def qp_equality() -> Program:
-        x = cp.Variable(3, name="x")
-        return pose("qp_equality", cp.sum_squares(x), {"plane": normal @ x == 1}, [x])
-
-    data = np.array([1.0, 3.0, 2.0, 4.0])
-
-    def qp_monotone_with_residuals() -> Program:
-        x, r = cp.Variable(4, name="x"), cp.Variable(4, name="r")
-        return pose("qp_monotone_with_residuals", cp.sum_squares(r) + 10.0, {
-            "residual": r == x - data, "monotone": x[:-1] - x[1:] <= 0}, [x, r],
-            structural=frozenset({"residual"}), derived={"r": x - data})
-
-    def qp_badly_scaled() -> Program:
-        x = cp.Variable(2, name="x")
-        unit = np.array([1e-4, 1e4])
-        return pose("qp_badly_scaled", cp.sum_squares(cp.multiply(unit, x) - 1), {"budget": unit @ x <= 1}, [x],
-                    start={"x": np.zeros(2)})
-
-    def qp_repeated_constraints() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("qp_repeated_constraints", cp.sum_squares(x - 1), {
-            "once": cp.sum(x) == 1, "twice": 2 * cp.sum(x) == 2, "cap": [x[0] <= 0.5, 3 * x[0] <= 1.5]}, [x])
-
-    def qp_infeasible() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("qp_infeasible", cp.sum_squares(x), {"sum": cp.sum(x) == 5, "cap": x <= 1}, [x])
-
-    def qp_unbounded() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("qp_unbounded", cp.square(x[0]) - x[1], {"band": x[0] <= 1}, [x])
-
+    target, normal = np.array([2.0, -0.5, 0.25]), np.array([1.0, 2.0, 2.0])
+    data, unit = np.array([1.0, 3.0, 2.0, 4.0]), np.array([1e-4, 1e4])
     return [
-        Case(qp_box, value=1.25, point={"x": [1.0, 0.0, 0.25]},
-             duals={"upper": [2.0, 0.0, 0.0], "lower": [0.0, 1.0, 0.0]}),
-        Case(qp_equality, value=1 / 9, point={"x": normal / 9}, duals={"plane": [-2 / 9]}),
-        Case(qp_monotone_with_residuals, value=10.5, point={"x": [1.0, 2.5, 2.5, 4.0]},
-             duals={"residual": [0.0, 1.0, -1.0, 0.0], "monotone": [0.0, 1.0, 0.0]}),
-        Case(qp_badly_scaled, value=0.5, point={"x": [5e3, 5e-5]}, duals={"budget": [1.0]}, hard=True),
-        Case(qp_repeated_constraints, value=0.5, point={"x": [0.5, 0.5]}, hard=True),
-        Case(qp_infeasible, INFEASIBLE), Case(qp_unbounded, UNBOUNDED),
+        _case("qp_box", {"x": 3}, lambda x: (cp.sum_squares(x - target), {"upper": x <= 1, "lower": x >= 0}),
+              value=1.25, point={"x": [1.0, 0.0, 0.25]}, duals={"upper": [2.0, 0.0, 0.0], "lower": [0.0, 1.0, 0.0]}),
+        _case("qp_equality", {"x": 3}, lambda x: (cp.sum_squares(x), {"plane": normal @ x == 1}),
+              value=1 / 9, point={"x": normal / 9}, duals={"plane": [-2 / 9]}),
+        _case("qp_monotone_with_residuals", {"x": 4, "r": 4}, lambda x, r: (cp.sum_squares(r) + 10.0, {
+            "residual": r == x - data, "monotone": x[:-1] - x[1:] <= 0},
+            {"structural": frozenset({"residual"}), "derived": {"r": x - data}}),
+              value=10.5, point={"x": [1.0, 2.5, 2.5, 4.0]},
+              duals={"residual": [0.0, 1.0, -1.0, 0.0], "monotone": [0.0, 1.0, 0.0]}),
+        _case("qp_badly_scaled", {"x": 2}, lambda x: (
+            cp.sum_squares(cp.multiply(unit, x) - 1), {"budget": unit @ x <= 1}), start={"x": np.zeros(2)},
+              value=0.5, point={"x": [5e3, 5e-5]}, duals={"budget": [1.0]}, hard=True),
+        _case("qp_repeated_constraints", {"x": 2}, lambda x: (cp.sum_squares(x - 1), {
+            "once": cp.sum(x) == 1, "twice": 2 * cp.sum(x) == 2, "cap": [x[0] <= 0.5, 3 * x[0] <= 1.5]}),
+              value=0.5, point={"x": [0.5, 0.5]}, hard=True),
+        _case("qp_infeasible", {"x": 2}, lambda x: (cp.sum_squares(x), {"sum": cp.sum(x) == 5, "cap": x <= 1}),
+              outcome=INFEASIBLE),
+        _case("qp_unbounded", {"x": 2}, lambda x: (cp.square(x[0]) - x[1], {"band": x[0] <= 1}), outcome=UNBOUNDED),
     ]
 
 
 def _conic() -> list[Case]:
-    cost = np.array([3.0, -4.0])
-
-    def socp_ball() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("socp_ball", cost @ x, {"ball": cp.norm(x) <= 1}, [x])
-
-    normal, centre = np.array([2.0, -1.0, 2.0]), np.array([1.0, 1.0, 1.0])
-
-    def socp_distance_to_plane() -> Program:
-        x, t = cp.Variable(3, name="x"), cp.Variable(name="t")
-        return pose("socp_distance_to_plane", t, {"cone": cp.SOC(t, x - centre), "plane": normal @ x == 0}, [x, t])
-
-    def socp_infeasible() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("socp_infeasible", cost @ x, {"ball": cp.norm(x) <= 1, "far": x[0] >= 2}, [x])
-
+    cost, normal, centre = np.array([3.0, -4.0]), np.array([2.0, -1.0, 2.0]), np.ones(3)
     matrix = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 4.0]])
     levels, vectors = np.linalg.eigh(matrix)
-    first = np.outer(vectors[:, 0], vectors[:, 0])
-
-    def sdp_smallest_eigenvalue() -> Program:
-        x = cp.Variable((3, 3), name="x", symmetric=True)
-        return pose("sdp_smallest_eigenvalue", cp.trace(matrix @ x), {"trace": cp.trace(x) == 1, "psd": x >> 0}, [x])
-
-    def sdp_largest_eigenvalue() -> Program:
-        t = cp.Variable(name="t")
-        return pose("sdp_largest_eigenvalue", t, {"psd": t * np.eye(3) - matrix >> 0}, [t])
-
-    def sdp_infeasible() -> Program:
-        x = cp.Variable((2, 2), name="x", symmetric=True)
-        return pose("sdp_infeasible", cp.trace(x), {"psd": x >> 0, "corner": x[0, 0] == -1}, [x])
-
-    def exp_entropy() -> Program:
-        x = cp.Variable(4, name="x")
-        return pose("exp_entropy", -cp.sum(cp.entr(x)), {"total": cp.sum(x) == 1}, [x],
-                    start={"x": np.array([0.1, 0.2, 0.3, 0.4])})
-
-    def exp_log_sum_exp() -> Program:
-        x = cp.Variable(3, name="x")
-        return pose("exp_log_sum_exp", cp.log_sum_exp(x), {"total": cp.sum(x) == 3}, [x])
-
+    first, last = (np.outer(vectors[:, k], vectors[:, k]) for k in (0, -1))
     return [
-        Case(socp_ball, value=-5.0, point={"x": [-0.6, 0.8]}, duals={"ball": [5.0]}),
-        Case(socp_distance_to_plane, value=1.0, point={"x": centre - normal / 3, "t": 1.0},
-             duals={"plane": [1 / 3]}),
-        Case(socp_infeasible, INFEASIBLE),
-        Case(sdp_smallest_eigenvalue, value=float(levels[0]), point={"x": first},
-             duals={"trace": [-levels[0]], "psd": np.ravel(matrix - levels[0] * np.eye(3), order="F")}),
-        Case(sdp_largest_eigenvalue, value=float(levels[-1]), point={"t": levels[-1]},
-             duals={"psd": np.ravel(np.outer(vectors[:, -1], vectors[:, -1]), order="F")}),
-        Case(sdp_infeasible, INFEASIBLE),
-        Case(exp_entropy, value=-np.log(4.0), point={"x": np.full(4, 0.25)}, duals={"total": [np.log(4.0) - 1]}),
-        Case(exp_log_sum_exp, value=1.0 + np.log(3.0), point={"x": np.ones(3)}, duals={"total": [-1 / 3]}),
+        _case("socp_ball", {"x": 2}, lambda x: (cost @ x, {"ball": cp.norm(x) <= 1}),
+              value=-5.0, point={"x": [-0.6, 0.8]}, duals={"ball": [5.0]}),
+        _case("socp_distance_to_plane", {"x": 3, "t": ()}, lambda x, t: (
+            t, {"cone": cp.SOC(t, x - centre), "plane": normal @ x == 0}),
+              value=1.0, point={"x": centre - normal / 3, "t": 1.0}, duals={"plane": [1 / 3]}),
+        _case("socp_infeasible", {"x": 2}, lambda x: (cost @ x, {"ball": cp.norm(x) <= 1, "far": x[0] >= 2}),
+              outcome=INFEASIBLE),
+        _case("sdp_smallest_eigenvalue", {"x": {"shape": (3, 3), "symmetric": True}}, lambda x: (
+            cp.trace(matrix @ x), {"trace": cp.trace(x) == 1, "psd": x >> 0}), value=float(levels[0]),
+              point={"x": first}, duals={"trace": [-levels[0]], "psd": np.ravel(matrix - levels[0] * np.eye(3))}),
+        _case("sdp_largest_eigenvalue", {"t": ()}, lambda t: (t, {"psd": t * np.eye(3) - matrix >> 0}),
+              value=float(levels[-1]), point={"t": levels[-1]}, duals={"psd": np.ravel(last)}),
+        _case("sdp_infeasible", {"x": {"shape": (2, 2), "symmetric": True}}, lambda x: (
+            cp.trace(x), {"psd": x >> 0, "corner": x[0, 0] == -1}), outcome=INFEASIBLE),
+        _case("exp_entropy", {"x": 4}, lambda x: (-cp.sum(cp.entr(x)), {"total": cp.sum(x) == 1}),
+              start={"x": np.array([0.1, 0.2, 0.3, 0.4])},
+              value=-np.log(4.0), point={"x": np.full(4, 0.25)}, duals={"total": [np.log(4.0) - 1]}),
+        _case("exp_log_sum_exp", {"x": 3}, lambda x: (cp.log_sum_exp(x), {"total": cp.sum(x) == 3}),
+              value=1.0 + np.log(3.0), point={"x": np.ones(3)}, duals={"total": [-1 / 3]}),
     ]
 
 
 def _nonlinear() -> list[Case]:
-    def nlp_rosenbrock() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("nlp_rosenbrock", cp.square(1 - x[0]) + 100 * cp.square(x[1] - cp.square(x[0])),
-                    {"disc": cp.sum_squares(x) <= 3}, [x], start={"x": np.array([-1.2, 1.0])})
-
-    def nlp_hs071() -> Program:
-        x = cp.Variable(4, name="x")
-        return pose("nlp_hs071", x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2], {
-            "product": x[0] * x[1] * x[2] * x[3] >= 25, "sphere": cp.sum_squares(x) == 40,
-            "lower": x >= 1, "upper": x <= 5}, [x], start={"x": np.array([1.0, 5.0, 5.0, 1.0])})
-
-    def nlp_hyperbola() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("nlp_hyperbola", cp.sum(x), {"product": x[0] * x[1] >= 1, "sign": x >= 0}, [x],
-                    start={"x": np.array([3.0, 1.0])})
-
-    def nlp_elementary_functions() -> Program:
-        x, y = cp.Variable(name="x"), cp.Variable(name="y")
-        return pose("nlp_elementary_functions", cp.exp(x) - 2 * x + cp.square(y - cp.exp(-x)), {
-            "ceiling": cp.logistic(y) <= 1}, [x, y], start={"x": 0.0, "y": 0.0})
-
-    def nlp_matrix_factor() -> Program:
-        left, right = cp.Variable((2, 1), name="left"), cp.Variable((1, 2), name="right")
-        return pose("nlp_matrix_factor", cp.sum_squares(left @ right - np.diag([3.0, 1.0])), {
-            "gauge": cp.sum_squares(right) == 1}, [left, right],
-            start={"left": np.array([[1.0], [1.0]]), "right": np.array([[1.0, 0.2]])})
-
-    def nlp_infeasible() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("nlp_infeasible", cp.sum_squares(x), {"product": x[0] * x[1] >= 4, "cap": x <= 1, "sign": x >= 0},
-                    [x], start={"x": np.array([0.5, 0.4])})
-
-    def nlp_infeasible_stationary() -> Program:
-        x = cp.Variable(name="x")
-        return pose("nlp_infeasible_stationary", x, {"circle": cp.square(x) == -1}, [x], start={"x": 0.3})
-
-    def nlp_unbounded() -> Program:
-        x = cp.Variable(2, name="x")
-        return pose("nlp_unbounded", x[0] * x[1], {"line": cp.sum(x) == 1}, [x], start={"x": np.array([2.0, -1.0])})
-
     return [
-        Case(nlp_rosenbrock, value=0.0, point={"x": [1.0, 1.0]}, duals={"disc": [0.0]}),
-        Case(nlp_hs071, **_hs071()),
-        Case(nlp_hyperbola, value=2.0, point={"x": [1.0, 1.0]}, duals={"product": [1.0], "sign": [0.0, 0.0]}),
-        Case(nlp_elementary_functions, value=2 - 2 * np.log(2.0), point={"x": np.log(2.0), "y": 0.5},
-             duals={"ceiling": [0.0]}),
-        Case(nlp_matrix_factor, value=1.0, point={"left": [[3.0], [0.0]], "right": [[1.0, 0.0]]},
-             duals={"gauge": [0.0]}),
-        Case(nlp_infeasible, INFEASIBLE), Case(nlp_infeasible_stationary, INFEASIBLE), Case(nlp_unbounded, UNBOUNDED),
+        _case("nlp_rosenbrock", {"x": 2}, lambda x: (
+            cp.square(1 - x[0]) + 100 * cp.square(x[1] - cp.square(x[0])), {"disc": cp.sum_squares(x) <= 3}),
+              start={"x": np.array([-1.2, 1.0])}, value=0.0, point={"x": [1.0, 1.0]}, duals={"disc": [0.0]}),
+        _case("nlp_hs071", {"x": 4}, lambda x: (x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2], {
+            "product": x[0] * x[1] * x[2] * x[3] >= 25, "sphere": cp.sum_squares(x) == 40, "lower": x >= 1,
+            "upper": x <= 5}), start={"x": np.array([1.0, 5.0, 5.0, 1.0])},
+              # problem 71 of Hock and Schittkowski (1981); digits by Newton's method on its optimality conditions
+              value=17.014017289156303, point={"x": [1.0, 4.742999637264417, 3.821149984184874, 1.3794082931726723]},
+              duals={"product": [0.5522936601207269], "sphere": [0.16146856677050583],
+                     "lower": [1.0878712286669403, 0, 0, 0], "upper": [0, 0, 0, 0]}),
+        _case("nlp_hyperbola", {"x": 2}, lambda x: (cp.sum(x), {"product": x[0] * x[1] >= 1, "sign": x >= 0}),
+              start={"x": np.array([3.0, 1.0])},
+              value=2.0, point={"x": [1.0, 1.0]}, duals={"product": [1.0], "sign": [0.0, 0.0]}),
+        _case("nlp_elementary_functions", {"x": (), "y": ()}, lambda x, y: (
+            cp.exp(x) - 2 * x + cp.square(y - cp.exp(-x)), {"ceiling": cp.logistic(y) <= 1}),
+              start={"x": 0.0, "y": 0.0},
+              value=2 - 2 * np.log(2.0), point={"x": np.log(2.0), "y": 0.5}, duals={"ceiling": [0.0]}),
+        _case("nlp_matrix_factor", {"left": (2, 1), "right": (1, 2)}, lambda left, right: (
+            cp.sum_squares(left @ right - np.diag([3.0, 1.0])), {"gauge": cp.sum_squares(right) == 1}),
+              start={"left": np.array([[1.0], [1.0]]), "right": np.array([[1.0, 0.2]])},
+              value=1.0, point={"left": [[3.0], [0.0]], "right": [[1.0, 0.0]]}, duals={"gauge": [0.0]}),
+        _case("nlp_infeasible", {"x": 2}, lambda x: (cp.sum_squares(x), {
+            "product": x[0] * x[1] >= 4, "cap": x <= 1, "sign": x >= 0}), start={"x": np.array([0.5, 0.4])},
+              outcome=INFEASIBLE),
+        _case("nlp_infeasible_stationary", {"x": ()}, lambda x: (x, {"circle": cp.square(x) == -1}), start={"x": 0.3},
+              outcome=INFEASIBLE),
+        _case("nlp_unbounded", {"x": 2}, lambda x: (x[0] * x[1], {"line": cp.sum(x) == 1}),
+              start={"x": np.array([2.0, -1.0])}, outcome=UNBOUNDED),
     ]
-
-
-def _hs071() -> dict[str, Any]:
-    """Problem 71 of Hock and Schittkowski (1981): x0 = 1, the rest by Newton's method on its optimality conditions."""
-    y = np.array([4.743, 3.8211, 1.3794, -0.55, 0.16])  # x1, x2, x3, multipliers of product and sphere
-    for _ in range(20):
-        a, b, c, p, s = y
-        residual = np.array([c + p * b * c + 2 * s * a, 1 + c + p * a * c + 2 * s * b,
-                             1 + a + b + p * a * b + 2 * s * c, a * b * c - 25, 1 + a * a + b * b + c * c - 40])
-        slope = np.array([[2 * s, p * c, 1 + p * b, b * c, 2 * a], [p * c, 2 * s, 1 + p * a, a * c, 2 * b],
-                          [1 + p * b, 1 + p * a, 2 * s, a * b, 2 * c], [b * c, a * c, a * b, 0, 0],
-                          [2 * a, 2 * b, 2 * c, 0, 0]])
-        y = y - np.linalg.solve(slope, residual)
-    a, b, c, p, s = y
-    lowest = c * (2 + a + b) + p * 25 + 2 * s  # the multiplier of x0 >= 1 is the gradient in x0
-    return {"value": float(c * (1 + a + b) + b), "point": {"x": [1.0, a, b, c]},
-            "duals": {"product": [-p], "sphere": [s], "lower": [lowest, 0, 0, 0], "upper": [0, 0, 0, 0]}}
 
 
 def planted_fit(seed: int = 0, rows: int = 60, levels: int = 4, noise: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
@@ -313,35 +213,28 @@ def planted_fit(seed: int = 0, rows: int = 60, levels: int = 4, noise: float = 0
 def _rank_one() -> list[Case]:
     matrix, y = planted_fit()
     triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, y]), mode="r"))
-    root, target, remainder = triangle[:-1, :-1], triangle[:-1, -1], float(triangle[-1, -1] ** 2)
-
+    root, target, remainder, scale = triangle[:-1, :-1], triangle[:-1, -1], float(triangle[-1, -1] ** 2), float(y @ y)
+    structure = RankOneStructure(RankOne(root, target, remainder, ((4, 2),), 1, scale), ("a",), (("mu", "b"),))
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
-    def bilinear(name: str, start: Mapping[str, Any], extra: Callable[[Any], Mapping[str, Any]]) -> Program:
-        a, mu, b = cp.Variable(1, name="a"), cp.Variable(4, name="mu"), cp.Variable(2, name="b")
-        r = cp.Variable(root.shape[0], name="r")
-        theta = cp.outer(mu, b)
-        residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
-        constraints = {"residual": r == residual, "gauge": cp.sum_squares(b) == 1, **extra(mu)}
-        form = RankOneStructure(RankOne(root, target, remainder, ((4, 2),), 1, float(y @ y)), ("a",), (("mu", "b"),))
-        return pose(name, cp.sum_squares(r) + remainder, constraints, [a, mu, b, r],
-                    start={"a": np.zeros(1), **start},
-                    structural=frozenset({"residual", "gauge"}), derived={"r": residual},
-                    structure=form, expressions={"Theta": theta},
-                    scale=float(y @ y))
+    def bilinear(name: str, sign: float, convex: bool) -> Case:
+        def statement(a: Any, mu: Any, b: Any, r: Any) -> tuple:
+            theta = cp.outer(mu, b)
+            residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
+            extra = {"convex": cp.diff(mu, 2) >= 0} if convex else {}
+            return cp.sum_squares(r) + remainder, {
+                "residual": r == residual, "gauge": cp.sum_squares(b) == 1, **extra}, {
+                "structural": frozenset({"residual", "gauge"}), "derived": {"r": residual}, "structure": structure,
+                "expressions": {"Theta": theta}, "scale": scale}
 
-    def rank_one_fit() -> Program:
-        return bilinear("rank_one_fit", rising, lambda mu: {})
+        start = {"a": np.zeros(1), **{key: sign * value for key, value in rising.items()}}
+        return _case(name, {"a": 1, "mu": 4, "b": 2, "r": len(root)}, statement, start,
+                     value=_search(matrix, y, convex=convex))
 
-    def rank_one_convex() -> Program:
-        falling = {name: -value for name, value in rising.items()}
-        return bilinear("rank_one_convex", falling, lambda mu: {"convex": cp.diff(mu, 2) >= 0})
-
-    return [Case(rank_one_fit, value=_search(matrix, y, convex=False)),
-            Case(rank_one_convex, value=_search(matrix, y, convex=True))]
+    return [bilinear("rank_one_fit", 1.0, False), bilinear("rank_one_convex", -1.0, True)]
 
 
-def _nuclear() -> list[Case]:
+def _nuclear() -> Case:
     """A Hankel matrix of one block row has independent entries: its singular values are reduced by half the weight."""
     y = np.random.default_rng(1).normal(size=(9, 3)) + np.outer(np.arange(9.0), [1.0, -0.5, 0.2])
     weight = 0.4
@@ -349,46 +242,43 @@ def _nuclear() -> list[Case]:
     kept = np.maximum(values - 0.5 / weight, 0.0)
     best = (left * kept) @ right
 
-    def nuclear_shrinkage() -> Program:
-        yhat, inner = cp.Variable(y.shape, name="yhat"), cp.Variable(y.T.shape, name="X")
-        r = cp.Variable(y.size, name="r")
+    def statement(yhat: Any, inner: Any, r: Any) -> tuple:
         misfit = cp.vec(yhat - y, order="C")
         parameter = cp.Parameter(nonneg=True, name="weight", value=weight)
-        return pose("nuclear_shrinkage", cp.normNuc(inner) + parameter * cp.sum_squares(r),
-                    {"structure": inner == yhat.T, "residual": r == misfit}, [yhat, inner, r], start={"yhat": y},
-                    structural=frozenset({"structure", "residual"}), derived={"X": yhat.T, "r": misfit},
-                    parameters={"weight": parameter},
-                    structure=NuclearNormStructure(NuclearProblem(y, np.arange(9), 1)),
-                    scale=weight * float(np.sum(y**2)))
+        return cp.normNuc(inner) + parameter * cp.sum_squares(r), {
+            "structure": inner == yhat.T, "residual": r == misfit}, {
+            "structural": frozenset({"structure", "residual"}), "derived": {"X": yhat.T, "r": misfit},
+            "parameters": {"weight": parameter}, "structure": NuclearNormStructure(NuclearProblem(y, np.arange(9), 1)),
+            "scale": weight * float(np.sum(y**2))}
 
-    return [Case(nuclear_shrinkage, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
-                 point={"yhat": best}, duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})]
+    return _case("nuclear_shrinkage", {"yhat": y.shape, "X": y.T.shape, "r": y.size}, statement, {"yhat": y},
+                 value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)), point={"yhat": best},
+                 duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})
 
 
-def _group_sparse() -> list[Case]:
+def _group_sparse() -> Case:
     """With an orthonormal design every group of coefficients is shrunk by itself."""
     rng = np.random.default_rng(5)
     design, target = np.linalg.qr(rng.normal(size=(12, 7)))[0], 3.0 * rng.normal(size=12)
-    weights, penalty = np.array([1.0, 2.0, 0.5, 1.5]), 0.9
-    free = design.T @ target
-    groups = [free[:1], free[1:2], free[2:5], free[5:]]
+    weights, penalty, edges = np.array([1.0, 2.0, 0.5, 1.5]), 0.9, np.array([0, 1, 2, 5, 7])
+    groups = np.split(design.T @ target, edges[1:-1])
     shrunk = [max(0.0, 1 - penalty * w / float(np.linalg.norm(z))) * z for w, z in zip(weights, groups)]
     rest = target - design @ np.concatenate(shrunk)
     value = 0.5 * float(rest @ rest) + penalty * sum(w * float(np.linalg.norm(z)) for w, z in zip(weights, shrunk))
+    shapes = {f"a{i + 1}": z.shape for i, z in enumerate(groups)}
 
-    def group_shrinkage() -> Program:
-        parts = [cp.Variable(z.size, name=f"a{i + 1}") for i, z in enumerate(groups)]
-        e, parameter = cp.Variable(12, name="residual"), cp.Parameter(nonneg=True, name="lambda", value=penalty)
+    def statement(*variables: Any) -> tuple:
+        *parts, e = variables
+        parameter = cp.Parameter(nonneg=True, name="lambda", value=penalty)
         misfit = target - design @ cp.hstack(parts)
         norms: Any = sum(w * cp.norm(part, 2) for w, part in zip(weights, parts))
-        form = GroupSparseStructure(GroupProblem(design, target, np.array([0, 1, 2, 5, 7]), weights),
-                         {part.name(): part.shape for part in parts})
-        return pose("group_shrinkage", 0.5 * cp.sum_squares(e) + parameter * norms, {"residual": e == misfit},
-                    [*parts, e], structural=frozenset({"residual"}), derived={"residual": misfit},
-                    parameters={"lambda": parameter}, structure=form, scale=0.5 * float(target @ target))
+        return 0.5 * cp.sum_squares(e) + parameter * norms, {"residual": e == misfit}, {
+            "structural": frozenset({"residual"}), "derived": {"residual": misfit}, "parameters": {"lambda": parameter},
+            "structure": GroupSparseStructure(GroupProblem(design, target, edges, weights), shapes),
+            "scale": 0.5 * float(target @ target)}
 
-    return [Case(group_shrinkage, value=value, point={f"a{i + 1}": z for i, z in enumerate(shrunk)},
-                 duals={"residual": -rest})]
+    return _case("group_shrinkage", {**shapes, "residual": 12}, statement, value=value,
+                 point=dict(zip(shapes, shrunk)), duals={"residual": -rest})
 
 
 def _search(matrix: np.ndarray, y: np.ndarray, *, convex: bool) -> float:

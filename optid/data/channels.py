@@ -12,6 +12,23 @@ MOST_LEVELS = 1000
 """Counting of distinct values stops here: above it a channel counts as continuous."""
 
 
+class Ports:
+    """Named inputs and outputs: what a record, a stream, the columns of a regression and a model share."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.outputs)
+
+
 @dataclass(frozen=True)
 class Transform:
     """Affine maps back to the units of the source: raw = value * scale + offset, one pair per channel.
@@ -118,49 +135,36 @@ def numbered_names(letter: str, count: int) -> tuple[str, ...]:
     return (letter,) if count == 1 else tuple(f"{letter}{c + 1}" for c in range(count))
 
 
-def channel_names(given: str | Sequence[str] | None, letter: str, count: int, what: str) -> tuple[str, ...]:
-    """Return one name per channel, the default being the letter, numbered from 1 when there are several.
+def channel_fields(
+    m: int, l: int, inputs: Any, outputs: Any, input_units: Any, output_units: Any  # noqa: E741 - the field's letter
+) -> dict[str, tuple[str, ...]]:
+    """Return the names and units of m inputs and l outputs by the names of these arguments.
+
+    Names are "u" and "y" when not given, numbered from 1 when there are several; units are "".
 
     Raises:
-        DataError: wrong number of names, or an empty one; `what` names the argument.
+        DataError: wrong number of names or units, an empty name, or one name for two channels.
     """
-    names = listed(given)
-    if names is None:
-        return numbered_names(letter, count)
-    if len(names) != count or not all(isinstance(name, str) and name for name in names):
-        raise DataError(f"{what} {names}: one non-empty name for each of the {count} channels is needed.")
-    return tuple(names)
-
-
-def channel_units(given: str | Sequence[str] | None, count: int, what: str) -> tuple[str, ...]:
-    """Return one unit per channel, "" when not given.
-
-    Raises:
-        DataError: wrong number of units; `what` names the argument.
-    """
-    units = listed(given) or [""] * count
-    if len(units) != count:
-        raise DataError(f"{what} {units}: one unit for each of the {count} channels is needed.")
-    return tuple(str(unit) for unit in units)
-
-
-def check_distinct(names: Sequence[str]) -> None:
-    """Refuse two channels of one name.
-
-    Raises:
-        DataError: names the name.
-    """
-    for name in names:
-        if names.count(name) > 1:
+    found: dict[str, tuple[str, ...]] = {}
+    for kind, letter, count, given, units in (
+        ("input", "u", m, inputs, input_units), ("output", "y", l, outputs, output_units)
+    ):
+        names, units = listed(given), listed(units) or [""] * count
+        if names is not None and (len(names) != count or not all(isinstance(name, str) and name for name in names)):
+            raise DataError(f"{kind}s {names}: one non-empty name for each of the {count} channels is needed.")
+        if len(units) != count:
+            raise DataError(f"{kind}_units {units}: one unit for each of the {count} channels is needed.")
+        found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
+        found[f"{kind}_units"] = tuple(str(unit) for unit in units)
+    everything = found["inputs"] + found["outputs"]
+    for name in everything:
+        if everything.count(name) > 1:
             raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
+    return found
 
 
 def sampling_time(dt: Any) -> float:
-    """Return dt as a float.
-
-    Raises:
-        DataError: dt is not a positive number.
-    """
+    """Return dt as a float; refuse what is not a positive number (`DataError`)."""
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
         raise DataError(f"dt = {dt!r}: the sampling time is a positive number.")
     return float(dt)

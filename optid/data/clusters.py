@@ -4,14 +4,12 @@ import json
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from optid.errors import ClusterError
-
-DISTRIBUTED = 'pip install "optid[distributed]"'
 
 REACH = 3.0
 """Seconds to reach the machine of a scheduler."""
@@ -50,16 +48,16 @@ def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[An
     try:
         from distributed import Client
     except ImportError:
-        raise ClusterError(f"a scheduler needs dask and distributed: {DISTRIBUTED}") from None
+        raise ClusterError('a scheduler needs dask and distributed: pip install "optid[distributed]"') from None
     if isinstance(scheduler, Client):
         if scheduler.asynchronous:
             raise ClusterError("an asynchronous Client cannot be waited for here: open Client(address).")
         if scheduler.status != "running":
             raise ClusterError(f"the Client is {scheduler.status}, not running: open it again.")
-        check_workers(scheduler, packages)
-        yield scheduler
-        return
-    with _opened(Client, scheduler) as client:
+        opened = nullcontext(scheduler)
+    else:
+        opened = _opened(Client, scheduler)
+    with opened as client:
         check_workers(client, packages)
         yield client
 
@@ -154,32 +152,25 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
 
 
 def check_workers(client: Any, packages: Sequence[str]) -> None:
-    """Refuse workers that have other versions than this process.
-
-    Raises:
-        ClusterError: no worker, or the first one that differs, with the difference.
-    """
+    """Refuse no workers, and workers with other versions than this process (`ClusterError` with the difference)."""
     reader, refusal = _reader(packages), ""
     for _ in range(LOOKS):
         here, there = reader(), client.run(reader, on_error="return")
         if not there:
             address = client.scheduler.address
             raise ClusterError(f"the scheduler at {address} has no worker yet: start some (dask worker {address}).")
-        if not (refusal := _differences(here, there)):
+        other = next((worker for worker, versions in there.items() if versions != here), None)
+        if other is None:
             return
+        if isinstance(there[other], BaseException):
+            refusal = f"cannot say which versions it has: {type(there[other]).__name__}: {there[other]}"
+        else:
+            refusal = f"has other packages: {difference(here, there[other])}. Install the same versions there."
+            if len(there) > 1:
+                same = sum(versions == there[other] for versions in there.values())
+                refusal = f"({same} of {len(there)} workers) {refusal}"
+        refusal = f"worker {other} {refusal}"
     raise ClusterError(refusal)
-
-
-def _differences(here: Mapping[str, str], workers: Mapping[str, Any]) -> str:
-    """Return a sentence on the first worker that differs, "" where none does."""
-    for worker, there in workers.items():
-        if isinstance(there, BaseException):
-            return f"worker {worker} cannot say which versions it has: {type(there).__name__}: {there}"
-        if text := difference(here, there):
-            same = sum(other == there for other in workers.values())
-            others = f" ({same} of {len(workers)} workers)" if len(workers) > 1 else ""
-            return f"worker {worker}{others} has other packages: {text}. Install the same versions there."
-    return ""
 
 
 def result_of(client: Any, task: Any) -> Any:
@@ -188,22 +179,15 @@ def result_of(client: Any, task: Any) -> Any:
     Raises:
         ClusterError: the workers that ran it died, or the scheduler went away.
     """
-    with lost_in_words():
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm.core import CommClosedError
+
+    try:
         future = client.compute(task)
         try:
             return future.result()
         finally:
             future.release()
-
-
-@contextmanager
-def lost_in_words() -> Iterator[None]:
-    """Turn what Dask raises when workers or the scheduler are gone into a `ClusterError`."""
-    from distributed import CancelledError, KilledWorker
-    from distributed.comm.core import CommClosedError
-
-    try:
-        yield
     except KilledWorker as error:
         count = error.allowed_failures + 1
         raise ClusterError(

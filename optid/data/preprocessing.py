@@ -1,14 +1,16 @@
-"""Changes of the samples before a fit; what is affine is recorded in `Data.transform` and undone in reports."""
+"""Changes of the samples before a fit, the methods of `Data`; what is affine is undone in reports."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.errors import DataError, nearest
 
 Changed = TypeVar("Changed", bound=Any)
-"""A record, `optid.Data`, which offers these changes as methods."""
+"""A record, `optid.Data`."""
 
 
 def detrend(data: Changed, order: int = 0) -> Changed:
@@ -66,8 +68,7 @@ def decimate(data: Changed, q: int) -> Changed:
     Raises:
         DataError: q is not a positive integer, samples are missing, or an experiment is shorter than the filter.
     """
-    if isinstance(q, bool) or not isinstance(q, int | np.integer) or q < 1:
-        raise DataError(f"decimate by {q!r}: a positive integer is needed.")
+    check_integer(q, "q", error=DataError)
     if q == 1:
         return data
     for channel, share in data.missing.items():
@@ -82,7 +83,10 @@ def decimate(data: Changed, q: int) -> Changed:
                 f"experiment {k + 1} has {e.n_samples} samples, the anti-alias filter for q = {q} has "
                 f"{20 * q + 1} taps; use a smaller q."
             )
-    lowpass = _decimator(int(q))
+    from scipy.signal import firwin, resample_poly
+
+    taps = firwin(20 * q + 1, 1.0 / q, window="hamming")
+    lowpass = partial(resample_poly, up=1, down=int(q), axis=0, window=taps, padtype="line")
     return data.mapped(lowpass, lowpass, dt=data.dt * int(q))
 
 
@@ -103,10 +107,3 @@ def _without_drift(y: np.ndarray) -> np.ndarray:
         if here.sum() > 1:
             column -= np.polyfit(t[here], column[here], 1)[0] * t
     return level
-
-
-def _decimator(q: int) -> Callable[[np.ndarray], np.ndarray]:
-    from scipy.signal import firwin, resample_poly
-
-    taps = firwin(20 * q + 1, 1.0 / q, window="hamming")
-    return lambda x: resample_poly(x, 1, q, axis=0, window=taps, padtype="line")

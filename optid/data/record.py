@@ -1,6 +1,6 @@
 """Records of inputs and outputs: one or several experiments with names, units and a sampling time."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import as_samples, is_scalar_list
 from optid.data import preprocessing
-from optid.data.channels import Channel, Transform, channel_names, channel_units, check_distinct, listed, sampling_time
+from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
 from optid.errors import DataError, nearest
 
 
@@ -41,17 +41,12 @@ class Experiment:
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class Data:
+class Data(Ports):
     """Inputs and outputs of one or several experiments, sampled every dt.
 
     Attributes:
         experiments: the records, each with read-only arrays u (N, m) and y (N, l).
-        dt: sampling time, in the user's unit of time (seconds where units matter).
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: their units, "" where unknown.
-        output_units: their units, "" where unknown.
-        name: name of the data set.
+        dt, inputs, outputs, input_units, output_units, name: as given, a name and a unit ("" where unknown) for each.
         transform: how to return to raw units; identity unless `detrend` or `scale` was used.
     """
 
@@ -81,7 +76,7 @@ class Data:
         Args:
             u: (N,) or (N, m), or a list of such arrays, one per experiment; NaN = missing.
             y: (N,) or (N, l), or a list of as many arrays; NaN = missing.
-            dt: sampling time, positive.
+            dt: sampling time, positive, in the user's unit of time (seconds where units matter).
             inputs: names of the inputs; u, or u1, u2, ... when not given.
             outputs: names of the outputs; y, or y1, y2, ... when not given.
             input_units: one unit per input.
@@ -110,37 +105,20 @@ class Data:
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
         m, l = us[0].shape[1], ys[0].shape[1]  # noqa: E741
-        input_names, output_names = channel_names(inputs, "u", m, "inputs"), channel_names(outputs, "y", l, "outputs")
-        check_distinct(input_names + output_names)
+        names = channel_fields(m, l, inputs, outputs, input_units, output_units)
         _filled(
             self,
             experiments=tuple(experiments),
             dt=sampling_time(dt),
-            inputs=input_names,
-            outputs=output_names,
-            input_units=channel_units(input_units, m, "input_units"),
-            output_units=channel_units(output_units, l, "output_units"),
             name=str(name),
             transform=Transform.identity(m, l),
+            **names,
         )
-        self._check_present()
-
-    def _check_present(self) -> None:
         for channel, share in self.missing.items():
             if share == 1.0:
                 raise DataError(f"channel {channel!r}: every sample is missing. Check the column, or leave it out.")
 
     # -- sizes and arrays ---------------------------------------------------------------------------------------
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
 
     @property
     def n_samples(self) -> int:
@@ -155,17 +133,17 @@ class Data:
     @property
     def u(self) -> Any:
         """Inputs (N, m), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.u for e in self.experiments])
+        return one_or_all([e.u for e in self.experiments])
 
     @property
     def y(self) -> Any:
         """Outputs (N, l), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.y for e in self.experiments])
+        return one_or_all([e.y for e in self.experiments])
 
     @property
     def time(self) -> Any:
         """Sampling instants (N,), or a tuple of such arrays when there are several experiments."""
-        return _one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
+        return one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -237,9 +215,9 @@ class Data:
                 raise DataError(
                     f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
                 )
-        first = [self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts)]
-        second = [self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts)]
-        return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
+        first = tuple(self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts))
+        second = tuple(self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts))
+        return self._with(experiments=first), self._with(experiments=second)
 
     def window(self, first: int, last: int) -> "Data":
         """Return samples first to last - 1 of every experiment.
@@ -312,17 +290,7 @@ class Data:
 
     # -- changes of the samples --------------------------------------------------------------------------------------
 
-    def detrend(self, order: int = 0) -> "Data":
-        """Subtract the means (order 0), and a drift of the outputs too (order 1): `preprocessing.detrend`."""
-        return preprocessing.detrend(self, order)
-
-    def scale(self, factors: Mapping[str, float] | None = None) -> "Data":
-        """Divide by the standard deviations or by the factors given: `preprocessing.scale`."""
-        return preprocessing.scale(self, factors)
-
-    def decimate(self, q: int) -> "Data":
-        """Low-pass with zero phase and keep every q-th sample: `preprocessing.decimate`."""
-        return preprocessing.decimate(self, q)
+    detrend, scale, decimate = preprocessing.detrend, preprocessing.scale, preprocessing.decimate
 
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
@@ -335,12 +303,9 @@ class Data:
         return self._with(transform=Transform.identity(self.m, self.l))
 
     def mapped(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
-        """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y).
+        """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y), and other fields by `changes`.
 
-        Args:
-            of_u: function from (N, m) to (n, m); must not change its argument.
-            of_y: function from (N, l) to (n, l); must not change its argument.
-            changes: further fields to replace, such as dt or transform.
+        The functions must not change their arguments.
         """
         experiments = tuple(Experiment(_frozen(of_u(e.u)), _frozen(of_y(e.y)), e.start) for e in self.experiments)
         return self._with(experiments=experiments, **changes)
@@ -386,5 +351,6 @@ def _take(values: tuple, positions: Sequence[int]) -> tuple:
     return tuple(values[p] for p in positions)
 
 
-def _one_or_all(arrays: list[np.ndarray]) -> np.ndarray | tuple[np.ndarray, ...]:
+def one_or_all(arrays: list[np.ndarray]) -> Any:
+    """Return the array of the only experiment, or a tuple with one array for each."""
     return arrays[0] if len(arrays) == 1 else tuple(arrays)

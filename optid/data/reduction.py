@@ -4,17 +4,50 @@ The tree is fixed by the parts alone, not by who is done first: the result is th
 and on any number of workers, also when some of them die and their parts are read again elsewhere.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from itertools import chain, islice
 from typing import Any, TypeVar
 
+from optid.arrays import check_integer
 from optid.data.reading.parts import Part
-from optid.data.workers import mapped
 
+One = TypeVar("One")
 Result = TypeVar("Result")
 
 FAN_IN = 8
 """Results that one task merges."""
+
+
+def available_threads(threads: int | None) -> int:
+    """Return the number of threads asked for, a positive integer; None asks for one per core of this process."""
+    if threads is not None:
+        return check_integer(threads, "threads")
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def mapped(function: Callable[[One], Result], parts: Iterable[One], threads: int) -> Iterator[Result]:
+    """Yield function(part) for every part, in the order of the parts.
+
+    With one thread, or one part, nothing is started; else the calling thread reads the parts, one ahead of those at
+    which the others compute. What `parts` or `function` raises is raised here, once the parts under way are done.
+    """
+    rest = iter(parts)
+    head = list(islice(rest, 2 if threads > 1 else 0))
+    if len(head) < 2:
+        yield from map(function, chain(head, rest))
+        return
+    running: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for part in chain(head, rest):
+            if len(running) > threads:
+                yield running.popleft().result()
+            running.append(pool.submit(function, part))
+        while running:
+            yield running.popleft().result()
 
 
 def reduced(

@@ -8,14 +8,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optid.data.channels import Transform, channel_names, channel_units, check_distinct, sampling_time
+from optid.arrays import check_integer
+from optid.data.channels import Ports, Transform, channel_fields, sampling_time
 from optid.data.reading.chunks import Channels, Chunk
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
 from optid.data.reading.survey import Survey, joined, surveyed, widened
-from optid.data.reduction import fetched, reduced
-from optid.data.workers import available_threads
+from optid.data.reduction import available_threads, fetched, reduced
 from optid.errors import DataError
 
 CHUNK = 131072
@@ -25,19 +25,14 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Stream:
+class Stream(Ports):
     """A record that is read chunk by chunk; every iteration is a new pass.
 
     Iterating yields (u (n, m), y (n, l)), float64, in time order; NaN = missing. An infinite sample raises a
     `DataError` that names the channel and the sample when its chunk is reached.
 
     Attributes:
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        dt: sampling time.
-        input_units: their units, "" where unknown.
-        output_units: their units, "" where unknown.
-        name: name of the data set.
+        dt, inputs, outputs, input_units, output_units, name: as of `Data`.
         n_samples: number of samples, None where only a pass can tell (CSV, Dask data frames).
         parts: what can be read apart, in order; empty where the record is one experiment that is read from its
             beginning to its end.
@@ -81,16 +76,6 @@ class Stream:
         return self.parts[-1].experiment + 1 if self.parts else 1
 
     @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
-
-    @property
     def transform(self) -> Transform:
         """Identity: a stream is in raw units."""
         return Transform.identity(self.m, self.l)
@@ -118,13 +103,7 @@ class Stream:
         merge: Callable[[Sequence[Result]], Result],
         threads: int = 1,
     ) -> Result:
-        """Reduce the parts to one result, each where it is read; see `optid.data.reduction.reduced`.
-
-        Args:
-            leaf: what is made of a part and the chunks that are read from it.
-            merge: what is made of results that are neighbours.
-            threads: threads that read parts on this machine.
-        """
+        """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
         return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
     @property
@@ -145,15 +124,12 @@ class Stream:
         Raises:
             DataError: every sample of an input is missing.
         """
-        lo, hi = self._ranges
-        return lo.copy(), hi.copy()
+        return self._ranges[0].copy(), self._ranges[1].copy()
 
     @cached_property
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        lo, hi = np.full(self.m, np.nan), np.full(self.m, np.nan)
-        if self.parts:
-            lo, hi = widened(lo, hi, np.array([self._survey.lo, self._survey.hi]))
-        for u, _ in () if self.parts else self:
+        lo = hi = np.full(self.m, np.nan)
+        for u in [np.array([self._survey.lo, self._survey.hi])] if self.parts else (u for u, _ in self):
             lo, hi = widened(lo, hi, u)
         for name, value in zip(self.inputs, lo):
             if np.isnan(value):
@@ -184,22 +160,15 @@ def open_stream(
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
 
-    Args:
+    Arguments as in `optid.data.readers.read`, besides:
         source: path of a .csv, .txt, .parquet or .npy file; {channel: path of an .npy file (N,)}; a folder whose
             .parquet files, in the order of their names (2 before 10), are one experiment; a Dask data frame, a Dask
             array (N, channels) or {channel: Dask array (N,)}; or a list of these, one per experiment. An npy file holds
             (N, channels) numbers; it is read, not mapped, because mapped pages count as resident memory.
-        inputs: columns by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
-        outputs: likewise; y, or y1, y2, ..., when not given.
         dt: sampling time; when not given from the first block or part with two time stamps, 1 without stamps.
         chunk: samples read at a time.
         time: column of time stamps, checked on every pass; a column t or time when not given; False ignores it.
         columns: names of the columns of an npy file, a Dask array, or a CSV file without a header.
-        input_units: one unit per input.
-        output_units: one unit per output.
-        name: name of the data set; the file's when not given.
-        delimiter: character between the cells of a CSV file.
-        decimal: decimal mark of a CSV file.
         time_tolerance: largest deviation of a time step from the first chunk's median step, relative to it.
         scheduler: address of a Dask scheduler ("tcp://host:8786"), or an open `distributed.Client`, whose workers read
             the parts of the record: row groups of Parquet files, whole files of another kind, partitions of Dask
@@ -211,13 +180,13 @@ def open_stream(
         DataError: as `read`, here or when the chunk is reached.
         ClusterError: the cluster cannot be used.
     """
-    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
-        raise DataError(f"chunk = {chunk!r}: a positive number of samples is needed.")
+    chunk = check_integer(chunk, "chunk", error=DataError)
     several = list(source) if isinstance(source, list | tuple) else [source]
     if not several:
         raise DataError("the list of sources is empty; give at least one.")
-    opened = [open_source(one, int(chunk), columns, delimiter, decimal) for one in several]
+    opened = [open_source(one, chunk, columns, delimiter, decimal) for one in several]
     ins, outs, clock = _chosen(opened, inputs, outputs, time)
+    names = channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units)
     dt = None if dt is None else sampling_time(dt)
     if scheduler is not None:
         from optid.data.clusters import connected
@@ -237,11 +206,8 @@ def open_stream(
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        inputs=channel_names(list(ins), "u", len(ins), "inputs"),
-        outputs=channel_names(list(outs), "y", len(outs), "outputs"),
+        **names,
         dt=step,
-        input_units=channel_units(input_units, len(ins), "input_units"),
-        output_units=channel_units(output_units, len(outs), "output_units"),
         name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
         _channels=Channels(ins, outs, clock, step, time_tolerance),
@@ -258,7 +224,6 @@ def _chosen(
     found = []
     for one in opened:
         ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
-        check_distinct((*ins, *outs))
         found.append((ins, outs, time_column(one.names, time, [*ins.values(), *outs.values()], one.label)))
         if found[-1] != found[0]:
             raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "

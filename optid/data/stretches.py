@@ -24,15 +24,12 @@ def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
     return np.nan_to_num(filled)
 
 
-def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice]]]:
-    """Cut a record where an input is missing.
+def between_gaps(data: Data, shortest: int) -> Data:
+    """Cut a record where an input is missing; the stretches are its experiments.
 
     Args:
         data: the record.
         shortest: outputs (of every channel) that a stretch must hold to be kept.
-
-    Returns:
-        The stretches as experiments, and for each the index of its experiment and its samples there.
 
     Raises:
         DataError: no stretch is long enough.
@@ -40,36 +37,25 @@ def between_gaps(data: Data, shortest: int) -> tuple[Data, list[tuple[int, slice
     if not any(data.missing[name] for name in data.inputs) and all(
         np.min(np.sum(~np.isnan(e.y), axis=0)) >= shortest for e in data.experiments
     ):
-        return data, [(i, slice(0, e.n_samples)) for i, e in enumerate(data.experiments)]
-    kept, places = [], []
+        return data
+    kept = []
     for i, e in enumerate(data.experiments):
-        for first, last in runs_of(np.isfinite(e.u).all(axis=1)):
+        for first, last in runs_of(np.isfinite(e.u).all(axis=1)).tolist():
             # more outputs than states, or the initial state would repeat them
             if np.min(np.sum(~np.isnan(e.y[first:last]), axis=0)) >= shortest:
-                kept.append(data.select(experiments=i).window(int(first), int(last)))
-                places.append((i, slice(int(first), int(last))))
+                kept.append(data.select(experiments=i).window(first, last))
     if not kept:
         raise DataError(f"no stretch of {shortest} samples has every input: interpolate them, or leave an input out")
-    return Data.join(*kept), places
+    return Data.join(*kept)
 
 
 def with_whole_inputs(data: Data, shortest: int) -> Data:
-    """Return a record in which no input is missing: the stretches between the gaps as experiments of their own.
-
-    A record without such a gap is returned as it is; otherwise a `DataWarning` says what remains.
-
-    Args:
-        data: the record.
-        shortest: as in `between_gaps`.
-
-    Raises:
-        DataError: no stretch is long enough.
-    """
+    """Return a record in which no input is missing: as it is, or cut by `between_gaps`, which a `DataWarning` tells."""
     gaps = [~np.isfinite(e.u) for e in data.experiments]
     lost = np.sum([gap.sum(axis=0) for gap in gaps], axis=0)
     if not lost.any():
         return data
-    cut, _ = between_gaps(data, shortest)
+    cut = between_gaps(data, shortest)
     total = sum(len(runs_of(~gap.any(axis=1))) for gap in gaps)
     channels = ", ".join(f"{name!r} ({count} samples)" for name, count in zip(data.inputs, lost) if count)
     dropped = total - cut.n_experiments

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
+from optid.data.record import one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import ADDITIVE, Fault, channel_of, place_of
-from optid.models.experiments import check_inputs, one_or_all, records_of, state_like
+from optid.models.experiments import check_inputs, records_of, state_like
 from optid.models.kalman import NoiseCovariances
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.signature_space import InputRuler, Ruler, SignatureSpace, signature_space
 from optid.faults.signatures import Dictionary
@@ -179,8 +179,7 @@ def study(
             candidate with a signature.
     """
     for word, value in (("draws", draws), ("calibration", calibration)):
-        if value != int(value) or value < 1:
-            raise StructureError(f"{word}={value!r}; a whole number of simulated windows, from 1, is needed.")
+        check_integer(value, word)
     if window * found.model.l * draws > NUMBERS:
         raise StructureError(
             f"window={window}: {draws} simulated windows of so many samples do not fit in memory; "

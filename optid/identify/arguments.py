@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 
@@ -18,42 +19,16 @@ def one_of(name: str, value: str, known: Sequence[str]) -> None:
         raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
 
 
-def whole_number(name: str, value: Any, low: int = 0, what: str = "") -> int:
-    """Check an order or another number of things.
-
-    Args:
-        name: of the argument.
-        value: of the argument.
-        low: least value.
-        what: its meaning, for the message.
-
-    Raises:
-        StructureError: not an integer, or below ``low``.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-        kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
-        raise StructureError(f"{name}{what and f' ({what})'} must be {kind}; got {value!r}")
-    return int(value)
-
-
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
     """Expand a scalar to one integer per input and check it."""
     values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
     if len(values) != len(inputs):
         raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
-    return tuple(whole_number(f"{name} of input {channel!r}", entry, low) for channel, entry in zip(inputs, values))
+    return tuple(check_integer(entry, f"{name} of input {channel!r}", low) for channel, entry in zip(inputs, values))
 
 
 def in_memory(data: Any, errors: str) -> Data:
-    """Refuse a stream.
-
-    Args:
-        data: the record.
-        errors: the residuals that the fit minimises, for the message.
-
-    Raises:
-        StructureError: naming the remedy.
-    """
+    """Refuse a stream (`StructureError`); the message names the errors that the fit minimises."""
     if not isinstance(data, Data):
         raise StructureError(f"{errors} need the record in memory, with every sample in order: read it with optid.read "
                              "instead of a stream")
@@ -61,15 +36,11 @@ def in_memory(data: Any, errors: str) -> Data:
 
 
 def one_output(data: Any, errors: str) -> Data:
-    """Refuse streams, several outputs, and an output without samples.
+    """Refuse streams, several outputs (`StructureError`), and an output without a single sample (`DataError`).
 
     Args:
         data: the record.
-        errors: the residuals that the fit minimises, for the message.
-
-    Raises:
-        StructureError: naming the remedy.
-        DataError: an output without a single sample.
+        errors: what the fit minimises, for the message.
     """
     data = in_memory(data, errors)
     if data.l > 1:
@@ -82,16 +53,13 @@ def one_output(data: Any, errors: str) -> Data:
 
 
 def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
-    """Refuse a record with fewer than 1.1 rows per unknown.
+    """Refuse a record with fewer than 1.1 rows per unknown (`RankError`).
 
     Args:
         rows: number of them.
         what: their name.
         unknowns: their number, initial states included.
         remedy: the lags or states that a user could have fewer of, besides basis functions.
-
-    Raises:
-        RankError: naming the numbers.
     """
     needed = ROWS_PER_UNKNOWN * unknowns
     if rows < needed:

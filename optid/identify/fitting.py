@@ -17,7 +17,7 @@ from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
-from optid.program.solution import Bound, Solution, Status
+from optid.program.solution import Solution, Status
 from optid.registry import check_arguments, defaults, formulation, named_constraint, render
 from optid.solving.solve import Outcome, Procedure, run
 
@@ -27,60 +27,57 @@ class Fit:
     """A fitted model with the evidence for it.
 
     Attributes:
-        identified: the identified model as far as it is needed at once, in raw units; None only with
-            ``raises=False``. See `model`.
-        solved: status, proof, residuals and times, as far as they were needed at once. See `solution`.
+        outcome: what the formulation ended with; see `program`, `solution`, `model`, `figures` and `steps`.
         formulation: its name.
         arguments: what it was called with.
-        program: the last programme solved.
         data: the record.
         prices: activity and price of every user constraint.
         findings: what the examination of the record found, one sentence each.
-        measured: rows used, rows there are, condition number, method of the statistics; for a procedure what it
-            measured on its way (singular values, number of starts, ...). See `figures`.
-        steps: (name, solution) of every programme on the way.
-        procedure: whether a procedure of several steps judged the whole: its bound may be that of a step.
         seconds: wall time of the whole call.
-        bound: returns a bound that was not needed at once, or None.
-        extend: as in `optid.solving.solve.Evidence`.
     """
 
-    identified: Any
-    solved: Solution
+    outcome: Outcome = field(repr=False)
     formulation: str
     arguments: Mapping[str, Any] = field(repr=False)
-    program: Program = field(repr=False)
     data: Data | Stream = field(repr=False)
     prices: tuple[Price, ...] = ()
     findings: tuple[str, ...] = ()
-    measured: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    steps: tuple[tuple[str, Solution], ...] = field(default=(), repr=False)
-    procedure: bool = False
     seconds: float = 0.0
-    bound: Callable[[], Bound] | None = field(default=None, repr=False)
-    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = field(default=None, repr=False)
+
+    @property
+    def program(self) -> Program:
+        """The last programme solved."""
+        return self.outcome.program
+
+    @property
+    def steps(self) -> tuple[tuple[str, Solution], ...]:
+        """Name and solution of every programme on the way."""
+        return self.outcome.steps
 
     @cached_property
     def solution(self) -> Solution:
         """Status, proof, residuals and times."""
-        return self.solved if self.bound is None else replace(self.solved, bound=self.bound())
+        solution, evidence = self.outcome.solution, self.outcome.evidence
+        return replace(solution, bound=evidence.bound()) if evidence and callable(evidence.bound) else solution
 
     @cached_property
-    def _extended(self) -> tuple[Any, dict[str, Any]]:
-        if self.extend is None:
-            return self.identified, {}
-        model, figures = self.extend()
-        return _in_raw_units(model, self.data), figures
+    def _completed(self) -> tuple[Any, dict[str, Any]]:
+        evidence = self.outcome.evidence
+        model, figures = evidence.extended() if evidence else (self.outcome.model, {})
+        transform = getattr(self.data, "transform", None)
+        if model is not None and transform is not None and not transform.is_identity:
+            model = model.with_transform(transform)
+        return model, {**self.outcome.figures, **figures}
 
     @property
     def model(self) -> Any:
-        """The identified model, in raw units; parts such as its noise model are estimated at the first call."""
-        return self._extended[0]
+        """The identified model in raw units, None without a point; its noise model is estimated at the first call."""
+        return self._completed[0]
 
     @property
     def figures(self) -> dict[str, Any]:
-        """What was measured on the way, the estimation of the parts of the model included."""
-        return {**self.measured, **self._extended[1]}
+        """Rows used, rows there are, condition number and method of the statistics; what a procedure measured."""
+        return self._completed[1]
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
@@ -96,14 +93,9 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        from optid.identify.validation.predictions import common_fits, one_step
-
         if self.program.compressed is not None:
             return self.program.compressed.one_step_fit(self.solution.values)
-        if isinstance(self.data, Stream):
-            return np.full(len(self.data.outputs), np.nan)
-        raw = self.data.raw()
-        return common_fits(raw, [one_step(self.model, raw)])[0]
+        return self._fit("one step")
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:
@@ -112,26 +104,18 @@ class Fit:
         NaN for a stream, where an input has missing samples (a simulation needs every one of them), and where the
         simulation runs away.
         """
-        return self._simulated_fit("simulation")
+        return self._fit("simulation")
 
     @cached_property
     def measured_feedback_fit(self) -> np.ndarray:
-        """Fit in % of the simulation that takes the outputs in the feedback from the record.
+        """As `simulation_fit`, with the outputs in the nonlinear feedback, if there is one, from the record."""
+        return self._fit("measured feedback" if has_feedback(self.model) else "simulation")
 
-        The same as `simulation_fit` for a model without nonlinear feedback.
-        """
-        return self._simulated_fit("measured feedback" if has_feedback(self.model) else "simulation")
+    def _fit(self, word: str) -> np.ndarray:
+        from optid.identify.validation.predictions import prediction_fit
 
-    def _simulated_fit(self, word: str) -> np.ndarray:
-        from optid.identify.validation.predictions import common_fits, simulated
-
-        if not isinstance(self.data, Stream) and not any(self.data.missing[name] for name in self.data.inputs):
-            raw = self.data.raw()
-            try:
-                return common_fits(raw, [simulated(self.model, raw, word)])[0]
-            except DataError:  # it leaves the range of the data
-                pass
-        return np.full(len(self.data.outputs), np.nan)
+        return (np.full(len(self.data.outputs), np.nan) if isinstance(self.data, Stream) else
+                prediction_fit(self.model, self.data, word))
 
     @cached_property
     def uncertainty(self) -> Any:
@@ -185,7 +169,9 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
-    findings = _examined(data, {**defaults(pose), **arguments})
+    findings, words = [], {**defaults(pose), **arguments}
+    if isinstance(data, Data):
+        findings = examine(data, fitted_bases(data, words.get("basis", Linear())), words)
     problem = pose(data, **arguments)
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate, "prove": prove,
                 **(solver_options or {})}
@@ -230,29 +216,15 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
-    model = outcome.model
-    findings = findings + _disobeyed(model, arguments.get("constraints", ()))
+    findings = findings + _disobeyed(outcome.model, arguments.get("constraints", ()))
     compressed, figures = outcome.program.compressed, dict(outcome.figures)
     if compressed is not None:
         figures |= {key: getattr(compressed.statistics, key) for key in ("rows", "candidates", "condition", "method")}
     findings = findings + examine_figures(figures)
-    return Fit(identified=_in_raw_units(model, data), solved=outcome.solution, formulation=name, arguments=arguments,
-               program=outcome.program, data=data,
-               prices=(*price_constraints(outcome.program, outcome.solution),
-                       *price_earlier_steps(outcome.constrained, outcome.program)),
-               findings=tuple(findings), measured=figures, steps=outcome.steps, procedure=outcome.procedure,
-               seconds=time.perf_counter() - started, bound=outcome.bound, extend=outcome.extend)
-
-
-def _in_raw_units(model: Any, data: Data | Stream) -> Any:
-    transform = getattr(data, "transform", None)
-    return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
-
-
-def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
-    if isinstance(data, Stream):
-        return []
-    return examine(data, fitted_bases(data, arguments.get("basis", Linear())), arguments)
+    prices = price_constraints(outcome.program, outcome.solution)
+    earlier = price_earlier_steps(outcome.constrained, outcome.program)
+    return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
+               time.perf_counter() - started)
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

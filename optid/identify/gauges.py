@@ -6,22 +6,17 @@ import cvxpy as cp
 import numpy as np
 
 from optid.errors import StructureError
-from optid.models.gauges import gauge_factor
+from optid.models.gauges import GAUGES, gauge_factor
 
-GAUGES = ("norm", "gain", "b0")
-
-
-def check_gauge(gauge: str) -> None:
-    """Refuse an unknown word (`StructureError`)."""
-    if gauge not in GAUGES:
-        raise StructureError(f"gauge must be one of {', '.join(GAUGES)}; got {gauge!r}")
+FIXED = GAUGES[:-1]
+"""The gauges that fix the scale."""
 
 
 def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np.ndarray | None = None) -> Any:
     """Return the constraint on the coefficients of B: norm one, unit static gain, or a first coefficient of one.
 
     Args:
-        gauge: one of `GAUGES`.
+        gauge: one of `FIXED`.
         b: coefficients of B of one input, (nb,) or (nb, l).
         a: coefficients of A, None without poles.
         reference: (nb,) iterate in whose tangent the norm is fixed; None for the norm itself.
@@ -43,7 +38,7 @@ def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, ch
     """Return mu and b of one input, scaled to satisfy a gauge.
 
     Args:
-        gauge: one of `GAUGES`.
+        gauge: one of `FIXED`.
         mu: (P,) coefficients of the nonlinearity.
         b: (nb,) or (nb, l) coefficients of B.
         a: coefficients of A, None without poles.

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.special import stdtrit
 
-from optid.arrays import Array
-from optid.errors import StructureError
+from optid.arrays import Array, check_integer
+from optid.structures.multipliers import least_distance
 
 DRAWS = 8192  # random draws of an interval under inequalities: their noise is about 0.7 % of its width
 SETS = 64  # sets of active rows that are tried for all points; where there are many more, each point finds its own
@@ -34,11 +33,8 @@ class LocalEstimate:
         dof: degrees of freedom of the noise estimate inside S.
         rows: (r, n) and
         slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
-        draws: number of random draws.
+        draws: number of random draws, at least 100 (`StructureError`).
         seed: their seed.
-
-    Raises:
-        StructureError: fewer than 100 draws.
     """
 
     centre: Array
@@ -50,8 +46,7 @@ class LocalEstimate:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.draws < 100:
-            raise StructureError(f"draws={self.draws}: the ends of an interval need at least 100 draws")
+        check_integer(self.draws, "draws, on which the ends of an interval rest,", 100)
 
     @cached_property
     def in_reach(self) -> np.ndarray:
@@ -107,8 +102,7 @@ class LocalEstimate:
 def project(points: Array, rows: Array, slack: Array) -> Array:
     """Project points (K, n) on the polyhedron {v: rows @ v + slack >= 0}, which contains the origin.
 
-    Least-distance programming by nonnegative least squares (Lawson and Hanson, Solving Least Squares Problems, 1974,
-    chapter 23) finds the active rows of one point; the same rows are then tried for all points that are left.
+    Least-distance programming finds the active rows of one point; the same rows are then tried for all that are left.
     """
     size = max(float(np.max(np.linalg.norm(points, axis=1), initial=0.0)), np.finfo(float).tiny)
     lengths = np.linalg.norm(rows, axis=1)
@@ -117,12 +111,9 @@ def project(points: Array, rows: Array, slack: Array) -> Array:
     left, tried = np.flatnonzero(np.any(points @ rows.T + slack < 0, axis=1)), 0
     while left.size:
         first = left[0]
-        system = np.vstack([rows.T, -(points[first] @ rows.T + slack) / size])
-        target = np.zeros(len(system))
-        target[-1] = 1.0
-        multipliers, _ = nnls(system, target, maxiter=30 * rows.shape[0])
-        residual = target - system @ multipliers
-        projected[first] -= size * residual[:-1] / residual[-1]
+        multipliers = least_distance(-rows, -(points[first] @ rows.T + slack) / size, np.zeros(len(rows), dtype=bool))
+        assert multipliers is not None  # the polyhedron contains the origin
+        projected[first] += size * multipliers @ rows
         left = left[1:]
         active = np.flatnonzero(multipliers > 0)
         if tried == SETS or not left.size or not 0 < active.size <= points.shape[1]:

@@ -13,18 +13,17 @@ hence K and Re.
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.data.stretches import between_gaps, runs_of
+from optid.data.stretches import between_gaps
 from optid.errors import DataError, StructureError
-from optid.identify.innovations import innovation_form, regression_lags
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
+from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     covariance_of,
     information,
@@ -34,12 +33,13 @@ from optid.models.innovation_gain import (
     whitened,
 )
 from optid.models.kalman import NoiseCovariances, kalman_gain
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
+from optid.statistics.hankel import complete_runs, hankel_statistics
 
 ROUNDING = 1e-10
 """Residuals below this share of the outputs are rounding: there is no noise to describe."""
+
+LONGEST = 40
+"""Lags of the autoregression of prediction errors at most."""
 
 EXACT = 1e-8
 """Prediction errors relative to the outputs below which a record shows no noise model."""
@@ -62,42 +62,8 @@ NEARLY, ELSEWHERE = 0.1, 1.0
 which two gains are not the same optimum of it."""
 
 
-class Noise(NamedTuple):
-    """The gain K (n, l) of the innovations, with A - K C stable, and the covariances of the noises."""
-
-    K: Array
-    covariances: NoiseCovariances
-
-
-def with_noise(model: "HammersteinSS", data: Data) -> "HammersteinSS":
-    """Return the model with the gain and the noise covariances that a record shows, see `estimate_noise`."""
-    found = estimate_noise(model, data)
-    return replace(model, K=found.K, noise=found.covariances)
-
-
-def with_noise_or_reason(model: "HammersteinSS", data: Data) -> tuple["HammersteinSS", str]:
-    """Return the model as of `with_noise`, or unchanged with the reason why the record shows no noise model.
-
-    Args:
-        model: a model in the units of the data.
-        data: the record it was identified on.
-    """
-    outputs = [e.y for e in data.experiments]
-    try:
-        regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
-        found = with_noise(model, data)
-    except (StructureError, DataError) as reason:
-        return model, f"none: {reason}"
-    except np.linalg.LinAlgError:
-        return model, "none: the prediction errors leave the range of numbers where outputs are missing"
-    spread = np.nanstd(np.concatenate(outputs), axis=0)
-    if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
-        return model, "none: the prediction errors vanish, there is no noise to model"
-    return found, ""
-
-
-def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
-    """Estimate the noise model from what A, B, C, D, E and L leave unexplained.
+def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
+    """Return the model with the gain K, A - K C stable, and the noise covariances that a record shows.
 
     Args:
         model: the model; its K and noise do not matter.
@@ -109,22 +75,43 @@ def estimate_noise(model: "HammersteinSS", data: Data) -> Noise:
         StructureError: a pole on or outside the unit circle that the outputs do not see.
     """
     observer = _observer(model)
-    data, _ = between_gaps(data.without_transform(), 2 * model.nx + 1)
+    data = between_gaps(data.without_transform(), 2 * model.nx + 1)
     rest = residuals(replace(model, K=observer, noise=None), data)
-    if not _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
-        return Noise(observer, NoiseCovariances.of_innovations(observer, covariance_of(rest)))
-    A = model.A - observer @ model.C
-    gain, covariance = _most_likely(A, model.C, rest)
-    return Noise(observer + gain, NoiseCovariances.of_innovations(observer + gain, covariance))
+    gain, covariance = np.zeros_like(observer), covariance_of(rest)
+    if _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
+        gain, covariance = _most_likely(model.A - observer @ model.C, model.C, rest)
+    return replace(model, K=observer + gain, noise=NoiseCovariances.of_innovations(observer + gain, covariance))
 
 
-def residuals(model: "HammersteinSS", data: Data) -> list[Array]:
+def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, str]]:
+    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model.
+
+    Args:
+        model: a model in the units of the data.
+        data: the record it was identified on.
+    """
+    outputs = [e.y for e in data.experiments]
+    try:
+        _regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
+        found = with_noise(model, data)
+    except (StructureError, DataError) as reason:
+        return model, {"noise model": f"none: {reason}"}
+    except np.linalg.LinAlgError:
+        return model, {"noise model": "none: the prediction errors leave the range of numbers where outputs are "
+                                      "missing"}
+    spread = np.nanstd(np.concatenate(outputs), axis=0)
+    if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
+        return model, {"noise model": "none: the prediction errors vanish, there is no noise to model"}
+    return found, {}
+
+
+def residuals(model: HammersteinSS, data: Data) -> list[Array]:
     """Return the one-step prediction errors (N, l) of every experiment in the units of the model, NaN = missing."""
     data = data.without_transform()
     return [e.y - p for e, p in zip(data.experiments, one_step(model, data))]
 
 
-def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
+def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
     """Return the spectral density of the noise at the outputs, H Re H* with H = I + C (zI - A)^-1 K.
 
     Args:
@@ -143,7 +130,7 @@ def noise_spectrum(model: "HammersteinSS", w: ArrayLike) -> Array:
     return np.asarray(shaped @ _innovations(model) @ np.conj(np.swapaxes(shaped, 1, 2)))
 
 
-def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Correlation]:
+def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
     """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
 
     Args:
@@ -160,7 +147,7 @@ def colour(model: "HammersteinSS", data: Data, lags: int = 25) -> dict[str, Corr
     return {name: autocorrelation([r[:, o] for r in rest], name, lags) for o, name in enumerate(model.outputs)}
 
 
-def output_noise(model: "HammersteinSS") -> Array:
+def output_noise(model: HammersteinSS) -> Array:
     """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
 
     It is the mean of the spectrum; infinite where a pole on or outside the unit circle is driven by the noise.
@@ -179,7 +166,7 @@ def output_noise(model: "HammersteinSS") -> Array:
     return np.asarray(model.C @ states @ model.C.T + covariance)
 
 
-def _innovations(model: "HammersteinSS") -> Array:
+def _innovations(model: HammersteinSS) -> Array:
     if model.noise is None:
         raise StructureError("the model has no noise covariances; optid.noise.with_noise(model, data) estimates them")
     return np.array(model.noise.innovation)
@@ -229,28 +216,72 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         try:
-            observers.append(_observer_gain(A, C, ratio))
+            observers.append(observer_gain(A, C, ratio))
         except StructureError:
             continue
     found = sorted(map(measured, observers), key=itemgetter(0))
     for _, gain in found[:TRIED]:
-        errors = whitened(A, C, gain, rest)
-        whole = [e[start:stop] for e in errors for start, stop in runs_of(~np.isnan(e).any(axis=1))]
         try:
-            found.append(measured(np.array(innovation_form(A, C, gain, whole)[0])))
+            found.append(measured(whitening_gain(A, C, gain, whitened(A, C, gain, rest))))
         except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
             continue
     return [gain for _, gain in sorted(found, key=itemgetter(0))]
 
 
-def _observer(model: "HammersteinSS") -> Array:
+def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
+    """Return the gain (n, l), A - K C stable, with the spectrum of a long autoregression of an observer's errors.
+
+    With F = A - L C the errors of the gain L obey r = e + C (qI - F)^-1 (K - L) e. The autoregression shows this
+    response (Hannan and Rissanen 1982), which is linear in K.
+
+    Args:
+        A: (n, n).
+        C: (l, n).
+        gain: (n, l) gain L of the observer.
+        errors: (N, l) its prediction errors, one array per experiment; NaN = missing.
+
+    Raises:
+        StructureError: errors that determine no gain: too few, zero, or on the stability limit.
+    """
+    n, l = gain.shape  # noqa: E741
+    lags = _regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
+    statistics, past = hankel_statistics([r for r in errors if len(r) > lags], lags + 1), lags * l
+    root = statistics.triangle(statistics.at(range(l)))
+    spread = np.linalg.norm(root[past:, past:], axis=0)
+    if not np.all(spread > 0):
+        raise StructureError("an output is predicted exactly: the covariance of the innovations is singular.")
+    regressive = np.linalg.lstsq(root[:past, :past], root[:past, past:], rcond=None)[0].reshape(lags, l, l)[::-1]
+    response, powers = [np.eye(l)], [C]
+    for i in range(1, lags + 1):
+        response.append(np.sum([regressive[j].T @ response[i - 1 - j] for j in range(i)], axis=0))
+        powers.append(powers[-1] @ (A - gain @ C))
+    unit = np.tile(spread, lags)[:, None]
+    change = np.linalg.lstsq(np.vstack(powers[:-1]) / unit, np.vstack(response[1:]) / unit, rcond=None)[0]
+    K, covariance = gain + change, root[past:, past:].T @ root[past:, past:] / statistics.windows
+    return np.array(kalman_gain(A, C, K @ covariance @ K.T, covariance, K @ covariance).K)
+
+
+def _regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
+    """Return the lags of the autoregression of the errors of l outputs, in complete runs of some lengths, order n.
+
+    Raises:
+        StructureError: too few for a noise model.
+    """
+    total = sum(lengths)
+    lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))
+    if max(lengths, default=0) <= 2 * lags or total < 10 * (lags + n) * l:
+        raise StructureError(f"{total} prediction errors are too few for a noise model.")
+    return lags
+
+
+def _observer(model: HammersteinSS) -> Array:
     """Zero for a stable model; for others a gain that stabilises A - K C, so that the residuals are stationary."""
     if np.max(np.abs(model.poles), initial=0.0) < NEARLY_MARGINAL:
         return np.zeros((model.nx, model.l))
-    return _observer_gain(model.A, model.C, 0.1)
+    return observer_gain(model.A, model.C, 0.1)
 
 
-def _observer_gain(A: Array, C: Array, ratio: float) -> Array:
+def observer_gain(A: Array, C: Array, ratio: float) -> Array:
     """Return the gain for equal noise in all states, so many times that at the outputs in units of C."""
     size = np.linalg.norm(C, axis=1)
     return np.array(kalman_gain(A, C, ratio * np.eye(len(A)), np.diag(np.where(size > 0, size, 1.0) ** 2)).K)

@@ -47,10 +47,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         if (lags := _lags(arguments, c)) is not None:
             check = check_lines(name, records, basis, lags)
             found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
-        if (outside := basis.n_outside(u)) and basis.interval is not None:
-            low, high = basis.interval
-            found.append(f"{100 * outside / u.size:.2g} % of input {name!r} lies outside the interval "
-                         f"[{low:g}, {high:g}] of its basis; there the basis is set to {basis.outside!r}")
+        found += list_outside("input", name, basis.n_outside(u) / u.size, basis)
         found += _outliers("input", name, records, arguments)
     for o, name in enumerate(data.outputs):
         records = [e.y[:, o] for e in data.experiments]
@@ -82,6 +79,15 @@ def examine_figures(figures: Mapping[str, Any]) -> list[str]:
     if rows < LEAST_KEPT * candidates:  # the statistics have already issued this warning
         found.append(f"only {100 * rows / candidates:.0f} % of the rows are free of missing samples")
     return found
+
+
+def list_outside(role: str, name: str, share: float, basis: Basis) -> list[str]:
+    """Say which share of the samples of a channel lies outside the interval of its basis; nothing where none does."""
+    if not share or basis.interval is None:
+        return []
+    low, high = basis.interval
+    return [f"{100 * share:.2g} % of {role} {name!r} lies outside the interval [{low:g}, {high:g}] of its basis; there "
+            f"the basis is set to {basis.outside!r}"]
 
 
 def list_samples(found: Sequence[np.ndarray]) -> str:

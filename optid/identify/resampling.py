@@ -10,51 +10,21 @@ import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
-from optid.identify.tangent import Quantity
-from optid.identify.uncertainty import Uncertainty, aligned
-from optid.models import HammersteinARX
+from optid.identify.uncertainty import Refits, Uncertainty, aligned, check_level
+from optid.models import HammersteinTF
 from optid.models.recursions import autoregression
 
 FAILED = 0.1  # share of refits without a point above which the user is told
-
-
-@dataclass(frozen=True, eq=False)
-class Refits:
-    """Intervals from the scatter of refits.
-
-    Attributes:
-        reference: the fitted model.
-        models: the refitted models, in its gauge and with its signs.
-        kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
-    """
-
-    reference: HammersteinARX
-    models: tuple[HammersteinARX, ...] = field(repr=False)
-    kind: Literal["percentile", "basic"]
-
-    @property
-    def meaning(self) -> str:
-        """What the intervals are, in words."""
-        return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
-
-    def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
-        """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
-        value = np.ravel(np.asarray(quantity(self.reference), dtype=float))
-        deviations = np.array([np.ravel(np.asarray(quantity(model), dtype=float)) - value for model in self.models])
-        low, high = np.quantile(deviations, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-        error = np.std(deviations, axis=0, ddof=1)
-        return (error, low, high) if self.kind == "percentile" else (error, -high, -low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +40,7 @@ class Bootstrap:
 
     percentile: Uncertainty
     basic: Uncertainty
-    models: tuple[HammersteinARX, ...] = field(repr=False)
+    models: tuple[HammersteinTF, ...] = field(repr=False)
     failed: int
 
 
@@ -104,8 +74,8 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
         raise StructureError(f"this fit has no model to resample: {fit.solution.reason or fit.solution.status}")
     if fit.model.structure != "arx":
         raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
-    if runs < 40 or not 0 < level < 1:
-        raise StructureError(f"runs={runs}, level={level}: at least 40 runs and a level between 0 and 1 are needed")
+    check_integer(runs, "runs", 40)
+    check_level(level)
     models, failed = [], 0
     steps = track(_records(fit, runs, seed), description="bootstrap", total=runs, transient=True,
                   console=Console(stderr=True), disable=not sys.stderr.isatty())
@@ -140,7 +110,7 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
         yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
 
 
-def _residuals(model: HammersteinARX, data: Data) -> Array:
+def _residuals(model: HammersteinTF, data: Data) -> Array:
     """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
     rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
     rows = rows[~np.isnan(rows).any(axis=1)]
@@ -149,7 +119,7 @@ def _residuals(model: HammersteinARX, data: Data) -> Array:
     return (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - parameters / l, 1.0))
 
 
-def _simulated(model: HammersteinARX, u: Array, y: Array, errors: Array) -> Array:
+def _simulated(model: HammersteinTF, u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
     n = model.largest_lag
     u, start = interpolated(u), interpolated(y)[:n]

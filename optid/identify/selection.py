@@ -10,7 +10,7 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError
 from optid.identify.fitting import Fit, fit, resolve
-from optid.identify.validation.predictions import common_fits, one_step
+from optid.identify.validation.predictions import prediction_fit
 
 PENALTIES = ("ridge", "curvature", "weight")
 GRID = 13
@@ -78,7 +78,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
         else:
             one = fit(train, formulation, **{**arguments, penalty: float(weight)})
         fits.append(one)
-        scores.append(_score(one, test))
+        scores.append(np.nan if test is None else float(np.nanmean(prediction_fit(one.model, test))))
     return Path(penalty, grid, tuple(fits), np.array(scores))
 
 
@@ -110,13 +110,6 @@ def default_weights(data: Data) -> np.ndarray:
     """Return 13 weights over six decades, the largest a hundredth of the energy of the outputs about their mean."""
     energy = sum(float(np.nansum((e.y - np.nanmean(e.y, axis=0)) ** 2)) for e in data.experiments)
     return 0.01 * energy * np.logspace(-np.log10(SPAN), 0, GRID)
-
-
-def _score(one: Fit, test: Data | None) -> float:
-    if test is None:
-        return float("nan")
-    raw = test.raw()
-    return float(np.nanmean(common_fits(raw, [one_step(one.model, raw)])))
 
 
 def _ratio(one: Fit) -> float:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.gradients import flat_value, jacobians
+from optid.program.gradients import flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program
 
@@ -59,11 +59,6 @@ class Tangent:
     local: LocalEstimate = field(repr=False)
     noise: Array
     meaning: str
-
-    def covariance(self, quantity: Quantity) -> Array:
-        """Covariance (q, q) of a quantity, flattened, without regard to inequalities."""
-        scattered = self.slopes(quantity) @ self.local.scatter
-        return scattered @ scattered.T
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
@@ -252,10 +247,7 @@ def _gradient(program: Program, names: tuple[str, ...], name: str, expression: E
     slopes = jacobians(expression)
     if slopes is None:
         raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap instead")
-    by_id = {variable.id: slope for variable, slope in slopes.items()}
-    variables = [program.variables[key] for key in names]
-    return np.hstack([by_id[v.id].toarray() if v.id in by_id else np.zeros((expression.size, v.size))
-                      for v in variables])
+    return side_by_side(slopes, [program.variables[key] for key in names], expression.size)
 
 
 def _square_root(matrix: Array) -> Array:

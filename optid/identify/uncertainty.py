@@ -9,7 +9,7 @@ same quantities from refits.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,7 @@ from optid.arrays import Array
 from optid.bases.expansions import Linear
 from optid.errors import StructureError
 from optid.identify.intervals import DRAWS
-from optid.identify.tangent import Quantity, linearise
+from optid.identify.tangent import Quantity, Tangent, linearise
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +40,32 @@ class Interval:
     at: Array | None = None
 
 
-class Source(Protocol):
-    """Where intervals come from: `optid.identify.tangent.Tangent`, or refits (`optid.identify.resampling.Refits`)."""
+@dataclass(frozen=True, eq=False)
+class Refits:
+    """Intervals from the scatter of refits.
+
+    Attributes:
+        reference: the fitted model.
+        models: the refitted models, in its gauge and with its signs.
+        kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
+    """
+
+    reference: Any
+    models: tuple[Any, ...] = field(repr=False)
+    kind: Literal["percentile", "basic"]
 
     @property
     def meaning(self) -> str:
         """What the intervals are, in words."""
-        ...
+        return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
-        ...
+        value = np.ravel(np.asarray(quantity(self.reference), dtype=float))
+        deviations = np.array([np.ravel(np.asarray(quantity(model), dtype=float)) - value for model in self.models])
+        low, high = np.quantile(deviations, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+        error = np.std(deviations, axis=0, ddof=1)
+        return (error, low, high) if self.kind == "percentile" else (error, -high, -low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,20 +80,12 @@ class Uncertainty:
 
     model: Any = field(repr=False)
     level: float
-    source: Source = field(repr=False)
+    source: Tangent | Refits = field(repr=False)
 
     @property
     def meaning(self) -> str:
         """What the intervals are, in words."""
         return self.source.meaning
-
-    def at_level(self, level: float) -> "Uncertainty":
-        """Return the same with another probability inside.
-
-        Raises:
-            StructureError: not a probability between 0 and 1.
-        """
-        return replace(self, level=_checked_level(level))
 
     # -- coefficients --------------------------------------------------------------------------------------------
 
@@ -185,13 +192,14 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    level, transform = _checked_level(level), getattr(fit.data, "transform", None)
+    check_level(level)
+    transform = getattr(fit.data, "transform", None)
 
     def rebuild(values: dict[str, Array]) -> Any:
         model = fit.program.recover(values)
         return aligned(model if transform is None else model.with_transform(transform), fit.model)
 
-    return Uncertainty(fit.model, level, linearise(fit, rebuild, draws, seed))
+    return Uncertainty(fit.model, float(level), linearise(fit, rebuild, draws, seed))
 
 
 def aligned(model: Any, reference: Any) -> Any:
@@ -203,7 +211,7 @@ def aligned(model: Any, reference: Any) -> Any:
                    nonlinearities=tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities)))
 
 
-def _checked_level(level: float) -> float:
+def check_level(level: float) -> None:
+    """Refuse what is no probability between 0 and 1 (`StructureError`)."""
     if not 0 < level < 1:
         raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")
-    return float(level)

@@ -5,7 +5,4 @@ from optid.models.hammerstein_tf import HammersteinTF
 from optid.models.kalman import NoiseCovariances
 from optid.models.nonlinearity import Nonlinearity
 
-HammersteinARX = HammersteinTF
-"""The name of a transfer-function model with the noise it has by default: D = A, C = 1."""
-
-__all__ = ["HammersteinARX", "HammersteinSS", "HammersteinTF", "NoiseCovariances", "Nonlinearity"]
+__all__ = ["HammersteinSS", "HammersteinTF", "NoiseCovariances", "Nonlinearity"]

@@ -1,7 +1,6 @@
-"""Records given to a model: channels and units, missing inputs, horizons and initial states are checked here."""
+"""Records and initial states given to a model: channels, units and shapes are checked here."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,30 +9,12 @@ from optid.arrays import Array, as_samples, is_scalar_list
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 
-
-class Channels(Protocol):
-    """A model as far as its channels go."""
-
-    @property
-    def inputs(self) -> tuple[str, ...]: ...  # noqa: D102 - names of the inputs
-
-    @property
-    def outputs(self) -> tuple[str, ...]: ...  # noqa: D102 - names of the outputs
-
-    @property
-    def dt(self) -> float: ...  # noqa: D102 - sampling time
-
-
 Record = tuple[Array, Array | None, str]
 """Inputs (N, m), outputs (N, l) or None, and the words that name the experiment in a message."""
 
 
-def in_units_of(model: Channels, data: Data) -> Data:
-    """Return the data in raw units, given that channels and sampling time are the model's.
-
-    Raises:
-        DataError: other channels or another sampling time than the model's.
-    """
+def in_units_of(model: Any, data: Data) -> Data:
+    """Return data in raw units; refuse channels or a sampling time other than the model's (`DataError`)."""
     for kind, given, wanted in (("inputs", data.inputs, model.inputs), ("outputs", data.outputs, model.outputs)):
         if len(given) != len(wanted) or (given != wanted and set(given) == set(wanted)):
             raise DataError(
@@ -45,15 +26,10 @@ def in_units_of(model: Channels, data: Data) -> Data:
     return data if data.transform.is_identity else data.raw()
 
 
-def records_of(model: Channels, data: Any) -> tuple[list[Record], bool]:
-    """Return the record of every experiment, and whether the inputs were one-dimensional.
+def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
+    """Return the record of every experiment, and whether the inputs were one-dimensional; errors as `in_units_of`.
 
-    Args:
-        model: the model.
-        data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
-
-    Raises:
-        DataError: other channels or another sampling time than the model's.
+    The data are Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
     """
     if isinstance(data, Data):
         raw, many = in_units_of(model, data), data.n_experiments > 1
@@ -67,39 +43,15 @@ def records_of(model: Channels, data: Any) -> tuple[list[Record], bool]:
 
 
 def samples_of(values: ArrayLike, what: str, count: int) -> Array:
-    """Read samples (N, count), or (N,) for one channel.
-
-    Raises:
-        DataError: another number of channels.
-    """
+    """Read samples (N, count), or (N,) for one channel; refuse another number of channels (`DataError`)."""
     samples = as_samples(values, what)
     if samples.shape[1] != count:
         raise DataError(f"{what} has {samples.shape[1]} channels; the model has {count}.")
     return samples
 
 
-def one_or_all(arrays: list[Array]) -> Any:
-    """Return the array of the only experiment, or a tuple with one array for each."""
-    return arrays[0] if len(arrays) == 1 else tuple(arrays)
-
-
-def checked_horizon(horizon: Any) -> int:
-    """Return a prediction horizon as an int.
-
-    Raises:
-        StructureError: not a positive integer.
-    """
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise StructureError(f"horizon = {horizon!r}: a positive integer number of samples.")
-    return int(horizon)
-
-
-def check_inputs(model: Channels, u: Array, label: str) -> None:
-    """Refuse missing and infinite inputs, beyond which no state is known.
-
-    Raises:
-        DataError: naming the input and the first such sample.
-    """
+def check_inputs(model: Any, u: Array, label: str) -> None:
+    """Refuse missing and infinite inputs, beyond which no state is known (`DataError`)."""
     bad = ~np.isfinite(u)
     if bad.any():
         k, c = np.argwhere(bad)[0]
@@ -124,35 +76,6 @@ def state_like(x0: Any, shape: tuple[int, ...]) -> Array:
     if not np.all(np.isfinite(state)):
         raise DataError("x0 contains a value that is not finite.")
     return state
-
-
-def states_of(
-    records: Sequence[Record], x0: Any, shape: tuple[int, ...], fitted: Callable[[int], Array]
-) -> list[Array]:
-    """Return the initial state of every record.
-
-    Args:
-        records: the records.
-        x0: "zero", "fit", or a state for each record.
-        shape: of a state.
-        fitted: returns the state that fits best, by the index of the record.
-
-    Raises:
-        StructureError: an x0 that cannot be read.
-        DataError: a state that is not finite.
-    """
-    if isinstance(x0, str):
-        if x0 == "zero":
-            return [np.zeros(shape)] * len(records)
-        if x0 != "fit":
-            raise StructureError(f"x0={x0!r}: use 'zero', 'fit' or an array {shape}.")
-        if any(y is None for _, y, _ in records):
-            raise StructureError("x0='fit' needs the outputs: pass Data, or x0='zero' or a state.")
-        return [fitted(i) for i in range(len(records))]
-    states = list(x0) if len(records) > 1 else [x0]
-    if len(states) != len(records):
-        raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
-    return [state_like(state, shape) for state in states]
 
 
 def signal_units(y: Array) -> Array:

@@ -1,7 +1,7 @@
 """Models for other tools: SciPy, python-control, and CasADi for predictive control."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -9,11 +9,9 @@ from optid.arrays import Array
 from optid.errors import OptidError, StructureError, nearest
 from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, tabulated
 from optid.models.nonlinearity import Nonlinearity
-from optid.models.state_space import StateSpace
-from optid.models.transfer_function import TransferFunction
 
 
-def to_dlti(model: TransferFunction, output: int | str = 0, input: int | str = 0) -> Any:
+def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
     """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
 
     The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
@@ -36,82 +34,62 @@ def to_dlti(model: TransferFunction, output: int | str = 0, input: int | str = 0
     return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
 
 
-def to_control(model: TransferFunction) -> Any:
+def to_control(model: Any) -> Any:
     """Return the linear part, from every f to every output, as a python-control system.
 
-    Its inputs are the values of the nonlinearities; the constant is not part of it. With one output it is a transfer
-    function, with several a state-space system.
+    Its inputs are the values of the nonlinearities; the constants are not part of it. A transfer-function model with
+    one output is a transfer function, every other one a state-space system.
 
     Raises:
         OptidError: python-control is not installed.
-    """
-    control = control_package()
-    if model.l > 1:
-        return control.ss(*state_space(model), model.dt)
-    pairs = [_polynomials(model, c) for c in range(model.m)]
-    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt)
-
-
-def control_package() -> Any:
-    """Import python-control.
-
-    Raises:
-        OptidError: it is not installed.
     """
     try:
         import control
     except ImportError as error:
         raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
-    return control
+    if model.structure == "ss" or model.l > 1:
+        return control.ss(*state_space(model), model.dt)
+    pairs = [_polynomials(model, c) for c in range(model.m)]
+    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt)
 
 
-def to_casadi(model: TransferFunction) -> Any:
-    """Return the model as a `casadi.Function` (x, u) -> (x_next, y) without noise.
+def to_casadi(model: Any) -> Any:
+    """Return a model as a `casadi.Function` (x, u) -> (x_next, y), the free run without noise.
 
-    x has n l entries, n = `model.largest_lag`: the rows of the state (n, l) one after the other, row i being what the
-    past adds to the equation i samples ahead. Start from `model.state(u, y)` flattened row by row, or from zeros. The
-    constant is part of y. Outside the interval of its basis f is clamped or extrapolated as chosen (outside="error"
-    clamps, since a symbolic function cannot raise). Iterating equals `model.simulate`.
-
-    Raises:
-        StructureError: a basis of UserFunctions, which has no symbolic form.
-    """
-    import casadi as ca
-
-    n, outputs = model.largest_lag, model.l
-    x, u = ca.MX.sym("x", n * outputs), ca.MX.sym("u", model.m)
-    received = [ca.MX(model.offset if i == 0 else np.zeros(outputs)) for i in range(n + 1)]
-    for c, nonlinearity in enumerate(model.nonlinearities):
-        f = symbolic(nonlinearity, u[c])
-        for lag, row in model.terms(c):
-            received[lag] += ca.DM(row) * f
-    rows = [x[i * outputs : (i + 1) * outputs] for i in range(n)] + [ca.MX.zeros(outputs)]
-    y = rows[0] + received[0]
-    following = [rows[i] + received[i] for i in range(1, n + 1)]
-    for i, a in enumerate(model.matrices):
-        following[i] -= ca.DM(a) @ y
-    return ca.Function("hammerstein_tf", [x, u], [ca.vertcat(*following), y], ["x", "u"], ["x_next", "y"])
-
-
-def state_space_to_casadi(model: StateSpace) -> Any:
-    """Return a state-space model as a `casadi.Function` (x, u) -> (x_next, y), the free run without noise.
+    x is the state of a state-space model. Of a transfer function it has n l entries, n = `model.largest_lag`: the rows
+    of the state (n, l) one after the other, row i being what the past adds to the equation i samples ahead; start from
+    `model.state(u, y)` flattened row by row, or from zeros. The constants are part of x_next and y. Outside the
+    interval of its basis f is clamped or extrapolated as chosen (outside="error" clamps, since a symbolic function
+    cannot raise). Iterating equals `model.simulate`.
 
     Raises:
         StructureError: a basis of UserFunctions, which has no symbolic form.
     """
     import casadi as ca
 
-    x, u = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.m)
-    f = ca.vertcat(*(symbolic(f, u[c]) for f, c in zip(model.nonlinearities, model.input_of)))
-    y = ca.DM(model.C) @ x + ca.DM(model.D) @ f + ca.DM(model.offset_y)
-    following = ca.DM(model.A) @ x + ca.DM(model.B) @ f + ca.DM(model.L) @ y + ca.DM(model.offset_x)
-    for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
-        following += ca.DM(model.E[:, j]) * symbolic(g, y[o])
-    return ca.Function("hammerstein_ss", [x, u], [following, y], ["x", "u"], ["x_next", "y"])
+    a, b, c, d = (ca.sparsify(ca.DM(matrix)) for matrix in state_space(model))
+    x, u = ca.MX.sym("x", a.shape[0]), ca.MX.sym("u", model.m)
+    places = getattr(model, "input_of", range(model.m))
+    f = ca.vertcat(*(symbolic(f, u[i]) for f, i in zip(model.nonlinearities, places)))
+    y, following = c @ x + d @ f, a @ x + b @ f
+    if model.structure == "ss":
+        y += ca.DM(model.offset_y)
+        following += ca.DM(model.L) @ y + ca.DM(model.offset_x)
+        for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
+            following += ca.DM(model.E[:, j]) * symbolic(g, y[o])
+    else:
+        y += ca.DM(model.offset)
+        constant = np.zeros((model.largest_lag, model.l))
+        constant[: model.na] = -model.matrices @ model.offset
+        following += ca.DM(constant.ravel())
+    name = "hammerstein_ss" if model.structure == "ss" else "hammerstein_tf"
+    return ca.Function(name, [x, u], [following, y], ["x", "u"], ["x_next", "y"])
 
 
-def state_space(model: TransferFunction) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, C, D of the linear part in observer form, with n l states."""
+def state_space(model: Any) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C, D of the linear part, of a transfer function in observer form with n l states."""
+    if model.structure == "ss":
+        return model.A, model.B, model.C, model.D
     n, outputs = model.largest_lag, model.l
     rows = np.zeros((n + 1, outputs, model.m))
     for c in range(model.m):
@@ -142,7 +120,7 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
         )
     if tables.outside[0] == LINEAR:
         slope = nonlinearity.slope(np.array([low, high]))
-        inside = symbolic(Nonlinearity(replace(nonlinearity.basis, outside="clamp"), nonlinearity.mu,
+        inside = symbolic(Nonlinearity(replace(cast(Any, nonlinearity.basis), outside="clamp"), nonlinearity.mu,
                                        nonlinearity.offset), u)
         return inside + float(slope[0]) * ca.fmin(u - low, 0) + float(slope[1]) * ca.fmax(u - high, 0)
     if tables.outside[0] != FREE:
@@ -178,7 +156,7 @@ def _piecewise(pieces: Array, x: Any) -> Any:
     return f
 
 
-def _polynomials(model: TransferFunction, c: int) -> tuple[Array, Array]:
+def _polynomials(model: Any, c: int) -> tuple[Array, Array]:
     """Numerator without leading zeros and denominator in powers of z, for one output."""
     n = model.largest_lag
     numerator, denominator = np.zeros(n + 1), np.zeros(n + 1)

@@ -1,11 +1,14 @@
-"""Model files: JSON with every digit, read without running any code."""
+"""Files without code: models as JSON with every digit, the states of what runs on as npz, restored bit for bit."""
 
 import json
 import os
-from collections.abc import Callable, Iterator
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from optid.errors import LookupFailed, ModelFileError, StructureError
 
@@ -16,21 +19,8 @@ KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any] | None], Any]] = {}
 """What builds a model from the content of its file, by the kind written there; every class enters itself."""
 
 
-def save(model: Any, path: str | Path) -> Path:
-    """Write a model to a JSON file; numbers are written so that they are read back to the last bit.
-
-    Args:
-        model: the model.
-        path: the file, replaced when it exists.
-
-    Returns:
-        The path.
-    """
-    return write(model.to_dict(), path, FORMAT, VERSION)
-
-
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
-    """Read a model from a file written by `save`.
+    """Read a model from a file that its `save` wrote.
 
     Args:
         path: the file.
@@ -45,14 +35,7 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
 
 
 def write(content: dict[str, Any], path: str | Path, form: str, version: int) -> Path:
-    """Write JSON types to a file that says of what form and version it is, and is complete or not there.
-
-    Args:
-        content: what to write.
-        path: the file, replaced when it exists.
-        form: "optid " and what it is.
-        version: of that form.
-    """
+    """Write JSON types to a file that says of what form ("optid model") and version it is; it replaces an older one."""
     path = Path(path)
     text = json.dumps({"format": form, "version": version, **content}, indent=1, allow_nan=False)
     with complete(path) as part:
@@ -62,20 +45,14 @@ def write(content: dict[str, Any], path: str | Path, form: str, version: int) ->
 
 @contextmanager
 def complete(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which becomes the file at the end: an interrupted write must not leave half of it."""
+    """Give a path to write to, which becomes the file at the end: an interrupted write leaves no half of it."""
     part = path.with_name(path.name + ".part")
     yield part
     os.replace(part, path)
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file written by `write`.
-
-    Args:
-        path: the file.
-        form: what it has to be.
-        version: the version that is read.
-        build: makes the object of the content.
+    """Return what `build` makes of the content of a file that `write` wrote in this form and version.
 
     Raises:
         FileNotFoundError: no such file.
@@ -118,3 +95,40 @@ def from_content(content: dict[str, Any], functions: dict[str, Any] | None = Non
     if kind not in KINDS:
         raise ValueError(f"unknown kind of model {kind!r}.")
     return KINDS[kind](content, functions)
+
+
+def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Path:
+    """Write the state of a `kind` of estimator: a head of JSON types, and arrays by name; it replaces an older file."""
+    path = Path(path)
+    content = json.dumps({"optid": kind, "version": version, **head})
+    with complete(path) as part, part.open("wb") as file:
+        np.savez(file, head=np.array(content), **arrays)
+    return path
+
+
+def read_state(
+    path: str | Path, kind: str, version: int, names: Sequence[str]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read the head, and the arrays of these names, that `write_state` wrote; refuse others (`ModelFileError`)."""
+    path = Path(path)
+    try:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
+            head, arrays = json.loads(str(file["head"])), {name: file[name] for name in names}
+    except (ValueError, KeyError, EOFError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise ModelFileError(f"{path} is not the complete state of a {kind}: {error}.") from error
+    if not isinstance(head, dict) or head.get("optid") != kind:
+        raise ModelFileError(f"{path} is not the state of a {kind} (version {version}).")
+    if head.get("version") != version:
+        raise ModelFileError(f"{path} has version {head.get('version')!r}; this optid reads version {version}.")
+    return head, arrays
+
+
+def set_arrays(state: Any, arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
+    """Give a fresh state the arrays of a file; refuse other types and shapes than its own (`ModelFileError`)."""
+    for name, array in arrays.items():
+        wanted = getattr(state, name)
+        if array.dtype != wanted.dtype or array.shape != wanted.shape:
+            raise ModelFileError(
+                f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} is needed."
+            )
+        setattr(state, name, np.ascontiguousarray(array))

@@ -1,5 +1,6 @@
 """The static functions and the responses of a model, as tables and figures name them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,21 +49,11 @@ def static_functions(model: Any) -> list[StaticFunction]:
 
     With one input and one function of it the word is "f"; several functions of one input are numbered.
     """
-    shown = tuple(model.nonlinearities)
-    if model.m == 1 and len(shown) == 1 and isinstance(getattr(model, "f", None), Nonlinearity):
-        shown = (model.f,)  # with its offset, where the model knows it
+    shown = model.f if isinstance(model.f, tuple) else (model.f,)  # with its offset, where the model knows it
     places = tuple(getattr(model, "input_of", range(model.m)))
-    names = _words("f", places, model.inputs, alone=model.m == 1)
-    found = [
-        StaticFunction(word, f, c, model.inputs[c], model.input_units[c]) for word, f, c in zip(names, shown, places)
-    ]
+    found = _named("f", shown, places, model.inputs, model.input_units)
     if has_feedback(model):
-        places = tuple(model.output_of)
-        names = _words("g", places, model.outputs, alone=model.l == 1)
-        found += [
-            StaticFunction(word, g, o, model.outputs[o], model.output_units[o], fed_back=True)
-            for word, g, o in zip(names, model.feedback, places)
-        ]
+        found += _named("g", model.feedback, tuple(model.output_of), model.outputs, model.output_units)
     return found
 
 
@@ -71,14 +62,16 @@ def has_feedback(model: Any) -> bool:
     return bool(getattr(model, "feedback", ()))
 
 
-def _words(letter: str, places: tuple[int, ...], channels: tuple[str, ...], alone: bool) -> list[str]:
-    """Names by channel, numbered behind the letter where a channel has several: f1_valve, f2_valve."""
-    words, count = [], dict.fromkeys(places, 0)
-    for c in places:
-        count[c] += 1
-        number = str(count[c]) if places.count(c) > 1 else ""
-        words.append(f"{letter}{number}" + ("" if alone else f"_{channels[c]}"))
-    return words
+def _named(
+    letter: str, functions: Sequence[Nonlinearity], places: tuple[int, ...], names: Sequence[str], units: Sequence[str]
+) -> list[StaticFunction]:
+    """Words by channel, numbered behind the letter where a channel has several functions: f1_valve, f2_valve."""
+    found = []
+    for j, (f, c) in enumerate(zip(functions, places)):
+        number = str(places[: j + 1].count(c)) if places.count(c) > 1 else ""
+        word = letter + number + ("" if len(names) == 1 else f"_{names[c]}")
+        found.append(StaticFunction(word, f, c, names[c], units[c], fed_back=letter == "g"))
+    return found
 
 
 def step_length(model: Model) -> int:

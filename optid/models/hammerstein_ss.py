@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, one_or_all
 from optid.errors import DataError
-from optid.models import export, state_text
 from optid.models import state_simulation as simulation
-from optid.models.experiments import Record, one_or_all, records_of
+from optid.models import text
+from optid.models.experiments import Record, records_of
 from optid.models.files import KINDS
 from optid.models.state_space import StateSpace
 
@@ -18,15 +18,8 @@ from optid.models.state_space import StateSpace
 class HammersteinSS(StateSpace):
     """A state-space model that predicts and simulates records; its arguments are those of `StateSpace`."""
 
-    def equation(self, digits: int = 4) -> str:
-        """Write the model as equations: one per state up to four states, in matrices with the poles beyond."""
-        return state_text.written(self, digits)
-
-    def coefficients(self) -> list[tuple[str, float]]:
-        """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
-        return state_text.listed(self)
-
     SIMULATORS = simulation.SIMULATORS
+    equation, coefficients = text.state_equations, text.matrix_entries
 
     @property
     def _state_shape(self) -> tuple[int]:
@@ -36,23 +29,10 @@ class HammersteinSS(StateSpace):
         return simulation.ahead(simulation.prepared(self, "predict", u, y, None, label), state, horizon)
 
     def simulate_measured_feedback(self, data: Data, x0: Any = "zero") -> Any:
-        """Simulate with the measured outputs in the feedback (P2), without correcting the state.
+        """Simulate with the measured outputs in the feedback (P2), without correcting the state; see `simulate`.
 
-        Where an output is missing the model's own output is fed back. Without feedback this is `simulate`.
-
-        Args:
-            data: the record; detrended or scaled data are taken back to raw units first.
-            x0: "zero", "fit" (least squares on the outputs present), or the state (n,), one for each experiment.
-
-        Returns:
-            (N, l) in raw units; a tuple of such arrays for several experiments.
-
-        Raises:
-            DataError: as `simulate`.
-            StructureError: an x0 that cannot be read, or inputs without outputs.
-
-        Warns:
-            DataWarning: the model is unstable.
+        Where an output is missing the model's own output is fed back. Inputs without outputs are refused
+        (`StructureError`).
         """
         return one_or_all(self._run("measured_feedback", records_of(self, data)[0], x0))
 
@@ -82,14 +62,6 @@ class HammersteinSS(StateSpace):
         from scipy.signal import dlti
 
         return dlti(self.A, self.B, self.C, self.D, dt=self.dt)
-
-    def to_control(self) -> Any:
-        """Return (A, B, C, D), from every f to every output, as a python-control system."""
-        return export.control_package().ss(self.A, self.B, self.C, self.D, self.dt)
-
-    def to_casadi(self) -> Any:
-        """Return (x, u) -> (x_next, y) as a `casadi.Function`, the free run without noise."""
-        return export.state_space_to_casadi(self)
 
 
 KINDS["HammersteinSS"] = HammersteinSS.from_dict

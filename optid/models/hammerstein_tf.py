@@ -4,7 +4,6 @@ The state x (n, l) is what the past adds to the right-hand side of the next n eq
 It shifts by one every sample and receives B_i f(u) - A_i y, so a free response is 1/A driven by the rows of x.
 """
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -110,8 +109,10 @@ class HammersteinTF(TransferFunction):
         n, outputs = self.largest_lag, self.l
         if n == 0:
             return np.zeros((0, outputs))
-        whitened = simulator == "predict" and not self.shares_poles
-        count = min(len(y), self._horizon(max(self.radius, roots.radius(self.c) if whitened else 0.0)))
+        whitened = simulator == "predict" and self.d is not None
+        radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
+        forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)
+        count = len(y) if radius >= 1 else min(len(y), forgotten)
         units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
         present = np.isfinite(rest)
         if not present.any():
@@ -126,12 +127,6 @@ class HammersteinTF(TransferFunction):
             errors = [noise_filter.innovations(s, None, self.c, self.noise_denominator).innovations for s in signals]
             rest, columns = errors[0][:, None], np.column_stack(errors[1:])[:, None]
         return scaled_least_squares(columns[present], rest[present]).reshape(n, outputs)
-
-    def _horizon(self, radius: float) -> int:
-        """Number of samples that inform about an initial state forgotten at a rate."""
-        if radius >= 1:
-            return sys.maxsize
-        return 10 * self.largest_lag + (0 if radius == 0 else int(2 * np.log(FORGOTTEN) / np.log(radius)))
 
     def state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Return the state (n, l) that follows the samples u (N, m) and y (N, l), N >= n, of the plant without noise.
@@ -165,17 +160,7 @@ class HammersteinTF(TransferFunction):
                 state[:lag] += np.outer(f[n - lag :], row)
         return state
 
-    def to_dlti(self, output: int | str = 0, input: int | str = 0) -> Any:
-        """Return the linear part of the plant from one f to one output as a `scipy.signal.dlti`."""
-        return export.to_dlti(self, output, input)
-
-    def to_control(self) -> Any:
-        """Return the linear part of the plant, all inputs and outputs, as a python-control system."""
-        return export.to_control(self)
-
-    def to_casadi(self) -> Any:
-        """Return the plant, without noise, as a `casadi.Function`; see `optid.models.export.to_casadi`."""
-        return export.to_casadi(self)
+    to_dlti = export.to_dlti
 
 
 KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

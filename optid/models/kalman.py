@@ -1,6 +1,5 @@
 """Covariances of the noises of a state-space model, and the steady Kalman gain that belongs to them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -52,21 +51,11 @@ class NoiseCovariances:
 
     @classmethod
     def of_innovations(cls, gain: Array, covariance: Array) -> "NoiseCovariances":
-        """Return those of ``w = K e, v = e``.
-
-        Args:
-            gain: K, (n, l).
-            covariance: (l, l) of the innovations e.
-        """
+        """Return those of ``w = K e, v = e`` for the gain K (n, l) and the covariance (l, l) of the innovations e."""
         return cls(_congruent(gain, covariance), covariance, gain @ covariance, covariance)
 
     def mapped(self, states: Array, outputs: Array) -> "NoiseCovariances":
-        """Return the covariances of T x and G y.
-
-        Args:
-            states: T, (n, n).
-            outputs: G, (l, l).
-        """
+        """Return the covariances of T x and G y for ``states`` T (n, n) and ``outputs`` G (l, l)."""
         return NoiseCovariances(
             _congruent(states, self.Q), _congruent(outputs, self.R), states @ self.S @ outputs.T,
             _congruent(outputs, self.innovation),
@@ -76,23 +65,9 @@ class NoiseCovariances:
         """Describe the matrices in JSON types."""
         return {name: getattr(self, name).tolist() for name in ("Q", "R", "S", "innovation")}
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "NoiseCovariances":
-        """Build what `to_dict` described."""
-        outputs = np.array(content["R"], dtype=float)
-        n = len(content["Q"])
-        return cls(
-            np.array(content["Q"], dtype=float).reshape(n, n), outputs,
-            np.array(content["S"], dtype=float).reshape(n, len(outputs)), np.array(content["innovation"], dtype=float),
-        )
-
 
 def _check_positive(name: str, matrix: Array) -> None:
-    """Refuse a negative variance along any direction, rounding aside.
-
-    Raises:
-        StructureError: naming the matrix.
-    """
+    """Refuse a negative variance along any direction, rounding aside (`StructureError`)."""
     variances = np.diag(matrix)
     size = np.sqrt(np.where(variances > 0, variances, 1.0))
     if variances.size and np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < ROUNDING:

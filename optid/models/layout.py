@@ -5,13 +5,14 @@ from functools import cached_property
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases.basis import Basis
+from optid.data.channels import Ports
 from optid.errors import StructureError
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(Ports):
     """The columns of Phi: -y_o(k-i), i = 1..na, o inner; then per input and per lag eta(u_c(k - nk_c - j)); then 1.
 
     The coefficients of input c are vec(Theta_c), Theta_c (P_c, nb_c), column by column.
@@ -43,23 +44,10 @@ class Layout:
                 raise StructureError(
                     f"{name} has {len(entries)} entries for {self.m} inputs ({', '.join(self.inputs)}): give one each."
                 )
-        for name, value, smallest in [("na", self.na, 0)] + [
-            (f"{order} of input {channel!r}", value, smallest)
-            for order, values, smallest in (("nb", self.nb, 1), ("nk", self.nk, 0))
-            for channel, value in zip(self.inputs, values)
-        ]:
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
-                raise StructureError(f"{name} must be an integer >= {smallest}; got {value!r}.")
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
+        check_integer(self.na, "na", 0)
+        for channel, b, delay in zip(self.inputs, self.nb, self.nk):
+            check_integer(b, f"nb of input {channel!r}")
+            check_integer(delay, f"nk of input {channel!r}", 0)
 
     @cached_property
     def n_columns(self) -> int:

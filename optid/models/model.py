@@ -2,30 +2,27 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
-from optid.data.channels import Transform, numbered_names
-from optid.data.record import Data
+from optid.arrays import Array, check_integer
+from optid.data.channels import Ports, Transform, numbered_names
+from optid.data.record import Data, one_or_all
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError, nearest
-from optid.models import files, roots
-from optid.models.experiments import Record, checked_horizon, one_or_all, records_of, states_of
+from optid.models import export, files, roots
+from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
-NAMES = ("inputs", "outputs", "input_units", "output_units")
+TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
 
 
 def finite(values: Any, name: str) -> Array:
-    """Copy coefficients into a read-only float64 array.
-
-    Raises:
-        StructureError: a value that is not finite.
-    """
+    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
     array = np.array(values, dtype=float)
     if not np.all(np.isfinite(array)):
         raise StructureError(f"{name} contains a value that is not finite.")
@@ -33,7 +30,7 @@ def finite(values: Any, name: str) -> Array:
     return array
 
 
-class Model:
+class Model(Ports):
     """A linear part between static functions, with named channels; the fields are those of its dataclasses.
 
     Attributes:
@@ -46,23 +43,27 @@ class Model:
         gauge: how the scale between f and B is fixed; see `regauge`.
         poles: complex, largest first.
         memory: samples at the start of a record that cannot be predicted.
+        c0: offset of f where the data tell it from the constants of the equations, else None.
+        offset_note: why c0 is None; "" where it is known.
         structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
     dt: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     gauge: str
     poles: Any
     memory: int
     structure: Any
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
+    c0: Any
+    offset_note: Any
     equation: Callable[..., str]
     impulse_response: Callable[..., Array]
+    _static_gain: Callable[[Array], Array]
     _state_shape: Any
     _predicted: Callable[[Array, Array, int, Array, str], Array]
     _run: Callable[[str, Sequence[Record], Any], list[Array]]
@@ -71,20 +72,14 @@ class Model:
     _in_raw_units: Callable[[Transform], Self]
 
     def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
-        """Set the fields of a new model, with default names and units for m inputs and l outputs.
-
-        Raises:
-            StructureError: an impossible sampling time, an unknown gauge.
-        """
-        fixed = {
-            **fields,
-            "nonlinearities": tuple(fields.get("nonlinearities", self.nonlinearities)),
-            "dt": float(self.dt),
-            "inputs": tuple(self.inputs) or numbered_names("u", m),
-            "outputs": tuple(self.outputs) or numbered_names("y", l),
-        }
-        for kind in ("input", "output"):
-            fixed[f"{kind}_units"] = tuple(getattr(self, f"{kind}_units")) or ("",) * len(fixed[f"{kind}s"])
+        """Set the fields of a new model, with default names and units for m inputs and l outputs, and check them."""
+        fixed = {**fields, "nonlinearities": tuple(fields["nonlinearities"]), "dt": float(self.dt)}
+        for kind, letter, count in (("input", "u", m), ("output", "y", l)):
+            names = tuple(getattr(self, f"{kind}s")) or numbered_names(letter, count)
+            units = tuple(getattr(self, f"{kind}_units")) or ("",) * len(names)
+            if len(names) != count or len(units) != count:
+                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
+            fixed |= {f"{kind}s": names, f"{kind}_units": units}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
@@ -93,24 +88,17 @@ class Model:
             raise StructureError(f"Unknown gauge {self.gauge!r}: use one of {', '.join(self.GAUGES)}.")
 
     @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.inputs)
-
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.outputs)
-
-    @property
     def kind(self) -> str:
         """The word for this class in model files."""
         return type(self).__name__
 
     @property
-    def _family(self) -> str:
-        """The first word of the title."""
-        return "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
+    def title(self) -> str:
+        """What kind of model this is, in words."""
+        family = "Linear" if all(f.is_linear for f in self.nonlinearities) else "Hammerstein"
+        more = [word for word, functions in (("nonlinear feedback", "feedback"), ("latent functions", "latent"))
+                if getattr(self, functions, ())]
+        return f"{family} {TITLES[self.structure]} model{' with ' * bool(more)}{' and '.join(more)}"
 
     @property
     def radius(self) -> float:
@@ -126,12 +114,29 @@ class Model:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
         return np.cumsum(self.impulse_response(n), axis=0)
 
-    def _operating_point(self, u0: ArrayLike) -> Array:
-        """Read constant inputs (m,).
+    @property
+    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
+        """The nonlinearity of the input, with its offset where `c0` knows it; a tuple when there are several."""
+        functions = self.nonlinearities
+        return replace(functions[0], offset=self.c0) if len(functions) == 1 else functions
+
+    def static_gain(self, u0: ArrayLike) -> Any:
+        """Return the slope of the steady-state characteristic at u0, feedback included.
+
+        Args:
+            u0: operating point, a number or (m,).
+
+        Returns:
+            A number for one input and output, otherwise (l, m).
 
         Raises:
-            StructureError: another number of them.
+            StructureError: u0 of the wrong size, an integrator (a pole at 1), or no equilibrium found.
         """
+        gain = self._static_gain(self._operating_point(u0))
+        return float(gain[0, 0]) if gain.size == 1 else gain
+
+    def _operating_point(self, u0: ArrayLike) -> Array:
+        """Read constant inputs (m,); refuse another number of them (`StructureError`)."""
         points = np.atleast_1d(np.asarray(u0, dtype=float))
         if points.shape != (self.m,):
             raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
@@ -167,7 +172,7 @@ class Model:
                 leave the range of numbers.
             StructureError: a horizon that is not a positive integer, or an x0 that cannot be read.
         """
-        horizon, (records, _) = checked_horizon(horizon), records_of(self, data)
+        horizon, (records, _) = check_integer(horizon, "horizon"), records_of(self, data)
         fit = isinstance(x0, str) and x0 == "fit"
         states = [None] * len(records) if fit else self._states("predict", records, x0)
         predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
@@ -181,20 +186,9 @@ class Model:
         return one_or_all(predicted)
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
-        """Predict one record in raw units; see `predict`.
+        """Predict (N, l) one record in raw units as `predict` does, from arrays u (N, m) and y (N, l), NaN = missing.
 
-        Args:
-            u: (N, m) inputs, NaN = missing.
-            y: (N, l) outputs, NaN = missing.
-            horizon: how many samples ahead, from 1.
-            x0: state at the first sample; None for that of the smallest one-step prediction errors.
-            label: words that name the experiment in a message.
-
-        Returns:
-            (N, l), NaN where there is no prediction.
-
-        Raises:
-            DataError: as `predict`.
+        x0 None is the state of the smallest one-step prediction errors; `label` names the experiment in a message.
         """
         known, prediction = np.isfinite(u).all(axis=1), np.full(y.shape, np.nan)
         for first, last in runs_of(known):
@@ -231,12 +225,7 @@ class Model:
         return one_or_all([y[:, 0] for y in outputs] if flat and self.l == 1 else outputs)
 
     def innovations(self, data: Data, x0: Any = "fit") -> Any:
-        """Return the one-step prediction errors (N, l), NaN where there is none; a tuple for several experiments.
-
-        Args:
-            data: as `predict`.
-            x0: as `predict`.
-        """
+        """Return the errors (N, l) of `predict` one step ahead, NaN where it has none; a tuple for several records."""
         predicted = self.predict(data, 1, x0)
         several = predicted if isinstance(predicted, tuple) else (predicted,)
         return one_or_all([e.y - p for e, p in zip(data.raw().experiments, several)])
@@ -265,7 +254,18 @@ class Model:
             raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
         if simulator != "free" and any(y is None for _, y, _ in records):
             raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
-        return states_of(records, x0, self._state_shape, lambda i: self._fitted(simulator, *records[i]))
+        if isinstance(x0, str):
+            if x0 == "zero":
+                return [np.zeros(self._state_shape)] * len(records)
+            if x0 != "fit":
+                raise StructureError(f"x0={x0!r}: use 'zero', 'fit' or an array {self._state_shape}.")
+            if any(y is None for _, y, _ in records):
+                raise StructureError("x0='fit' needs the outputs: pass Data, or x0='zero' or a state.")
+            return [self._fitted(simulator, *record) for record in records]
+        states = list(x0) if len(records) > 1 else [x0]
+        if len(states) != len(records):
+            raise StructureError(f"{len(states)} initial states for {len(records)} experiments: give one each.")
+        return [state_like(state, self._state_shape) for state in states]
 
     def _warn_unstable(self) -> None:
         if not self.is_stable:
@@ -314,28 +314,43 @@ class Model:
         # units do not turn signs: what a constraint decided about them stays
         return self._in_raw_units(transform).regauge(self.gauge, signs=False)
 
-    # -- files ---------------------------------------------------------------------------------------------------
+    # -- other tools and files -----------------------------------------------------------------------------------
+
+    to_control, to_casadi = export.to_control, export.to_casadi
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""
-        return {
-            "kind": self.kind,
-            "nonlinearities": [f.to_dict() for f in self.nonlinearities],
-            "dt": self.dt,
-            **{name: list(getattr(self, name)) for name in NAMES},
-            "gauge": self.gauge,
-        }
+        return {"kind": self.kind} | {one.name: _in_json(getattr(self, one.name)) for one in fields(self)}
 
-    @staticmethod
-    def _shared_fields(content: Mapping[str, Any], functions: dict[str, Any] | None) -> dict[str, Any]:
-        """Read the fields that `Model.to_dict` described."""
-        return {
-            "nonlinearities": tuple(Nonlinearity.from_dict(f, functions) for f in content["nonlinearities"]),
-            "dt": content["dt"],
-            **{name: tuple(content[name]) for name in NAMES},
-            "gauge": content["gauge"],
-        }
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
+        """Build the model that `to_dict` described; the errors are those of the parts.
+
+        Args:
+            content: what `to_dict` returned.
+            functions: those of a basis of UserFunctions, by name.
+        """
+        given = {one.name: content[one.name] for one in fields(cls)}
+        for name in given.keys() & {"nonlinearities", "feedback", "latent"}:
+            given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])
+        return cls(**given)
 
     def save(self, path: str | Path) -> Path:
-        """Write the model to a JSON file, from which `optid.load` restores it exactly."""
-        return files.save(self, path)
+        """Write the model to a JSON file, from which `optid.load` restores it to the last bit."""
+        return files.write(self.to_dict(), path, files.FORMAT, files.VERSION)
+
+
+def static_solution(matrix: Array, right: Array) -> Array:
+    """Solve the equations of a steady state; refuse those of an integrator, which are singular (`StructureError`)."""
+    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
+        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
+
+
+def _in_json(value: Any) -> Any:
+    """Arrays as lists, parts as what they say of themselves."""
+    if isinstance(value, tuple):
+        return [_in_json(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.to_dict() if hasattr(value, "to_dict") else value

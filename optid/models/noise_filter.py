@@ -63,16 +63,11 @@ def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
     NaN where one of these innovations cannot be told.
     """
     told = np.where(np.isnan(found.predicted), np.nan, found.innovations)
-    weights = impulse_response(c, d, horizon)
+    response = lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), np.eye(1, horizon)[0])
     prediction = found.filled.copy()
-    for i, weight in enumerate(weights):
+    for i, weight in enumerate(response):
         prediction[i:] -= weight * told[: len(told) - i]
     return prediction
-
-
-def impulse_response(c: Array, d: Array, n: int) -> Array:
-    """Return the first n samples of C/D, which begins with one."""
-    return lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), np.eye(1, n)[0])
 
 
 def _march(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) -> tuple[Array, Array, Array, Any]:

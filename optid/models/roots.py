@@ -39,27 +39,22 @@ def with_roots(roots: Any, size: int) -> Array:
     return found
 
 
-def reflected(coefficients: Array, limit: float = 1.0) -> Array:
-    """Return the coefficients with every root outside the circle of radius ``limit`` reflected into it.
+def reflected(coefficients: Array) -> Array:
+    """Return the coefficients with every root outside the unit circle reflected into it.
 
-    For ``limit`` 1 the spectrum of C e keeps its shape (spectral factorisation).
+    The spectrum of C e keeps its shape (spectral factorisation).
     """
-    return with_roots(_reflected(roots_of(coefficients), limit), len(coefficients))
+    return contained(coefficients, np.inf)
 
 
 def pulled(coefficients: Array, limit: float) -> Array:
     """Return the coefficients with every root outside the circle of radius ``limit`` pulled back onto it."""
-    return with_roots(_pulled(roots_of(coefficients), limit), len(coefficients))
+    roots = roots_of(coefficients)
+    return with_roots(roots * (limit / np.maximum(np.abs(roots), max(limit, 1e-300))), len(coefficients))
 
 
 def contained(coefficients: Array, limit: float) -> Array:
     """Return the coefficients with roots outside the unit circle reflected, and none outside a radius ``limit``."""
-    return with_roots(_pulled(_reflected(roots_of(coefficients), 1.0), limit), len(coefficients))
-
-
-def _reflected(roots: Any, limit: float) -> Any:
-    return roots * (limit / np.maximum(np.abs(roots), limit)) ** 2
-
-
-def _pulled(roots: Any, limit: float) -> Any:
-    return roots * (limit / np.maximum(np.abs(roots), max(limit, 1e-300)))
+    roots = roots_of(coefficients)
+    roots = roots / np.maximum(np.abs(roots), 1.0) ** 2
+    return with_roots(roots * np.minimum(limit / np.maximum(np.abs(roots), 1e-300), 1.0), len(coefficients))

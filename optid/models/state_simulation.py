@@ -38,7 +38,7 @@ class Run(NamedTuple):
     Attributes:
         model: the model.
         u: (N, m) inputs.
-        y: (N, l) outputs, None where there are none.
+        y: (N, l) outputs; NaN where there are none.
         known: those that the simulator may see, NaN elsewhere; None for a free run.
         gain: (n, l) gain of the correction.
         low: (l,) lower end of the range allowed.
@@ -48,7 +48,7 @@ class Run(NamedTuple):
 
     model: StateSpace
     u: Array
-    y: Array | None
+    y: Array
     known: Array | None
     gain: Array
     low: Array
@@ -75,7 +75,8 @@ def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limit
     low, high = limits if limits is not None else (np.full(model.l, -np.finfo(float).max), np.finfo(float).max)
     low, high = (np.array(np.broadcast_to(end, model.l), dtype=float) for end in (low, high))
     known = None if simulator == "free" else y
-    return Run(model, u, y, known, model.K if simulator == "predict" else none, low, high, label)
+    measured = np.full((len(u), model.l), np.nan) if y is None else y
+    return Run(model, u, measured, known, model.K if simulator == "predict" else none, low, high, label)
 
 
 def run(job: Run, x0: Array) -> Array:
@@ -248,7 +249,7 @@ def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
     for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
         g[:, j] = np.nan if job.known is None else function(y[:, o])
     driven = (f @ model.B.T + model.offset_x, f @ model.D.T + model.offset_y, g, y, u @ model.Dz.T + model.offset_z)
-    return Stretch(*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high)
+    return Stretch._make([*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high])
 
 
 def signals(job: Run, stretch: Stretch, states: Array, outputs: Array, **known: Array) -> Signals:

@@ -1,31 +1,33 @@
 """The equations of a state-space model: matrices, poles, responses, forms that predict the same, content of files."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import solve_discrete_lyapunov
 
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
-from optid.models.balancing import balancing
 from optid.models.feedback_tables import tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, finite
+from optid.models.model import Model, finite, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
-SHAPES = {
+MATRICES = {
     "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
     "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k",
 }
 """Shapes of the matrices: n states, m inputs, l outputs, r functions of the inputs, s of the outputs, k latent ones."""
+
+COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 NEWTON_STEPS = 100
 RESTS = 1e-12
@@ -57,11 +59,7 @@ class StateSpace(Model):
         offset_x: (n,) constant of the state equation.
         offset_y: (l,) constant of the output equation.
         noise: covariances of the noises, or None.
-        dt: sampling time.
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: one per input, "" where unknown.
-        output_units: one per output, "" where unknown.
+        dt, inputs, outputs, input_units, output_units: see `Model`.
         gauge: how the scale between f and B is fixed: "norm", "gain" or "none"; see `regauge`.
         latent: k nonlinearities h of the latent signals.
         Ez: (n, k), one column per latent signal; zero by default, like the four below.
@@ -102,6 +100,10 @@ class StateSpace(Model):
     Dz: Any = field(default=None, kw_only=True)
     offset_z: Any = field(default=None, kw_only=True)
     GAUGES = ("norm", "gain", "none")
+    structure = "ss"
+    memory = 0  # the initial state is estimated
+    c0 = None
+    offset_note = "The constants of f and g are part of the constants of the state and output equations."
 
     def __post_init__(self) -> None:
         fixed: dict[str, Any] = {name: finite(np.atleast_2d(getattr(self, name)), name) for name in ("A", "B", "C")}
@@ -109,21 +111,15 @@ class StateSpace(Model):
         fixed |= {"nonlinearities": functions, "feedback": tuple(self.feedback), "latent": tuple(self.latent)}
         fixed["input_of"] = tuple(int(c) for c in self.input_of) or tuple(range(len(functions)))
         fixed["output_of"] = tuple(int(o) for o in self.output_of) or tuple(range(len(fixed["feedback"])))
-        m = 1 + max(fixed["input_of"], default=-1)
-        shapes = self._shapes(len(fixed["A"]), m, len(fixed["C"]), len(functions), len(fixed["feedback"]),
-                              len(fixed["latent"]))
-        for name in SHAPES:
+        m = len(self.inputs) or 1 + max(fixed["input_of"], default=-1)
+        shapes = _shapes(len(fixed["A"]), m, len(fixed["C"]), len(functions), len(fixed["feedback"]),
+                         len(fixed["latent"]))
+        for name in MATRICES:
             given = getattr(self, name)
             absent = given is None or (np.size(given) == 0 and 0 in shapes[name])
             fixed.setdefault(name, finite(np.zeros(shapes[name]) if absent else given, name))
         self._fix(fixed, m, len(fixed["C"]))
         self._check(shapes)
-
-    @staticmethod
-    def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of the matrices for n, m, l, r, s and k."""
-        size = dict(zip("nmlrsk", sizes))
-        return {name: tuple(size[letter] for letter in letters) for name, letters in SHAPES.items()}
 
     def _check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Refuse parts that do not agree, naming the part and the shape that is needed."""
@@ -134,8 +130,8 @@ class StateSpace(Model):
                 f"E has {n + outputs} rows for {n} states: its last {outputs} would carry g(y) to the output y of the "
                 "same sample, an algebraic loop. Delay the feedback by one sample: keep the first rows only."
             )
-        for name, shape in shapes.items():
-            found = getattr(self, name).shape
+        for name in MATRICES:
+            found, shape = getattr(self, name).shape, shapes[name]
             if found != shape:
                 raise StructureError(
                     f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs"
@@ -151,12 +147,8 @@ class StateSpace(Model):
             for j, f in enumerate(getattr(self, kind)):
                 if f.offset:
                     raise StructureError(f"{kind}[{j}] has an offset: the constants belong to offset_x and offset_y.")
-        for kind, count in (("inputs", self.m), ("outputs", outputs)):
-            names, units = getattr(self, kind), getattr(self, kind[:-1] + "_units")
-            if len(names) != count or len(units) != count:
-                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}.")
-        if self.noise is not None and self.noise.S.shape != (n, outputs):
-            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {(n, outputs)} is needed.")
+        if self.noise is not None and self.noise.S.shape != shapes["S"]:
+            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {shapes['S']} is needed.")
 
     @property
     def nx(self) -> int:
@@ -164,26 +156,9 @@ class StateSpace(Model):
         return len(self.A)
 
     @property
-    def structure(self) -> str:
-        """State space, "ss"."""
-        return "ss"
-
-    @property
-    def title(self) -> str:
-        """What kind of model this is, in words."""
-        more = [word for word, functions in (("nonlinear feedback", self.feedback), ("latent functions", self.latent))
-                if functions]
-        return f"{self._family} state-space model" + (f" with {' and '.join(more)}" if more else "")
-
-    @property
     def orders(self) -> dict[str, Any]:
         """The number of states nx."""
         return {"nx": self.nx}
-
-    @property
-    def memory(self) -> int:
-        """Samples at the start of a record that cannot be predicted: none, the initial state is estimated."""
-        return 0
 
     @cached_property
     def parts(self) -> Parts:
@@ -191,16 +166,6 @@ class StateSpace(Model):
         matrices = [np.array(getattr(self, name), order="C") for name in Parts._fields[:-2]]
         functions = tabulated([*self.feedback, *self.latent])
         return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), functions])
-
-    @property
-    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
-        """The nonlinearity of the input; a tuple when there are several."""
-        return self.nonlinearities[0] if len(self.nonlinearities) == 1 else self.nonlinearities
-
-    @property
-    def offset_note(self) -> str:
-        """Why the offsets of f and g are not identifiable."""
-        return "The constants of f and g are part of the constants of the state and output equations."
 
     def expanded(self, u: Array) -> Array:
         """Return the values of the r nonlinearities at the inputs u (N, m), (N, r)."""
@@ -257,26 +222,14 @@ class StateSpace(Model):
             if not np.all(np.isfinite(x)):
                 break
         if not self.feedback and not self.latent:
-            _solved(self.A + self.L @ self.C - np.eye(self.nx), self.B)
+            static_solution(self.A + self.L @ self.C - np.eye(self.nx), self.B)
         raise StructureError(
             f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there."
         )
 
-    def static_gain(self, u0: ArrayLike) -> Any:
-        """Return the slope of the steady-state characteristic at u0, feedback included.
-
-        Args:
-            u0: operating point, a number or (m,).
-
-        Returns:
-            A number for one input and output, otherwise (l, m).
-
-        Raises:
-            StructureError: as `equilibrium`.
-        """
-        A, B, C, D = self._tangent(*self.equilibrium(u0), self._operating_point(u0))
-        gain = D - C @ _solved(A - np.eye(self.nx), B)
-        return float(gain[0, 0]) if gain.size == 1 else gain
+    def _static_gain(self, points: Array) -> Array:
+        A, B, C, D = self._tangent(*self.equilibrium(points), points)
+        return D - C @ static_solution(A - np.eye(self.nx), B)
 
     def _tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C, D of the free run near a state (n,), outputs (l,) and inputs (m,)."""
@@ -309,14 +262,7 @@ class StateSpace(Model):
     # -- forms that predict the same -----------------------------------------------------------------------------
 
     def transformed(self, T: ArrayLike) -> Self:
-        """Return the model in the states T x; predictions do not change.
-
-        Args:
-            T: (n, n), invertible.
-
-        Raises:
-            StructureError: T of another shape, or singular.
-        """
+        """Return the model in the states T x; predictions do not change. T (n, n) must be invertible."""
         turn, n = np.atleast_2d(np.asarray(T, dtype=float)), self.nx
         turn = turn.reshape(0, 0) if n == 0 and turn.size == 0 else turn
         if turn.shape != (n, n) or not np.all(np.isfinite(turn)):
@@ -341,14 +287,8 @@ class StateSpace(Model):
     def injected(self, gain: ArrayLike) -> Self:
         """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
 
-        P1 and P3 do not change; P2 does, since it feeds back the measured output. With gain = -L the injection is
-        absorbed into A.
-
-        Args:
-            gain: (n, l).
-
-        Raises:
-            StructureError: a gain of another shape.
+        P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
+        injection is absorbed into A.
         """
         moved = np.asarray(gain, dtype=float)
         if moved.shape != self.L.shape:
@@ -415,34 +355,20 @@ class StateSpace(Model):
             offset_z=self.offset_z - inward @ np.array(transform.u_offset),
         )
 
-    # -- content of files ----------------------------------------------------------------------------------------
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe the model in JSON types."""
-        return super().to_dict() | {
-            **{name: getattr(self, name).tolist() for name in SHAPES},
-            "input_of": list(self.input_of),
-            "feedback": [g.to_dict() for g in self.feedback],
-            "output_of": list(self.output_of),
-            "latent": [h.to_dict() for h in self.latent],
-            "noise": None if self.noise is None else self.noise.to_dict(),
-        }
-
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build the model that `to_dict` described; ``functions`` are those of a basis of UserFunctions, by name."""
-        content = {"latent": [], **content}  # models without latent functions may be older than those
-        sizes = (len(content[name]) for name in ("A", "inputs", "outputs", "nonlinearities", "feedback", "latent"))
-        shapes = cls._shapes(*sizes)
-        return cls(
-            **{name: np.array(content[name], dtype=float).reshape(shape) for name, shape in shapes.items()
-               if name in content},
-            latent=tuple(Nonlinearity.from_dict(h, functions) for h in content["latent"]),
-            input_of=tuple(content["input_of"]), output_of=tuple(content["output_of"]),
-            feedback=tuple(Nonlinearity.from_dict(g, functions) for g in content["feedback"]),
-            noise=None if content["noise"] is None else NoiseCovariances.from_dict(content["noise"]),
-            **cls._shared_fields(content, functions),
-        )
+        # models without latent functions may be older than those
+        content = {"latent": [], **dict.fromkeys(("Ez", "Fz", "Cz", "Dz", "offset_z")), **content}
+        shapes = _shapes(*(len(content[name]) for name in (
+            "A", "inputs", "outputs", "nonlinearities", "feedback", "latent")))
+
+        def read(part: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+            return {name: None if part[name] is None else np.array(part[name], dtype=float).reshape(shapes[name])
+                    for name in names}
+
+        noise = content["noise"] and NoiseCovariances(**read(content["noise"], COVARIANCES))
+        return super().from_dict({**content, **read(content, MATRICES), "noise": noise}, functions)
 
 
 def _signs(response: Array) -> Array:
@@ -450,7 +376,32 @@ def _signs(response: Array) -> Array:
     return np.array([leading_sign(response[:, :, j].ravel(), 1e-6) for j in range(response.shape[2])])
 
 
-def _solved(matrix: Array, right: Array) -> Array:
-    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
-        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
-    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
+def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the matrices for n, m, l, r, s and k."""
+    size = dict(zip("nmlrsk", sizes))
+    return {name: tuple(size[letter] for letter in letters) for name, letters in (MATRICES | COVARIANCES).items()}
+
+
+def balancing(A: Array, B: Array, C: Array) -> Array:
+    """Return the change of states T (n, n) that makes both Gramians of (A, B, C) diagonal and equal.
+
+    Raises:
+        StructureError: A is unstable, or the triple is not minimal.
+    """
+    largest = roots.spectral_radius(A)
+    if largest >= 1:
+        raise StructureError(f"The model is unstable (largest pole {largest:.6g}): it has no Gramians.")
+    reach = _root(solve_discrete_lyapunov(A, B @ B.T))
+    see = _root(solve_discrete_lyapunov(A.T, C.T @ C))
+    left, values, right = np.linalg.svd(see.T @ reach)
+    if values[-1] <= 1e-13 * values[0]:
+        raise StructureError(
+            f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
+            "Identify it with fewer states."
+        )
+    return (left / np.sqrt(values)).T @ see.T
+
+
+def _root(gramian: Array) -> Array:
+    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -11,18 +11,16 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.channels import Transform
 from optid.errors import StructureError
-from optid.models import noise_filter, roots
+from optid.models import roots
 from optid.models.gauges import GAUGES, gauge_factor
 from optid.models.layout import Layout
-from optid.models.model import Model, finite
+from optid.models.model import Model, finite, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression
 from optid.models.text import polynomial, signed_sum, signed_terms
 
 TINY_SUM = 1e-6
 """Share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured."""
-
-TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +37,7 @@ class TransferFunction(Model):
         nonlinearities: one per input, their offsets None: the constants together are `offset`. See `f`.
         nk: delay in samples, one per input.
         offset: (l,) constant of the equation.
-        dt: sampling time.
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
-        input_units: one per input, "" where unknown.
-        output_units: one per output, "" where unknown.
+        dt, inputs, outputs, input_units, output_units: see `Model`.
         c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...; one output.
         d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; one output. None where D is A.
         gauge: how the scale between f and B is fixed: "norm", "gain", "b0" or "none"; see `regauge`.
@@ -70,17 +64,19 @@ class TransferFunction(Model):
     GAUGES = GAUGES
 
     def __post_init__(self) -> None:
+        a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))
         fields = {
-            "a": finite(self.a, "a"),
+            "a": a.reshape(0, offset.size, offset.size) if offset.size > 1 and not a.size else a,
             "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
+            "nonlinearities": self.nonlinearities,
             "nk": tuple(int(delay) for delay in self.nk),
-            "offset": np.atleast_1d(finite(self.offset, "offset")),
+            "offset": offset,
             "c": finite(self.c, "c"),
             "d": None if self.d is None else finite(self.d, "d"),
         }
-        if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], fields["a"]):
+        if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], a):
             fields["d"] = None
-        self._fix(fields, len(self.b), fields["offset"].size)
+        self._fix(fields, len(self.b), offset.size)
         self._check_plant()
         self._check_noise()
 
@@ -88,11 +84,9 @@ class TransferFunction(Model):
         l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
         if not m:
             raise StructureError("A model needs at least one input.")
-        if self.offset.ndim != 1 or len(self.outputs) != l or len(self.output_units) != l:
-            raise StructureError(
-                f"offset has shape {self.offset.shape} for {len(self.outputs)} outputs: one each is needed."
-            )
-        for name in ("nonlinearities", "nk", "inputs", "input_units"):
+        if self.offset.ndim != 1:
+            raise StructureError(f"offset has shape {self.offset.shape}; (l,) is needed.")
+        for name in ("nonlinearities", "nk"):
             if len(getattr(self, name)) != m:
                 raise StructureError(
                     f"{name} has {len(getattr(self, name))} entries; b has one array for each of {m} inputs."
@@ -153,7 +147,7 @@ class TransferFunction(Model):
 
         The largest lag for ARX and ARMAX; none for output error and Box-Jenkins, whose initial state is estimated.
         """
-        return self.largest_lag if self.shares_poles else 0
+        return self.largest_lag if self.d is None else 0
 
     @property
     def layout(self) -> Layout:
@@ -180,16 +174,6 @@ class TransferFunction(Model):
         return "bj" if self.c.size or self.d.size else "oe"
 
     @property
-    def title(self) -> str:
-        """What kind of model this is, in words."""
-        return f"{self._family} {TITLES[self.structure]} model"
-
-    @property
-    def shares_poles(self) -> bool:
-        """Whether D is A: the noise enters the equation of the plant (ARX, ARMAX)."""
-        return self.d is None
-
-    @property
     def noise_denominator(self) -> Array:
         """Coefficients of D after the leading one: `d`, or `a` where D is A."""
         return self.a if self.d is None else self.d
@@ -203,22 +187,6 @@ class TransferFunction(Model):
             "oe": "e is added to the output: C = D = 1",
         }[self.structure]
 
-    @cached_property
-    def noise_poles(self) -> Any:
-        """Roots of D, complex, largest first."""
-        return self.poles if self.d is None else roots.largest_first(roots.roots_of(self.d))
-
-    @cached_property
-    def noise_zeros(self) -> Any:
-        """Roots of C, complex (nc,), largest first; all inside the unit circle."""
-        return roots.largest_first(roots.roots_of(self.c))
-
-    def noise_impulse_response(self, n: int = 100) -> Array:
-        """Return the response of C/D to a unit impulse of e, (n,); (n, l, l) for several outputs."""
-        if self.l > 1:
-            return self.inverse_impulse(n)
-        return noise_filter.impulse_response(self.c, self.noise_denominator, n)
-
     def noise_frequency_response(self, w: ArrayLike) -> Any:
         """Return C/D at the frequencies w (radians per unit of time), complex (len(w),), or (len(w), l, l)."""
         shift = self._shift(w)
@@ -228,13 +196,6 @@ class TransferFunction(Model):
         return above / below
 
     # -- plant ---------------------------------------------------------------------------------------------------
-
-    @property
-    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
-        """The nonlinearity, with its offset where `c0` knows it; a tuple when there are several inputs."""
-        if self.m > 1:
-            return self.nonlinearities
-        return replace(self.nonlinearities[0], offset=self.c0)
 
     @property
     def c0(self) -> float | None:
@@ -274,26 +235,10 @@ class TransferFunction(Model):
             companion[: self.l] = -np.hstack(list(self.matrices))
         return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
 
-    def static_gain(self, u0: ArrayLike) -> Any:
-        """Return the slope of the steady-state characteristic at u0, A(1)^-1 sum_j b_j f'(u0).
-
-        Args:
-            u0: operating point, a number or (m,).
-
-        Returns:
-            A number for one input and output, otherwise (l, m).
-
-        Raises:
-            StructureError: u0 of the wrong size, or an integrator (a pole at 1), which has no static gain.
-        """
-        points = self._operating_point(u0)
-        at_one = np.eye(self.l) + self.matrices.sum(axis=0)
-        if np.linalg.svd(at_one, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(self.a).sum()):
-            raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
+    def _static_gain(self, points: Array) -> Array:
         slopes = np.array([f.slope(u) for f, u in zip(self.nonlinearities, points)])
         sums = np.stack([np.atleast_1d(b.sum(axis=0)) for b in self.b], axis=1)
-        gain = np.linalg.solve(at_one, sums * slopes)
-        return float(gain[0, 0]) if gain.size == 1 else gain
+        return static_solution(np.eye(self.l) + self.matrices.sum(axis=0), sums * slopes)
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""
@@ -325,9 +270,7 @@ class TransferFunction(Model):
 
     def _denominator(self, shift: Any) -> Any:
         """A(q), (len(shift), l, l)."""
-        return np.eye(self.l) + sum(
-            (shift**i)[:, None, None] * matrix for i, matrix in enumerate(self.matrices, start=1)
-        ) + np.zeros((shift.size, 1, 1))
+        return np.eye(self.l) + np.tensordot(shift[:, None] ** np.arange(1, self.na + 1), self.matrices, 1)
 
     # -- gauge and units -----------------------------------------------------------------------------------------
 
@@ -407,40 +350,16 @@ class TransferFunction(Model):
     def __str__(self) -> str:
         """Return the equations, the poles and the noise model."""
         text = super().__str__()
-        apart = () if self.d is None else self.noise_poles
-        for name, found in (("zeros of the noise", self.noise_zeros), ("poles of the noise", apart)):
-            if len(found):
-                text += f"\n{name}: {roots.in_words(found)}"
+        for name, values in (("zeros", self.c), ("poles", self.d)):
+            if values is not None and values.size:
+                text += f"\n{name} of the noise: {roots.in_words(roots.largest_first(roots.roots_of(values)))}"
         return text
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe the model in JSON types."""
-        return super().to_dict() | {
-            "a": self.a.tolist(),
-            "b": [b.tolist() for b in self.b],
-            "nk": list(self.nk),
-            "offset": self.offset.tolist(),
-            "c": self.c.tolist(),
-            "d": None if self.d is None else self.d.tolist(),
-        }
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
-        """Build the model that `to_dict` described; the errors are those of the parts.
-
-        Args:
-            content: what `to_dict` returned, or the content of a file with the plant apart, or without noise.
-            functions: those of a basis of UserFunctions, by name.
-        """
+        """Build the model that `to_dict` described, or a file says with the plant apart or without noise."""
         if content["kind"] == "HammersteinARX":
             content = {**content, "c": (), "d": None}
         elif "plant" in content:
             content = {**content["plant"], "c": content["c"], "d": content["d"]}
-        outputs = len(content["outputs"])
-        a = np.array(content["a"], dtype=float)
-        return cls(
-            a=a if a.size or outputs == 1 else a.reshape(0, outputs, outputs),
-            b=tuple(np.array(b, dtype=float) for b in content["b"]),
-            nk=tuple(content["nk"]), offset=np.array(content["offset"], dtype=float), c=content["c"], d=content["d"],
-            **cls._shared_fields(content, functions),
-        )
+        return super().from_dict(content, functions)

@@ -48,11 +48,6 @@ class FeedbackSystem:
         """Number of states."""
         return len(self.a)
 
-    def feedback(self, y: ArrayLike) -> Array:
-        """Return g(y), (N, 2), of outputs (N, 2)."""
-        y1, y2 = np.asarray(y, dtype=float).T
-        return np.column_stack([-np.sin(y1), -y2 * np.abs(y2) / (1 + y2**2)])
-
     def record(self, u: ArrayLike, seed: int | np.random.Generator = 0, *, process: float = 0.0,
                measurement: float = 0.0, colour: float = 0.0, x0: ArrayLike | None = None) -> Data:
         """Simulate a record.

@@ -90,15 +90,6 @@ class ReactionWheelPendulum:
         u = np.clip(np.asarray(u, dtype=float), -self.saturation, self.saturation)
         return self.torque_gain * np.sign(u) * np.maximum(np.abs(u) - self.dead_zone, 0.0)
 
-    def energy(self, states: Array) -> Array:
-        """Return potential plus kinetic energy (J) of states (N, 3): angle, rate, wheel speed.
-
-        It is conserved without torque and friction.
-        """
-        angle, rate, speed = np.asarray(states).T
-        return (self.weight * (1 - np.cos(angle)) + 0.5 * self.inertia * rate**2
-                + 0.5 * self.wheel_inertia * (speed + rate) ** 2)
-
     def states(self, u: ArrayLike, *, dt: float = 0.02, substeps: int = 4, x0: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return angle (rad), rate (rad/s) and wheel speed (rad/s), (N, 3), under commands (N,) held between samples.
 
@@ -177,6 +168,11 @@ def pendulum_input(kind: str, n: int, seed: int = 0, *, dt: float = 0.02) -> Arr
     return makers[kind]()
 
 
+def van_der_pol_drive(u: Array) -> Array:
+    """Return f(u) = u + 0.5 u |u| of inputs of any shape."""
+    return u + 0.5 * u * np.abs(u)
+
+
 def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: float = 0.0, measurement: float = 0.0,
                 colour: float = 0.0, eps: float = 1.0, dt: float = 0.1, method: str = "euler", substeps: int = 4,
                 x0: ArrayLike = (0.0, 0.0)) -> Data:
@@ -211,8 +207,7 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
     rng = np.random.default_rng(seed)
     w = gaussian(rng, len(u), 2, process, 0.0, "process")
     v = gaussian(rng, len(u), 1, measurement, colour, "measurement")[:, 0]
-    drive = u[:, 0] + 0.5 * u[:, 0] * np.abs(u[:, 0])
-    states = integrate(VAN_DER_POL, drive, v, w, as_state(x0, 2), np.array([float(eps)]), float(dt),
-                       int(substeps) if method == "rk4" else 1, STAGES[method])
+    states = integrate(VAN_DER_POL, van_der_pol_drive(u[:, 0]), v, w, as_state(x0, 2), np.array([float(eps)]),
+                       float(dt), int(substeps) if method == "rk4" else 1, STAGES[method])
     check_bounded(states, "Van der Pol oscillator")
     return Data(u, states[:, 0] + v, dt, name="vanderpol")

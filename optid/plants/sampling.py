@@ -11,11 +11,7 @@ WILD = 1e8
 
 
 def as_input(u: ArrayLike, channels: int) -> Array:
-    """Return the input as (N, channels).
-
-    Raises:
-        DataError: another shape, no sample, or a sample that is not finite, named by channel and position.
-    """
+    """Return the input as (N, channels); refuse other shapes, and samples that are not finite (`DataError`)."""
     array = np.asarray(u, dtype=float)
     if array.ndim == 1:
         array = array[:, None]
@@ -48,11 +44,7 @@ def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colou
 
 
 def check_bounded(states: Array, plant: str) -> None:
-    """Refuse a simulation that left all bounds.
-
-    Raises:
-        DataError: with the first sample at which it did.
-    """
+    """Refuse a simulation that left all bounds (`DataError` with the first sample at which it did)."""
     with np.errstate(invalid="ignore"):
         wild = ~(np.abs(states) < WILD).all(axis=1)
     if wild.any():
@@ -61,11 +53,7 @@ def check_bounded(states: Array, plant: str) -> None:
 
 
 def as_state(x0: ArrayLike, order: int) -> Array:
-    """Return the initial state as (order,).
-
-    Raises:
-        DataError: another shape, or a value that is not finite.
-    """
+    """Return the initial state as (order,); refuse other shapes, and values that are not finite (`DataError`)."""
     state = np.array(x0, dtype=float)
     if state.shape != (order,) or not np.isfinite(state).all():
         raise DataError(f"x0 = {x0!r}: {order} finite numbers are needed.")

@@ -1,6 +1,6 @@
 """Derivatives and sizes of CVXPY expressions at the assigned point, in the one form that all of optid uses."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 Map = Callable[[np.ndarray], np.ndarray]
-"""From the Jacobian of an argument to its part of the Jacobian of an atom."""
+"""From the derivatives of an argument to their part of those of an atom."""
 
 DENSE = 100_000
 """Entries of the Jacobian up to which an expression is small."""
@@ -30,17 +30,17 @@ def flat_value(expression: cp.Expression) -> np.ndarray:
     return np.ravel(np.asarray(expression.value, dtype=float), order="F")
 
 
-def jacobians(expression: cp.Expression) -> dict[cp.Variable, sp.csr_array] | None:
+def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
     """Return the Jacobian (rows, size) of an expression with respect to each of its variables.
 
     Rows and columns follow the entries column by column. None where CVXPY knows no gradient at the assigned point.
     Small expressions are differentiated here, with the common atoms by their own rules: CVXPY composes sparse
-    matrices atom by atom, which takes ten times as long. Large ones are left to it.
+    matrices atom by atom, which takes ten times as long. Large ones are left to it, and their Jacobians are sparse.
     """
     variables = expression.variables()
     if expression.size * sum(variable.size for variable in variables) <= DENSE:
         node = _differentiate(expression, {})
-        return None if node is None else {v: sp.csr_array(node.slopes[v]) for v in variables if v in node.slopes}
+        return None if node is None else {v: _columns(slope) for v, slope in node.slopes.items()}
     found = {}
     for variable, part in expression.grad.items():
         if part is None:
@@ -53,7 +53,7 @@ def jacobians(expression: cp.Expression) -> dict[cp.Variable, sp.csr_array] | No
 
 @dataclass(frozen=True)
 class _Node:
-    """Value of an expression and its Jacobians (size, size of the variable), entries column by column."""
+    """Value of an expression and its derivatives (*shape, size of the variable) by every entry of the variables."""
 
     value: Any
     slopes: dict[cp.Variable, np.ndarray]
@@ -72,27 +72,42 @@ def _derive(expression: Any, known: dict[int, _Node | None]) -> _Node | None:
         if value is None:
             return None
         value = value.toarray() if sp.issparse(value) else np.asarray(value, dtype=float)
-        return _Node(value, {} if expression.is_constant() else {expression: np.eye(expression.size)})
+        return _Node(value, {} if expression.is_constant() else {
+            expression: _shaped(np.eye(expression.size), expression.shape)})
     nodes = [_differentiate(arg, known) for arg in expression.args]
     if any(node is None for node in nodes):
         return None
-    values = [node.value for node in nodes]  # type: ignore[union-attr]
+    values, shape = [node.value for node in nodes], expression.shape  # type: ignore[union-attr]
     name = type(expression).__name__
-    if name in MOVES:
-        maps: Any = _moved(expression)
-    elif name in RULES and all(value.ndim <= 2 for value in values):
-        maps = RULES[name](expression, values)
+    if name in RULES and all(value.ndim <= 2 for value in values):
+        maps: Any = RULES[name](expression, values)
     else:
-        maps = [_of_atom(part, node) for part, node in zip(expression._grad(values), nodes)]
+        flat = _moved(expression) if name in MOVES else map(_of_atom, expression._grad(values), values)
+        maps = [None if one is None else partial(_through, one, shape) for one in flat]
     slopes: dict[cp.Variable, np.ndarray] = {}
     for node, apply in zip(nodes, maps):
         for variable, slope in node.slopes.items():  # type: ignore[union-attr]
             if apply is None:
                 return None
             part = apply(slope)
+            part = part if part.shape[:-1] == shape else np.broadcast_to(part, (*shape, variable.size))
             slopes[variable] = slopes[variable] + part if variable in slopes else part
     value = expression.numeric(values)
     return _Node(value.toarray() if sp.issparse(value) else np.asarray(value, dtype=float), slopes)
+
+
+def _columns(slope: np.ndarray) -> np.ndarray:
+    """Return derivatives (*shape, n) as a Jacobian (size, n), entries column by column."""
+    return slope if slope.ndim == 2 else slope.reshape((-1, slope.shape[-1]), order="F")
+
+
+def _shaped(jacobian: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return jacobian if len(shape) == 1 else jacobian.reshape((*shape, jacobian.shape[-1]), order="F")
+
+
+def _through(apply: Map, shape: tuple[int, ...], slope: np.ndarray) -> np.ndarray:
+    """Apply what maps Jacobians."""
+    return _shaped(apply(_columns(slope)), shape)
 
 
 def sources(expression: Any) -> np.ndarray:
@@ -119,73 +134,51 @@ def _gather(source: np.ndarray, slope: np.ndarray) -> np.ndarray:
     return np.where(source[:, None] >= 0, slope[source], 0.0)
 
 
-def _of_atom(part: Any, node: Any) -> Map | None:
+def _of_atom(part: Any, value: np.ndarray) -> Map | None:
     """Use the gradient (size of the argument, size) of an atom as CVXPY knows it."""
     if part is None:
         return None
     matrix = part.toarray() if sp.issparse(part) else np.asarray(part, dtype=float)
-    return partial(np.matmul, np.reshape(matrix, (node.value.size, -1)).T)
+    return partial(np.matmul, np.reshape(matrix, (value.size, -1)).T)
 
 
-def _flat(value: Any, size: int) -> np.ndarray:
-    """Return a value as a column, a scalar as many times as there are entries."""
-    column = np.reshape(value, (-1, 1), order="F")
-    return np.repeat(column, size, axis=0) if column.size == 1 < size else column
-
-
-def _scaled(size: int, weights: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    return weights * (np.repeat(slope, size, axis=0) if len(slope) == 1 < size else slope)
-
-
-def _add(expression: Any, values: list[Any]) -> list[Map]:
-    return [partial(_scaled, expression.size, np.ones((expression.size, 1)))] * len(values)
-
-
-def _negate(expression: Any, values: list[Any]) -> list[Map]:
-    return [np.negative]
-
-
-def _multiply(expression: Any, values: list[Any]) -> list[Map]:
-    size = expression.size
-    return [partial(_scaled, size, _flat(values[1], size)), partial(_scaled, size, _flat(values[0], size))]
-
-
-def _divide(expression: Any, values: list[Any]) -> list[Map]:
-    size = expression.size
-    above, below = _flat(values[0], size), _flat(values[1], size)
-    return [partial(_scaled, size, 1 / below), partial(_scaled, size, -above / below**2)]
-
-
-def _matmul(expression: Any, values: list[Any]) -> list[Map]:
+def _product(expression: Any, values: list[Any]) -> list[Map]:
     left, right = values
-    left, right = np.atleast_2d(left), right[:, None] if right.ndim == 1 else right
-    (m, n), p = left.shape, right.shape[1]
-
-    def of_left(slope: np.ndarray) -> np.ndarray:
-        return np.reshape(np.einsum("mnk,np->mpk", slope.reshape((m, n, -1), order="F"), right), (m * p, -1), order="F")
-
-    def of_right(slope: np.ndarray) -> np.ndarray:
-        return np.reshape(np.tensordot(left, slope.reshape((n, p, -1), order="F"), 1), (m * p, -1), order="F")
-
-    return [of_left, of_right]
+    return [lambda slope: np.moveaxis(np.tensordot(slope, right, (-2, 0)), left.ndim - 1, -1),
+            lambda slope: np.tensordot(left, slope, (-1, 0))]
 
 
 def _sum(expression: Any, values: list[Any]) -> list[Map]:
-    shape, axis = expression.args[0].shape, expression.axis
-    axes = range(len(shape)) if axis is None else [axis] if isinstance(axis, int) else axis
-    axes = tuple(one % len(shape) for one in axes)
-
-    def total(slope: np.ndarray) -> np.ndarray:
-        return np.reshape(slope.reshape((*shape, -1), order="F").sum(axis=axes), (expression.size, -1), order="F")
-
-    return [total]
+    dimensions, axis = values[0].ndim, expression.axis
+    axes = range(dimensions) if axis is None else [axis] if isinstance(axis, int) else axis
+    summed = tuple(one % dimensions for one in axes)
+    return [lambda slope: slope.sum(axis=summed).reshape((*expression.shape, -1))]
 
 
-RULES = {"AddExpression": _add, "NegExpression": _negate, "multiply": _multiply, "DivExpression": _divide,
-         "MulExpression": _matmul, "Sum": _sum}
+def _squares(expression: Any, values: list[Any]) -> list[Map]:
+    above, below = values
+    (total,) = _sum(expression, [above])
+    return [lambda slope: total(2 / below * above[..., None] * slope),
+            lambda slope: -total((above / below)[..., None] ** 2) * slope]
 
 
-def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, sp.csr_array], np.ndarray] | None:
+RULES: dict[str, Callable[[Any, list[Any]], list[Map]]] = {
+    "AddExpression": lambda _, values: [lambda slope: slope] * len(values),
+    "NegExpression": lambda _, values: [np.negative],
+    "multiply": lambda _, values: [partial(np.multiply, value[..., None]) for value in reversed(values)],
+    "DivExpression": lambda _, values: [partial(np.multiply, 1 / values[1][..., None]),
+                                        partial(np.multiply, -(values[0] / values[1] ** 2)[..., None])],
+    "MulExpression": _product, "Sum": _sum, "quad_over_lin": _squares}
+"""By atom, from its arguments' values, what maps the derivatives (*shape, n) of every argument, up to broadcasting."""
+
+
+def side_by_side(slopes: Mapping[cp.Variable, Any], variables: Iterable[cp.Variable], rows: int) -> np.ndarray:
+    """Return Jacobians as one array (rows, sizes of the variables), zero for variables that have none."""
+    parts = [slopes.get(variable, np.zeros((rows, variable.size))) for variable in variables]
+    return np.hstack([part.toarray() if sp.issparse(part) else part for part in parts])
+
+
+def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, Any], np.ndarray] | None:
     """Return the Jacobians of an affine expression, as `jacobians` does, and its constant, flat; None if not affine.
 
     The constant is the value at the origin, so that one that is zero is exactly zero.

@@ -1,16 +1,16 @@
 """Our own residuals at a solver's point: a solver's status is a claim, these numbers decide."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
-from cvxpy.constraints.zero import Equality, Zero
 
 from optid.program.gradients import flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
@@ -43,11 +43,6 @@ def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:
     return variable_size(flat_value(variable), usual.get(variable.id))
 
 
-def value_size(program: Program, objective: float) -> float:
-    """Yardstick of errors in the objective: its magnitude, or a hundredth of the zero model's where it vanishes."""
-    return max(abs(objective), 1e-2 * program.scale)
-
-
 def measure_violation(program: Program) -> tuple[float, str]:
     """Return the largest relative violation over all constraints at the assigned point, and its name.
 
@@ -65,10 +60,9 @@ def measure_violation(program: Program) -> tuple[float, str]:
                 worst, name = amount, key
     for key, variable in program.variables.items():
         value, amount, size = np.asarray(variable.value, dtype=float), 0.0, _size(variable, usual)
-        if has_bounds(variable):
-            lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
-            amount = float(np.max(np.maximum(lower - value, value - upper), initial=0.0))
-            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in (lower, upper))])
+        if (bounds := bounds_of(variable)) is not None:
+            amount = float(np.max(np.maximum(bounds[0] - value, value - bounds[1]), initial=0.0))
+            size = max([size, *(float(np.max(np.abs(b[np.isfinite(b)]), initial=0.0)) for b in bounds)])
         elif variable.attributes["PSD"] or variable.attributes["NSD"]:
             sign = 1.0 if variable.attributes["PSD"] else -1.0
             amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
@@ -87,7 +81,7 @@ def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> f
         member: the constraint.
         usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
     """
-    expressions = [member.expr] if isinstance(member, Equality | Zero | Inequality | NonPos) else member.args
+    expressions = [member.expr] if isinstance(member, EQUALITIES | INEQUALITIES) else member.args
     sizes = [_terms(expression, usual or {}) for expression in expressions]
     largest = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in member.args), default=0.0)
     return max([size for size in sizes if size is not None], default=largest) or largest or 1.0
@@ -106,9 +100,12 @@ def _terms(expression: cp.Expression, usual: Mapping[int, float]) -> float | Non
     return float(np.max(total + np.abs(inner), initial=0.0))  # inner is now minus the constant of an affine expression
 
 
-def has_bounds(variable: cp.Variable) -> bool:
-    """Whether the variable carries bounds as attributes (nonneg, bounds, ...)."""
-    return any(variable.attributes[key] not in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds"))
+def bounds_of(variable: cp.Variable) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the bounds that a variable carries as attributes (nonneg, bounds, ...), None where it has none."""
+    if all(variable.attributes[key] in (None, False) for key in ("nonneg", "nonpos", "pos", "neg", "bounds")):
+        return None
+    lower, upper = (np.asarray(bound, dtype=float) for bound in variable.get_bounds())
+    return lower, upper
 
 
 def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
@@ -122,9 +119,9 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
         The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
         or None for a cone whose multipliers are not used here.
     """
-    if isinstance(member, Equality | Zero):
+    if isinstance(member, EQUALITIES):
         return [(member.expr, dual)]
-    if isinstance(member, Inequality | NonPos):
+    if isinstance(member, INEQUALITIES):
         return [(member.expr, np.maximum(dual, 0.0))]
     if isinstance(member, NonNeg):
         return [(member.args[0], -np.maximum(dual, 0.0))]
@@ -151,7 +148,6 @@ class Lagrangian:
         terms: {id of a variable: sum of the magnitudes of its terms}.
         value: sum of the products of multipliers and constraints.
         complementarity: sum of their magnitudes, over inequalities and cones.
-        known: whether every part had a gradient.
     """
 
     def __init__(self, program: Program) -> None:
@@ -159,24 +155,25 @@ class Lagrangian:
         self.usual = program.usual_sizes()
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
         self.terms = {v.id: np.zeros(v.size) for v in self.variables}
-        self.value, self.complementarity, self.known = 0.0, 0.0, True
+        self.value, self.complementarity = 0.0, 0.0
 
     @classmethod
-    def of(cls, program: Program, duals: Values) -> "Lagrangian":
-        """Add up the constraints that have multipliers, these projected on the dual cones."""
+    def of(cls, program: Program, duals: Values, names: Iterable[str]) -> "Lagrangian | None":
+        """Add up the named constraints, multipliers projected on the dual cones; None where one has none, or no use."""
         found = cls(program)
-        for name, multipliers in duals.items():
+        for name in names:
             position = 0
+            if name not in duals:
+                return None
             for member in program.constraints[name]:
                 length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, multipliers[position : position + length])
+                terms = multiplier_terms(member, duals[name][position : position + length])
                 position += length
                 if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
-                    found.known = False
-                    return found
+                    return None
                 products = [flat_value(expression) * weights for expression, weights in terms]
                 found.value += float(sum(map(np.sum, products)))
-                if not isinstance(member, Equality | Zero):
+                if not isinstance(member, EQUALITIES):
                     whole = isinstance(member, PSD | SOC)  # in these cones only the sum of the products vanishes
                     found.complementarity += abs(float(sum(map(np.sum, products)))) if whole else float(
                         np.sum(np.abs(products[0])))
@@ -211,26 +208,22 @@ class Lagrangian:
         gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
         if flags["symmetric"]:
             gradient = (gradient + gradient.T) / 2
-        if has_bounds(variable):
-            lower, upper = (np.asarray(bound) for bound in variable.get_bounds())
+        if (bounds := bounds_of(variable)) is not None:
             value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
-            held = ((value <= lower + margin) & (gradient > 0)) | ((value >= upper - margin) & (gradient < 0))
+            held = ((value <= bounds[0] + margin) & (gradient > 0)) | ((value >= bounds[1] - margin) & (gradient < 0))
             gradient = np.where(held, 0.0, gradient)
         return np.abs(np.ravel(gradient, order="F"))
 
 
 def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
-    unknown = float("nan"), float("nan")
-    yardstick = max(abs(objective), program.scale)
-    if any(name not in duals for name in program.constraints):
-        return unknown
     try:
-        lagrangian = Lagrangian.of(program, {name: duals[name] for name in program.constraints})
-        if not lagrangian.known or not lagrangian.add(program.objective.expr, np.ones(1)):
-            return unknown
+        lagrangian = Lagrangian.of(program, duals, program.constraints)
+        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
+            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
+            return (lagrangian.residual(max(abs(objective), program.scale)), float(lagrangian.complementarity / size))
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        return unknown
-    return lagrangian.residual(yardstick), float(lagrangian.complementarity / value_size(program, objective))
+        pass
+    return float("nan"), float("nan")
 
 
 _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
@@ -238,15 +231,4 @@ _KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normN
 
 
 def _smooth(expression: cp.Expression) -> bool:
-    if expression.is_affine():
-        return True
-    return not ({type(atom).__name__ for atom in _atoms(expression)} & _KINKS)
-
-
-def _atoms(expression: cp.Expression) -> list[cp.Expression]:
-    stack, found = [expression], []
-    while stack:
-        node = stack.pop()
-        found.append(node)
-        stack.extend(getattr(node, "args", []))
-    return found
+    return expression.is_affine() or not {atom.__name__ for atom in expression.atoms()} & _KINKS

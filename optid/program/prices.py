@@ -63,7 +63,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     ``fit = 100 (1 - sqrt(F / S))`` with S the energy of the outputs about their means, so that a multiplier
     lambda = -dF/d(bound) is worth ``50 lambda / sqrt(F S)`` points.
     """
-    if not solution.has_point:
+    if not solution.has_point or not program.user_constraints:
         return ()
     program.assign(solution.values)
     unit = program.unit

@@ -135,10 +135,12 @@ class Program:
         Raises:
             StructureError: unknown variable, name used twice, or a nonconvex constraint in a convex formulation.
         """
+        if not builders:
+            return self
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual: dict[int, float] | None = None
+        usual = self.usual_sizes()
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -149,7 +151,9 @@ class Program:
                     foreign = set(member.variables()) - known
                     own = {v for v in foreign if self.view.owns(v)}
                     for variable in sorted(own, key=lambda v: v.id):
-                        _name_new(variables, variable)
+                        numbered = (f"{variable.name()} {k}" for k in range(2, len(variables) + 3))
+                        free = (one for one in (variable.name(), *numbered) if one not in variables)
+                        variables[next(free)] = variable
                     known |= own
                     if foreign := foreign - own:
                         raise StructureError(
@@ -162,7 +166,6 @@ class Program:
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
                 if self.view.units is not None:
-                    usual = usual if usual is not None else self.usual_sizes()
                     constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
                 else:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
@@ -289,13 +292,6 @@ class Program:
     def size(self) -> int:
         """Number of scalar unknowns."""
         return sum(v.size for v in self.variables.values())
-
-
-def _name_new(variables: dict[str, cp.Variable], variable: cp.Variable) -> None:
-    name, count = variable.name(), 2
-    while name in variables:
-        name, count = f"{variable.name()} {count}", count + 1
-    variables[name] = variable
 
 
 _MATRIX_ATOMS = {"normNuc", "lambda_max", "sigma_max", "lambda_sum_largest", "MatrixFrac", "matrix_frac", "tr_inv"}

@@ -1,6 +1,7 @@
 """What a constraint may speak about: the named expressions of a programme, in the units of the record."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
@@ -41,14 +42,18 @@ class View(Mapping[str, cp.Expression]):
         self.inner = dict(expressions)
         self.units = units
         self.reference = dict(reference or {})
-        self._expressions = self.inner if units is None else outward(
-            self.inner, units, channels, states="C" in self.reference)
         self._auxiliaries: dict[int, cp.Variable] = {}
         self.outputs = tuple(outputs)
         self.iterate = iterate
         self.channels = channels
         self.bases = dict(bases or {})
         self.gauge = gauge
+
+    @cached_property
+    def _expressions(self) -> Mapping[str, cp.Expression]:
+        if self.units is None:
+            return self.inner
+        return outward(self.inner, self.units, self.channels, states="C" in self.reference)
 
     def __getitem__(self, name: str) -> cp.Expression:
         try:
@@ -59,13 +64,13 @@ class View(Mapping[str, cp.Expression]):
             ) from None
 
     def __contains__(self, name: object) -> bool:
-        return name in self._expressions
+        return name in self.inner
 
     def __iter__(self):
-        return iter(self._expressions)
+        return iter(self.inner)
 
     def __len__(self) -> int:
-        return len(self._expressions)
+        return len(self.inner)
 
     def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> cp.Variable:
         """Return a new variable that a constraint needs for itself, such as the matrix of a Lyapunov inequality.

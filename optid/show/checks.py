@@ -44,8 +44,8 @@ def _test_table(checked: "Validation") -> Table:
     rows = [(text, "yes" if t.passed else "no", number(t.p_value, 2), _outside(t)) for text, t in tests]
     structure, note = checked.structure, ""
     if structure is not None:
-        verdict = "looks Hammerstein" if structure.passed else "does not look Hammerstein"
-        rows.append((f"structure: {verdict}", "yes" if structure.passed else "no", number(structure.p_value, 2), "-"))
+        passed = "yes" if structure.passed else "no"
+        rows.append((f"structure: {structure.finding}", passed, number(structure.p_value, 2), "-"))
         ratios = ", ".join(f"{name} {ratio:.3g}" for name, ratio in structure.ratios.items())
         saved = 100 * max(structure.saving, 0)
         note = f"Another structure saves {saved:.2g} % of the residual variance; second over first singular value of "

@@ -46,7 +46,7 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
     because = f": {reason}" if reason else ""
     if solution.status not in (Status.LOCAL, Status.OPTIMAL):
         return "bad", word, f"The solver stopped early{because}. Read the figures below with care."
-    if fit.procedure and because:
+    if fit.outcome.evidence is not None and because:
         return "fair", word, f"Not proved to be the best model of this structure{because}."
     if gap < 1:
         most = f"{100 * gap:.2g} %"

@@ -7,12 +7,13 @@ scale to first order, so that constraints on mu that are not scale-free stay mea
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
+from optid.program.expressions import flat
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
@@ -48,16 +49,16 @@ def run(program: Program, settings: Settings) -> Answer:
     mus, bs = [mu for mu, _ in form.blocks], [b for _, b in form.blocks]
     point = {name: np.asarray(program.start.get(name, program.variables[name].value), dtype=float)
              for name in (*mus, *bs)}
-    halves = _Halves(_hold(program, {name: point[name] for name in bs}),
-                     _hold(_tangent(program, bs), {name: point[name] for name in mus}))
+    without_b = _hold(program, {name: point[name] for name in bs})
+    without_mu = _hold(_tangent(program, bs), {name: point[name] for name in mus})
     accuracy = min(settings.accuracy, 1e-9)
     before, count, last = np.inf, 0, None
     for count in range(1, steps + 1):
-        in_mu = _step(halves.in_mu, point, inner, accuracy)
+        in_mu = _step(without_b, point, inner, accuracy)
         if not in_mu.has_point:
             return _stopped(in_mu, last, count)
         point.update(in_mu.values)
-        in_b = _step(halves.in_b, point, inner, accuracy)
+        in_b = _step(without_mu, point, inner, accuracy)
         if not in_b.has_point:
             return _stopped(in_b, last, count)
         last = _answer(program, form.gauge, point, in_mu, in_b, count)
@@ -70,14 +71,6 @@ def run(program: Program, settings: Settings) -> Answer:
             for name in bs:
                 point[name] = point[name] / np.linalg.norm(point[name])
     return last or Answer(Status.LIMIT, "iteration limit", iterations=count)
-
-
-@dataclass(frozen=True)
-class _Halves:
-    """The two convex programmes: everything but the b, and everything but the mu."""
-
-    in_mu: Program
-    in_b: Program
 
 
 def _hold(program: Program, values: Mapping[str, np.ndarray]) -> Program:
@@ -96,7 +89,7 @@ def _tangent(program: Program, bs: list[str]) -> Program:
         b = program.variables[name]
         direction = cp.Parameter(b.size, name=_direction(name))
         parameters[_direction(name)] = direction
-        tangents.append(direction @ cp.vec(b, order="F") == 1)
+        tangents.append(direction @ flat(b) == 1)
     return replace(program, constraints={**program.constraints, GAUGE: tuple(tangents)}, parameters=parameters)
 
 

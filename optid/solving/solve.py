@@ -64,38 +64,26 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     settings = Settings(accuracy, time_limit, warm, verbose, options)
 
     separate = (time_limit is not None) if isolate is None else isolate
-    clock = time.perf_counter()
-    answer = _attempt(program, back_end, settings, separate)
-    solved = time.perf_counter()
-    solution = _verdict(program, back_end, answer, chosen, settings, solved - clock, prove, separate)
-    if chosen and solution.status is Status.FAILED and not options:
-        return _substitute(program, solution, settings, prove, separate)
-    if chosen and solution.status is Status.INACCURATE and not options:
-        return _sharpened(program, back_end, solution, settings, prove, separate)
-    return solution
 
-
-def _sharpened(program: Program, back_end: BackEnd, first: Solution, settings: Settings, prove: bool, separate: bool
-               ) -> Solution:
-    """Return what a hundredth of the tolerance gives where that satisfies our measurements, else the first answer."""
-    clock = time.perf_counter()
-    answer = _attempt(program, back_end, replace(settings, accuracy=settings.accuracy / 100), separate)
-    seconds = first.times.solve + time.perf_counter() - clock
-    again = _verdict(program, back_end, answer, first.chosen, settings, seconds, prove, separate)
-    return again if again.status in (Status.LOCAL, Status.OPTIMAL) else first
-
-
-def _substitute(program: Program, first: Solution, settings: Settings, prove: bool, separate: bool) -> Solution:
-    """Return the first usable answer of another back end of the class, or the failure of the one chosen."""
-    for back_end in fallbacks(program, first.solver):
+    def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
         clock = time.perf_counter()
         answer = _attempt(program, back_end, settings, separate)
-        seconds = time.perf_counter() - clock
-        chosen = f"{back_end.name}: in place of {first.solver}"
-        solution = _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
-        if solution.has_point and solution.status is not Status.FAILED:
-            return replace(solution, failed=first.solver)
-    return first
+        seconds = spent + time.perf_counter() - clock
+        return _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
+
+    solution = attempt(back_end, settings, chosen)
+    if not chosen or options:
+        return solution
+    if solution.status is Status.FAILED:
+        for other in fallbacks(program, back_end.name):
+            found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
+            if found.has_point and found.status is not Status.FAILED:
+                return replace(found, failed=back_end.name)
+    if solution.status is Status.INACCURATE:  # a hundredth of the tolerance may satisfy our measurements
+        sharper = replace(settings, accuracy=settings.accuracy / 100)
+        found = attempt(back_end, sharper, chosen, solution.times.solve)
+        return found if found.status in (Status.LOCAL, Status.OPTIMAL) else solution
+    return solution
 
 
 def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
@@ -140,11 +128,12 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
 
     clock = time.perf_counter()
     try:
-        point = _judged(program, answer)
+        point = _judged(program, answer, base)
     except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
         why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
+    assert point.residuals is not None
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
         return _conflict(program, base, reason)
@@ -156,10 +145,9 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
         elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
             status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
     done = time.perf_counter()
-    return replace(base, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   values=point.values, duals=point.duals, objective=point.objective, bound=bound,
-                   residuals=point.residuals,
-                   times=replace(base.times, judge=judged - clock, prove=done - judged)).in_units(program.unit)
+    return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
+                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged)
+                   ).in_units(program.unit)
 
 
 def _conflict(program: Program, base: Solution, reason: str) -> Solution:
@@ -167,20 +155,11 @@ def _conflict(program: Program, base: Solution, reason: str) -> Solution:
     return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}").in_units(program.unit)
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """A point with what we measured there."""
-
-    values: Values
-    duals: Values
-    objective: float
-    residuals: Residuals
-
-
-def _judged(program: Program, answer: Answer) -> _Judged:
+def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
+    """Return a solution at the answer's point, with what we measured there."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         objective, residuals = judge(program, answer.values, answer.duals)
-    return _Judged(program.values(), dict(answer.duals), objective, residuals)
+    return replace(base, values=program.values(), duals=dict(answer.duals), objective=objective, residuals=residuals)
 
 
 def _overflowed(program: Program) -> bool:
@@ -230,53 +209,47 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     return Status.LOCAL, ""
 
 
-def _refuted(program: Program, point: _Judged, bound: Bound, accuracy: float) -> bool:
+def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -> bool:
     """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
     if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
         return False
     return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
 
 
-def _proof(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, separate: bool
-           ) -> tuple[_Judged, Bound | None]:
-    """Ask for a proof; when the attempt proposes a better start, solve again from there and keep the better point."""
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
+           ) -> tuple[Solution, Bound | None]:
+    """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
     if program.certify is None:
-        return point, _convex_proof(program, point)
+        if program.kind == "NLP":
+            return point, None
+        try:
+            return point, certify_convex(program, point.values, point.duals, point.objective)
+        except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+            return point, None
     bound, start = program.certify(program, point.values, point.duals)
     if start is not None and not bound.proved:
-        answer = _attempt(replace(program, start=start), back_end, settings, separate)
-        if answer.values:
-            again = _judged(program, answer)
-            lower = point.objective - 1e-10 * abs(point.objective)
-            if again.objective < lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
-                bound, _ = program.certify(program, again.values, again.duals)
-                point = again
-        program.assign(point.values)
+        point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
     if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
         wider = replace(settings, options={**back_end.thorough, **settings.options})
-        point, bound = _better(program, back_end, wider, point, bound, separate)
+        point, bound = _lowered(program, program.start, back_end, wider, point, bound, separate)
     return point, bound
 
 
-def _better(program: Program, back_end: BackEnd, settings: Settings, point: _Judged, bound: Bound, separate: bool
-            ) -> tuple[_Judged, Bound]:
-    """Search further for a local optimum that lies lower, and certify it."""
-    answer = _attempt(program, back_end, settings, separate)
-    again = _judged(program, answer) if answer.values else point
-    lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-    if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9) and program.certify is not None:
-        return again, program.certify(program, again.values, again.duals)[0]
+def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
+             separate: bool) -> tuple[Solution, Bound]:
+    """Solve again from a start, and certify the point found there where it lies lower."""
+    answer = _attempt(replace(program, start=start), back_end, settings, separate)
+    if answer.values and program.certify is not None:
+        again = _judged(program, answer, point)
+        lower = again.objective < point.objective - 1e-10 * abs(point.objective)
+        if lower and _violation(again) <= max(_violation(point), 1e-9):
+            point, bound = again, program.certify(program, again.values, again.duals)[0]
     program.assign(point.values)
     return point, bound
 
 
-def _convex_proof(program: Program, point: _Judged) -> Bound | None:
-    if program.kind == "NLP":
-        return None
-    try:
-        return certify_convex(program, point.values, point.duals, point.objective)
-    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        return None
+def _violation(point: Solution) -> float:
+    return float("inf") if point.residuals is None else point.residuals.violation
 
 
 @dataclass(frozen=True)
@@ -324,12 +297,11 @@ class Outcome:
         solution: the last solution.
         program: the last programme.
         steps: every (name, solution) on the way; one entry for a plain programme.
-        figures: those of the procedure's `Evidence`.
+        figures: those of the evidence, and which solvers stood in for others.
         constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
             constraints to the steps they are about.
-        procedure: whether a procedure judged the whole, so that solution and program are no pair of their own.
-        bound: that of the procedure's `Evidence` where it is a function; the solution has no bound then.
-        extend: that of the procedure's `Evidence`.
+        evidence: with which a procedure judged the whole, so that solution and program are no pair of their own; the
+            solution has no bound where the evidence has a function that returns it.
     """
 
     model: Any
@@ -338,9 +310,7 @@ class Outcome:
     steps: tuple[tuple[str, Solution], ...]
     figures: Mapping[str, Any] = field(default_factory=dict)
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
-    procedure: bool = False
-    bound: Callable[[], Bound] | None = None
-    extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
+    evidence: Evidence | None = None
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
@@ -377,9 +347,8 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-            later = found.bound if callable(found.bound) else None
-            solution = replace(solution, objective=found.objective, bound=None if later else found.bound,
-                               status=found.status, reason=found.reason)
+            bound = None if callable(found.bound) else found.bound
+            solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
+                               reason=found.reason)
             figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, True, later,
-                           found.extend)
+            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)

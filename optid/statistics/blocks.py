@@ -1,23 +1,199 @@
-"""Blocks of a record, evaluated one at a time: the rows they add are all that is ever formed."""
+"""Rows of lagged signals, evaluated in blocks: those of one stretch of a record are all that is ever formed."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.errors import DataError, RankError
+from optid.bases.basis import spread
+from optid.errors import DataError, RankError, StructureError
 from optid.models.layout import Layout
-from optid.statistics.sums import Block, make_block, stretches
 
 CHUNK = 32768
-"""Samples evaluated at a time: their basis functions stay in the processor's cache."""
+"""Samples summed up at a time: their basis functions stay in the processor's cache."""
+
+PIECE = 4096
+"""Samples evaluated at a time: so do the intermediate results."""
 
 BLOCKS = 4
 """Chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record."""
 
-NO_WEIGHTS = "weights are for records in memory; a stream has none."
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where the samples of groups of signals stand in a row; every group enters at lags of its own.
+
+    Attributes:
+        lags: lags of every group.
+        columns: (lags, signals) columns of every group.
+        constant: column of the constant.
+    """
+
+    lags: tuple[range, ...]
+    columns: tuple[NDArray[np.int32], ...]
+    constant: int
+
+    @classmethod
+    def of(cls, layout: Layout) -> "Frame":
+        """Return the complete rows of a layout: outputs, complete families of every input, 1, outputs at lag 0."""
+        return cls(layout.group_lags, layout.complete_columns, layout.n_complete - 1 - layout.l)
+
+    @cached_property
+    def n(self) -> int:
+        """Length of a row."""
+        return 1 + sum(columns.size for columns in self.columns)
+
+    @cached_property
+    def reach(self) -> int:
+        """Largest lag."""
+        return max(lags[-1] for lags in self.lags)
+
+    def differences(self, g: int, h: int) -> range:
+        """Differences of a lag of group h and a lag of group g; of a group with itself one sign of them is enough."""
+        return range(0 if g == h else self.lags[h][0] - self.lags[g][-1], self.lags[h][-1] - self.lags[g][0] + 1)
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Signals that enter the rows at the same lags: the outputs, or the functions of one input.
+
+    Attributes:
+        first: (T,) position of the first function that does not vanish.
+        weights: (T, s) values from there on.
+        size: number of signals.
+    """
+
+    first: NDArray[np.int32]
+    weights: Array
+    size: int
+
+    @classmethod
+    def dense(cls, values: Array) -> "Signals":
+        """Return signals that vanish nowhere in particular, (T, size)."""
+        return cls(np.zeros(len(values), dtype=np.int32), values, values.shape[1])
+
+    @property
+    def local(self) -> bool:
+        """Whether some functions vanish at every sample."""
+        return self.weights.shape[1] < self.size
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples of a stretch of time, with zeros before, behind and in place of missing ones.
+
+    Attributes:
+        frame: the rows.
+        groups: the signals of every group.
+        valid: (R,) rows that touch neither a missing sample nor the zeros around; row r looks back from sample
+            reach + r of the signals.
+        weights: (R,) weights of the rows, or None for ones.
+        candidates: rows that would be used, were no sample missing.
+    """
+
+    frame: Frame
+    groups: tuple[Signals, ...]
+    valid: NDArray[np.bool_]
+    weights: Array | None
+    candidates: int
+
+    def entries(self, rows: NDArray[np.intp]) -> Iterator[tuple[Signals, NDArray[np.int32], NDArray[np.intp]]]:
+        """Yield every group at every lag: its signals, its columns (size,) and its samples (K,) in some rows."""
+        for group, lags, columns in zip(self.groups, self.frame.lags, self.frame.columns):
+            for lag, where in zip(lags, columns):
+                yield group, where, rows + (self.frame.reach - lag)
+
+    def dense_rows(self, rows: NDArray[np.intp]) -> Array:
+        """Form some rows, (K, n)."""
+        formed = np.empty((rows.size, self.frame.n))
+        for group, where, at in self.entries(rows):
+            formed[:, where[0] : where[-1] + 1] = spread(group.first[at], group.weights[at], group.size)
+        formed[:, self.frame.constant] = 1.0
+        return formed
+
+    def sparse_rows(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.int32], Array]:
+        """List the entries of some rows that may differ from zero: columns (K, z), increasing, and values."""
+        found: list[Any] = [(np.full((rows.size, 1), self.frame.constant, dtype=np.int32), np.ones((rows.size, 1)))]
+        for group, where, at in self.entries(rows):
+            width = np.arange(group.weights.shape[1], dtype=np.int32)
+            found.append((where[0] + group.first[at, None] + width, group.weights[at]))
+        columns, values = zip(*sorted(found, key=lambda entry: entry[0][0, 0]))
+        return np.concatenate(columns, axis=1), np.concatenate(values, axis=1)
+
+
+def stretches(chunks: Iterable[Sequence[Array]], reach: int, size: int) -> Iterator[list[Array]]:
+    """Cut chunks of parallel arrays into stretches of `size` samples, each with the `reach` samples before it.
+
+    Args:
+        chunks: arrays with the same first axis, in time order, of any length.
+        reach: samples carried over from one stretch to the next.
+        size: new samples of each stretch; the last one has fewer.
+
+    Yields:
+        Arrays of at most reach + size samples; nothing when there are no more than `reach` in all.
+    """
+    carried: list[Array] | None = None
+    for chunk in chunks:
+        parts = list(chunk) if carried is None else [np.concatenate(pair) for pair in zip(carried, chunk)]
+        start = 0
+        while len(parts[0]) - start >= reach + size:
+            yield [part[start : start + reach + size] for part in parts]
+            start += size
+        carried = [part[start:] for part in parts]
+    if carried is not None and len(carried[0]) > reach:
+        yield carried
+
+
+def rows_present(missing: Sequence[NDArray[np.bool_]], lags: Sequence[range], reach: int) -> NDArray[np.bool_]:
+    """Mark the rows (R,) in which every sample is present.
+
+    Args:
+        missing: (reach + R,) marks of missing samples, one array per group.
+        lags: lags of every group.
+        reach: largest lag; the first row is that of sample `reach`.
+    """
+    count = len(missing[0]) - reach
+    present = np.ones(count, dtype=bool)
+    for lost, delays in zip(missing, lags):
+        for lag in delays if lost.any() else ():
+            present &= ~lost[reach - lag : reach - lag + count]
+    return present
+
+
+def used_rows(u: Array, y: Array, layout: Layout) -> NDArray[np.bool_]:
+    """Mark the rows (R,) of a layout in which every sample of u (reach + R, m) and y (reach + R, l) is present."""
+    missing = [np.logical_or.reduce(np.isnan(y), axis=1), *np.isnan(u).T]
+    return rows_present(missing, layout.group_lags, layout.first_row)
+
+
+def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Block:
+    """Evaluate the bases on one stretch: u (reach + R, m), y (reach + R, l), weights (reach + R,) or None."""
+    frame, reach = Frame.of(layout), layout.first_row
+    valid = np.zeros(len(u) + reach, dtype=bool)
+    valid[reach : len(u)] = used_rows(u, y, layout)
+    outputs = np.zeros((len(y) + 2 * reach, layout.l))
+    outputs[reach : reach + len(y)] = np.where(np.isnan(y), 0.0, y)
+    groups = [Signals.dense(outputs)]
+    for c, basis in enumerate(layout.bases):
+        first, values = np.zeros(len(outputs), dtype=np.int32), np.zeros((0, 0))
+        for start in range(0, len(u), PIECE):
+            piece = slice(reach + start, reach + min(start + PIECE, len(u)))
+            found, weighted = basis.local(u[start : start + PIECE, c])
+            values = values if start else np.zeros((len(outputs), weighted.shape[1]))
+            first[piece], values[piece] = found, weighted
+        if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
+            raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
+        groups.append(Signals(first, values, basis.full_size))
+    candidates = len(u) - reach
+    if weights is not None:
+        candidates = int(np.count_nonzero(weights[reach:]))
+        weights = np.pad(weights, (0, reach))
+        valid &= weights > 0
+    return Block(frame, tuple(groups), valid, weights, candidates)
 
 
 @dataclass(frozen=True)
@@ -29,18 +205,12 @@ class Stretch:
     position: int
 
 
-def cut(data: Any, layout: Layout, weights: Sequence[Array] | None, chunk: int) -> Iterator[Stretch]:
-    """Cut a record into stretches that threads take one at a time."""
-    length = length_of_stretches(layout, chunk)
-    for name, chunks in _records(data, layout, weights):
-        for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
-            yield Stretch(arrays, name, i * length)
-
-
-def length_of_stretches(layout: Layout, chunk: int) -> int:
-    """Return the new samples of a stretch."""
+def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[Stretch]:
+    """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time."""
     size = _block_size(layout, chunk)
-    return size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
+    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
+    for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
+        yield Stretch(arrays, record, i * length)
 
 
 def blocks_of(part: Stretch, layout: Layout, chunk: int) -> Iterator[Block]:
@@ -60,42 +230,45 @@ def _block_size(layout: Layout, chunk: int) -> int:
     return max(chunk - layout.first_row, 32 * layout.first_row, 1)
 
 
-def _records(data: Any, layout: Layout, weights: Sequence[Array] | None
-             ) -> Iterator[tuple[str, Iterable[Sequence[Array]]]]:
+def records(data: Any, layout: Layout, weights: Sequence[Array] | None
+            ) -> Iterator[tuple[str, Iterable[Sequence[Array]]]]:
     """Yield the name and the chunks (u, y) or (u, y, weights) of every experiment."""
-    check_channels(data, layout)
     if not hasattr(data, "experiments"):
-        if weights is not None:
-            raise DataError(NO_WEIGHTS)
         yield "", data
         return
-    if weights is not None and len(weights) != len(data.experiments):
-        raise DataError(f"{len(weights)} arrays of weights for {len(data.experiments)} experiments: give one each.")
-    for i, experiment in enumerate(data.experiments):
-        name = f"experiment {i + 1}: " if len(data.experiments) > 1 else ""
-        count = len(experiment.y)
+    names = check_lengths([len(experiment.y) for experiment in data.experiments], layout)
+    if weights is not None and len(weights) != len(names):
+        raise DataError(f"{len(weights)} arrays of weights for {len(names)} experiments: give one each.")
+    for i, (name, experiment) in enumerate(zip(names, data.experiments)):
+        own = () if weights is None else (row_weights(weights[i], len(experiment.y), name),)
+        yield name, [(experiment.u, experiment.y, *own)]
+
+
+def check_lengths(lengths: Sequence[int], layout: Layout) -> list[str]:
+    """Return the name of every experiment in messages, or refuse one without a complete row (`RankError`)."""
+    names = [f"experiment {i + 1}: " for i in range(len(lengths))] if len(lengths) > 1 else [""]
+    for name, count in zip(names, lengths):
         if count <= layout.first_row:
-            raise too_short(name, count, layout)
-        if weights is None:
-            yield name, [(experiment.u, experiment.y)]
-        else:
-            yield name, [(experiment.u, experiment.y, _checked_weights(weights[i], count, name))]
+            raise RankError(f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. "
+                            "Leave it out, or use fewer lags.")
+    return names
 
 
-def too_short(name: str, count: int, layout: Layout) -> RankError:
-    """Return the refusal of an experiment without a complete row."""
-    return RankError(f"{name}{count} samples, but the lags reach back {layout.first_row}: no row is complete. Leave it "
-                     "out, or use fewer lags.")
+def row_weights(weights: Any, count: int, name: str = "") -> Array:
+    """Return the weights of rows as (count,), from one number or one per sample.
 
-
-def _checked_weights(weights: Any, count: int, name: str) -> Array:
-    weights = np.asarray(weights, dtype=float)
-    if weights.shape != (count,):
-        raise DataError(f"{name}weights have shape {weights.shape}; one per sample is needed, ({count},).")
+    Raises:
+        DataError: wrong shape, or a weight that is negative or not finite.
+    """
+    given = np.asarray(weights, dtype=float)
+    if given.shape not in ((), (count,)):
+        raise DataError(f"{name}weights have shape {given.shape}: one number, or one for each of the {count} samples.")
+    weights = np.array(np.broadcast_to(given, count))
     bad = ~(np.isfinite(weights) & (weights >= 0))
     if bad.any():
         k = int(np.argmax(bad))
-        raise DataError(f"{name}weight of sample {k} is {weights[k]}: weights are finite and not negative.")
+        raise DataError(f"{name}weight of sample {k} is {weights[k]}: weights must be finite and not negative; 0 "
+                        "leaves a row out.")
     return weights
 
 

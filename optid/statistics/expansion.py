@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.bases import Bases, FeedbackBases, feedback_bases, fitted_bases
 from optid.bases.basis import Basis
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
-from optid.statistics.factors import add_to_root
+from optid.statistics.hankel import hankel_statistics
 
 SMALLEST = 1e-6
 """Part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding."""
@@ -202,44 +204,34 @@ class Expansion:
         return replace(self, feedback=(), simulated=False)
 
 
-def expand(records: Sequence[Array], inputs: Sequence[Basis], feedback: Sequence[Basis | None],
-           input_names: Sequence[str], output_names: Sequence[str]) -> Expansion:
-    """Fit the feedback functions to a record and return its expansion.
+def expand(data: Data, basis: Bases, feedback_basis: FeedbackBases = None) -> Expansion:
+    """Fit the bases to a record and return its expansion.
 
     Args:
-        records: (N, m + l) arrays [u | y], one per experiment; NaN = missing.
-        inputs: one basis per input, with an interval.
-        feedback: one basis per output, with an interval, or None for an output that is not fed back; empty for none.
-        input_names: m names.
-        output_names: l names.
+        data: the record; NaN = missing.
+        basis: of the inputs.
+        feedback_basis: of the outputs.
 
     Raises:
+        StructureError: a wrong number of bases, or an entry that is not a basis.
         RankError: the feedback functions of an output are linear in y on this record.
-        DataError: no sample at which all outputs are present.
+        DataError: a constant channel, or no sample at which all outputs are present.
 
     Warns:
         DataWarning: they are nearly linear.
     """
-    m, l = len(input_names), len(output_names)  # noqa: E741
-    families = []
-    for output, basis in enumerate(feedback):
-        if basis is not None:
-            families.append(_orthogonalised([record[:, m : m + l] for record in records], output, basis, output_names))
-    return Expansion(tuple(inputs), tuple(families), tuple(input_names), tuple(output_names))
+    outputs = [e.y for e in data.experiments]
+    families = [_orthogonalised(outputs, output, family, data.outputs)
+                for output, family in enumerate(feedback_bases(data, feedback_basis)) if family is not None]
+    return Expansion(fitted_bases(data, basis), tuple(families), data.inputs, data.outputs)
 
 
 def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: Sequence[str]) -> Feedback:
-    l, q = len(names), basis.size  # noqa: E741
-    root, count = np.zeros((1 + l + q, 1 + l + q)), 0
-    for record in outputs:
-        y = record[~np.isnan(record).any(axis=1)]
-        count += len(y)
-        for start in range(0, len(y), 8192):
-            part = y[start : start + 8192]
-            rows = np.concatenate([np.ones((len(part), 1)), part, basis.values(part[:, output])], axis=1)
-            root = add_to_root(root, rows)
-    if not count:
+    l = len(names)  # noqa: E741
+    if all(np.isnan(y).any(axis=1).all() for y in outputs):
         raise DataError("no sample has all outputs: the feedback functions cannot be formed.")
+    statistics = hankel_statistics(outputs, 1, lambda y: np.hstack([y, basis.values(y[:, output])]), method="qr")
+    root, count = statistics.root, statistics.windows
     slopes = np.linalg.lstsq(root[: 1 + l, : 1 + l], root[: 1 + l, 1 + l :], rcond=None)[0]  # (1 + l, Q)
     rest = root[:, 1 + l :] - root[:, : 1 + l] @ slopes
     spread = np.linalg.norm(root[1:, 1 + l :])
@@ -251,8 +243,7 @@ def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: 
         warnings.warn(_nearly_linear(basis, names[output], share) + " What it adds will be uncertain.", DataWarning,
                       stacklevel=4)
     _, values, right = np.linalg.svd(rest)
-    sizes = np.linalg.norm(root[1:, 1 + l :])
-    kept = values > SMALLEST * sizes
+    kept = values > SMALLEST * spread
     vectors = right[: values.size][kept].T / (values[kept] / np.sqrt(count))
     reduced = slopes @ vectors
     return Feedback(output, basis, vectors, reduced[0], reduced[1:].T, share)

@@ -51,6 +51,12 @@ def root_of_gram(gram: Array, n: int) -> Array:
     return _nonnegative_diagonal(root) * scale
 
 
+def any_root_of_gram(gram: Array) -> Array:
+    """Return an upper triangular R, diagonal >= 0, with R^T R = gram, also where columns depend on others."""
+    root = root_of_gram(gram, len(gram))
+    return root if np.all(np.diag(root) > 0) else root_of_gram(gram, 0)
+
+
 def dependent_column(root: Array, n: int, method: str) -> int | None:
     """Return the first of n columns that depends on those before it to the rounding of the method, or None."""
     norms = np.linalg.norm(root[:, :n], axis=0)

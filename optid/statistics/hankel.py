@@ -1,37 +1,30 @@
 """Gram matrices of block Hankel matrices that are never formed.
 
-A column of a block Hankel matrix is a window: the samples s(k), ..., s(k + rows - 1) of d signals. Block (i, j) of the
-Gram matrix over all windows of a run of samples depends on j - i only, up to the two ends of the run, so that one
-product of the signals per lag replaces one per pair of block rows. Ends are added, never subtracted: no digit is lost.
-
-Windows that touch a missing sample are left out, which cuts a record into runs; experiments are further runs.
-Statistics add up over runs, experiments, chunks and workers.
+A column of a block Hankel matrix is a window: the samples s(k), ..., s(k + rows - 1) of d signals, a row of lagged
+signals in `optid.statistics.sums`. Windows that touch a missing sample are left out. Statistics add up over
+experiments, chunks and workers.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
+from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.sums import Factor, Sums
 
 Expand = Callable[[Array], Array]
 """From raw channels (T, c) to signals (T, d), sample by sample."""
 
-CHUNK = 8192
-"""Samples expanded at a time."""
-
-WIDE = 128
-"""Signals times samples of the blocks whose products are taken at once."""
-
-FORMED = 2048
-"""Windows formed at once where that is the cheapest way."""
+CHUNK = 4096
+"""Samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time."""
 
 CONDITION_LIMIT = 1e5
 """Condition number of the scaled windows beyond which their Gram matrix, which squares it, is replaced by a streamed QR
@@ -131,11 +124,9 @@ class HankelStatistics:
         if self.windows < needed:
             lost = self.candidates - self.windows
             missing = f" (missing samples cost {lost} of {self.candidates})" if lost else ""
-            raise RankError(
-                f"{self.windows} complete windows of {self.rows} samples{missing} for {self.rows} block rows of "
-                f"{self.d} signals: at least {needed} are needed. Use a longer record, fewer block rows or fewer basis "
-                "functions."
-            )
+            raise RankError(f"{self.windows} complete windows of {self.rows} samples{missing} for {self.rows} block "
+                            f"rows of {self.d} signals: at least {needed} are needed. Use a longer record, fewer block "
+                            "rows or fewer basis functions.")
 
 
 def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None = None, *,
@@ -159,8 +150,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         StructureError: rows < 1, an unknown method.
         RankError: an experiment shorter than the block rows, or no complete window at all.
     """
-    if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 1:
-        raise StructureError(f"block rows: a whole number from 1 is needed; got {rows!r}.")
+    rows = check_integer(rows, "block rows")
     if method not in ("auto", "gram", "qr"):
         raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
     records = [np.asarray(record, dtype=float) for record in records]
@@ -168,33 +158,50 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         if record.ndim != 2:
             raise DataError(f"experiment {i + 1}: an array (N, channels) is needed; got shape {record.shape}.")
         if len(record) < rows:
-            raise RankError(
-                f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it out or use "
-                "fewer block rows."
-            )
+            raise RankError(f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it "
+                            "out or use fewer block rows.")
     runs = [run for record in records for run in complete_runs(record, rows)]
-    candidates = sum(len(record) - rows + 1 for record in records)
     if not runs:
         raise RankError(f"no window of {rows} samples is complete: every one touches a missing sample. Use fewer block "
                         "rows or data with fewer gaps.")
-    d = runs[0].shape[1] if expand is None else expand(runs[0][:1]).shape[1]
-    sums = _Sums(rows, expand, d, chunk)
-    names = tuple(names) if names is not None else tuple(f"s{c + 1}" for c in range(sums.d))
-    if len(names) != sums.d:
-        raise StructureError(f"{len(names)} names for {sums.d} signals.")
-    if isinstance(centre, str):
-        spread = [sums.evaluated(run[:: 1 + len(run) // chunk]) for run in runs]  # a centre has to be near, no more
-        sums.centre = np.concatenate(spread).mean(axis=0)
-    elif centre is not None:
-        sums.centre = np.asarray(centre, dtype=float)
+    expand = expand or np.asarray
+    d = expand(runs[0][:1]).shape[1]
+    names = tuple(names) if names is not None else tuple(f"s{c + 1}" for c in range(d))
+    if len(names) != d:
+        raise StructureError(f"{len(names)} names for {d} signals.")
+    if isinstance(centre, str):  # a centre has to be near, no more
+        centre = np.concatenate([expand(run[:: 1 + len(run) // chunk]) for run in runs]).mean(axis=0)
+    middle = np.zeros(d) if centre is None else np.asarray(centre, dtype=float)
+    columns = np.arange(1, 1 + rows * d, dtype=np.int32).reshape(rows, d)
+    frame = Frame((range(rows),), (columns[::-1],), 0)  # row i of a window lies rows - 1 - i samples before its last
+
+    def total(sums: Any) -> Any:
+        for record in records:
+            for (raw,) in stretches([(record,)], frame.reach, max(8 * chunk, 32 * frame.reach)):
+                sums.add(_block(raw, frame, expand, middle, chunk))
+        return sums
+
+    candidates = sum(len(record) - rows + 1 for record in records)
     if method != "qr":
-        for run in runs:
-            sums.add(run)
-        found = HankelStatistics(rows, names, sums.centre, sums.gram(), candidates)
+        found = HankelStatistics(rows, names, middle, total(Sums(frame)).complete(), candidates)
         if method == "gram" or found.condition <= CONDITION_LIMIT:
             return found
-    root = sums.factorised(runs)
-    return HankelStatistics(rows, names, sums.centre, root.T @ root, candidates, root)
+    root = total(Factor(frame.n)).root
+    return HankelStatistics(rows, names, middle, root.T @ root, candidates, root)
+
+
+def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) -> Block:
+    """Evaluate the signals of one stretch (T, c)."""
+    missing = np.logical_or.reduce(np.isnan(raw), axis=1)
+    padded = np.zeros((len(raw) + 2 * frame.reach, centre.size))
+    inner = padded[frame.reach : frame.reach + len(raw)]
+    for start in range(0, len(raw), chunk):
+        part = slice(start, start + chunk)
+        present = ~missing[part] if missing[part].any() else slice(None)
+        if not missing[part].all():
+            inner[part][present] = expand(raw[part][present]) - centre
+    valid = np.pad(rows_present([missing], frame.lags, frame.reach), frame.reach)
+    return Block(frame, (Signals.dense(padded),), valid, None, 0)
 
 
 def complete_runs(record: Array, rows: int) -> Iterator[Array]:
@@ -207,104 +214,8 @@ def complete_runs(record: Array, rows: int) -> Iterator[Array]:
             yield record[start:stop]
 
 
-def windows_of(signals: Array, rows: int) -> Array:
-    """View the windows of signals (T, d) as (T - rows + 1, rows, d), nothing copied."""
-    return np.lib.stride_tricks.sliding_window_view(signals, rows, axis=0).transpose(0, 2, 1)
-
-
 def dependent_signal(statistics: HankelStatistics, order: Sequence[int] | NDArray[np.intp]) -> str | None:
     """Name the first of some positions whose row of the Hankel matrix depends on those before it, or None."""
     order = np.asarray(order, dtype=np.intp)
     column = dependent_column(statistics.triangle(order), order.size, statistics.method)
-    if column is None:
-        return None
-    return statistics.name(int(order[column]))
-
-
-class _Sums:
-    """Running sums over runs: per lag in the middle of a run, of windows that are formed at its ends."""
-
-    def __init__(self, rows: int, expand: Expand | None, d: int, chunk: int) -> None:
-        self.rows, self.d = rows, d
-        self.centre: Array = np.zeros(d)
-        self._expand, self._chunk = expand, max(chunk, 4 * rows)
-        self._middle = np.zeros((rows, d, d))  # sum of s(k) s(k + lag)^T
-        self._total = np.zeros(d)
-        self._ends = np.zeros((rows * d, 1 + rows * d))  # those of block rows not above the diagonal do not count
-        self._windows = 0
-
-    def evaluated(self, raw: Array) -> Array:
-        """Return the signals of some samples, less the centre."""
-        signals = raw if self._expand is None else self._expand(raw)
-        return signals - self.centre if np.any(self.centre) else np.ascontiguousarray(signals)
-
-    def add(self, run: Array) -> None:
-        """Add the windows of a run of complete samples."""
-        rows, count = self.rows, len(run) - self.rows + 1
-        self._windows += count
-        if count < rows:
-            self._add_formed(self.evaluated(run), np.ones((count, rows)))
-            return
-        signals = self.evaluated(run[rows - 1 : rows - 1 + self._chunk])
-        start = rows - 1  # of the signals at hand; the middle is rows - 1 <= k < count
-        while start < count:
-            stop = min(start + len(signals) - (rows - 1), count)
-            self._add_lags(signals, stop - start)
-            following = run[start + len(signals) : start + len(signals) + self._chunk]
-            signals, start = signals[stop - start :], stop
-            if len(following):
-                signals = np.concatenate([signals, self.evaluated(following)])
-        if rows > 1:  # windows k < rows - 1 with k + i < rows - 1, and k > count - rows with k + i >= count
-            early = np.add.outer(np.arange(rows - 1), np.arange(rows)) < rows - 1
-            self._add_formed(self.evaluated(run[: 2 * rows - 2]), early)
-            self._add_formed(self.evaluated(run[count - rows + 1 :]), ~early)
-
-    def _add_formed(self, signals: Array, counted: NDArray) -> None:
-        """Add the products of the samples that count, by window and block row, with the samples after them."""
-        windows = windows_of(signals, self.rows)
-        whole = windows.reshape(len(windows), -1)
-        part = (windows * counted[:, :, None]).reshape(whole.shape)
-        self._ends[:, 0] += part.sum(axis=0)
-        self._ends[:, 1:] += part.T @ whole
-
-    def _add_lags(self, signals: Array, count: int) -> None:
-        """Add the products of the first `count` samples with those up to rows - 1 samples later."""
-        rows, d = self.rows, self.d
-        step = min(rows, max(1, WIDE // d))  # samples of a block: large products are fast, the diagonals are added up
-        following = -(-(rows - 1) // step)  # blocks that the largest lag reaches
-        blocks = max((count + rows - 1) // step - following, 0)
-        views = [signals[i * step : (i + blocks) * step].reshape(blocks, step * d) for i in range(following + 1)]
-        products = np.concatenate([(views[0].T @ view).reshape(step, d, step, d) for view in views], axis=2)
-        found = sum((products[i, :, i : i + rows] for i in range(step)), np.zeros((d, rows, d)))
-        if blocks * step < count:
-            rest = windows_of(signals[blocks * step : count + rows - 1], rows).reshape(-1, rows * d)
-            found += (signals[blocks * step : count].T @ rest).reshape(d, rows, d)
-        self._middle += found.transpose(1, 0, 2)
-        self._total += np.ones(count) @ signals[:count]
-
-    def gram(self) -> Array:
-        """Return the Gram matrix of [1; window], symmetric."""
-        rows, d = self.rows, self.d
-        upper = np.zeros((1 + rows * d, 1 + rows * d))
-        upper[1:] = self._ends
-        for i in range(rows):
-            start = 1 + i * d
-            upper[start : start + d, start:] += self._middle[: rows - i].transpose(1, 0, 2).reshape(d, -1)
-        upper[0] = np.concatenate([[self._windows], upper[1:, 0] + np.tile(self._total, rows)])
-        return np.triu(upper) + np.triu(upper, 1).T
-
-    def factorised(self, runs: Sequence[Array]) -> Array:
-        """Return the triangular factor of [1; window] over all runs by stacked QR decompositions."""
-        n = 1 + self.rows * self.d
-        root, waiting, size = np.zeros((n, n)), [], max(FORMED, 2 * n)
-        for run in runs:
-            for start in range(0, len(run) - self.rows + 1, size):
-                waiting.append(run[start : start + size + self.rows - 1])
-                if sum(map(len, waiting)) >= size:
-                    root, waiting = add_to_root(root, self._formed(waiting)), []
-        return add_to_root(root, self._formed(waiting)) if waiting else root
-
-    def _formed(self, runs: Sequence[Array]) -> Array:
-        parts = [windows_of(self.evaluated(run), self.rows).reshape(len(run) - self.rows + 1, -1) for run in runs]
-        stacked = np.concatenate(parts)
-        return np.concatenate([np.ones((len(stacked), 1)), stacked], axis=1)
+    return None if column is None else statistics.name(int(order[column]))

@@ -18,10 +18,8 @@ from optid.arrays import Array
 from optid.data.reading.chunks import Chunk
 from optid.data.reading.parts import Part
 from optid.models.layout import Layout
-from optid.statistics.blocks import Stretch, blocks_of, check_channels, length_of_stretches, too_short
-from optid.statistics.sums import Total, make_block, stretches
-
-Ends = tuple[Array, Array]
+from optid.statistics.blocks import blocks_of, check_lengths, cut, make_block
+from optid.statistics.sums import Total
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +30,15 @@ class Run:
         total: sums over the rows inside.
         first: experiment in which the run begins.
         last: experiment in which it ends.
-        head: u and y of the first samples of its first experiment, as many as the lags reach back, or all there are.
-        tail: u and y of the last samples of its last experiment likewise.
+        head: the first samples [u | y] of its first experiment, as many as the lags reach back, or all there are.
+        tail: the last samples [u | y] of its last experiment likewise.
     """
 
     total: Total
     first: int
     last: int
-    head: Ends
-    tail: Ends
+    head: Array
+    tail: Array
 
 
 def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int
@@ -57,27 +55,24 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
     Raises:
         RankError: an experiment shorter than the lags.
     """
-    check_channels(stream, layout)
-    for i, count in enumerate(stream.lengths):
-        if count <= layout.first_row:
-            raise too_short(f"experiment {i + 1}: " if len(stream.lengths) > 1 else "", count, layout)
+    check_lengths(stream.lengths, layout)
     return stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, layout, start), threads).total
 
 
 def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
     reach = layout.first_row
-    nothing = np.empty((0, layout.m)), np.empty((0, layout.l))
-    head, tail = nothing, nothing
+    head = tail = np.empty((0, layout.m + layout.l))
 
     def watched() -> Iterable[Sequence[Array]]:
         nonlocal head, tail
         for u, y, _ in chunks:
-            head, tail = _first(head, (u, y), reach), _last(tail, (u, y), reach)
+            head = _first(head, np.hstack([u[:reach], y[:reach]]), reach)
+            tail = _last(tail, np.hstack([_end(u, reach), _end(y, reach)]), reach)
             yield u, y
 
-    total, length = start(), length_of_stretches(layout, chunk)
-    for i, arrays in enumerate(stretches(watched(), reach, length)):
-        for block in blocks_of(Stretch(arrays, f"{part.label}, ", i * length), layout, chunk):
+    total = start()
+    for stretch in cut(watched(), f"{part.label}, ", layout, chunk):
+        for block in blocks_of(stretch, layout, chunk):
             total.add(block)
     return Run(total, part.experiment, part.experiment, head, tail)
 
@@ -90,9 +85,9 @@ def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> 
         total.merge(run.total)
         head, tail = whole.head, run.tail
         if run.first == whole.last:
-            u, y = (np.concatenate(pair) for pair in zip(whole.tail, run.head))
-            if len(u) > reach:
-                total.add(make_block(u, y, None, layout))
+            rows = np.concatenate([whole.tail, run.head])
+            if len(rows) > reach:
+                total.add(make_block(rows[:, : layout.m], rows[:, layout.m :], None, layout))
             if whole.first == whole.last:
                 head = _first(head, run.head, reach)
             if run.first == run.last:
@@ -101,13 +96,13 @@ def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> 
     return whole
 
 
-def _first(before: Ends, behind: Ends, count: int) -> Ends:
-    u, y = (np.concatenate([a, b[:count]])[:count] for a, b in zip(before, behind))
-    return u, y
+def _first(before: Array, behind: Array, count: int) -> Array:
+    return np.concatenate([before, behind])[:count]
 
 
-def _last(before: Ends, behind: Ends, count: int) -> Ends:
-    # copies: a view would keep the whole chunk in memory
-    joints = (np.concatenate([a, b[max(len(b) - count, 0) :]]) for a, b in zip(before, behind))
-    u, y = (joint[max(len(joint) - count, 0) :] for joint in joints)
-    return u, y
+def _last(before: Array, behind: Array, count: int) -> Array:
+    return _end(np.concatenate([before, behind]), count)
+
+
+def _end(samples: Array, count: int) -> Array:
+    return samples[max(len(samples) - count, 0) :]

@@ -96,11 +96,3 @@ def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> Non
             weight, row = scale[k] * values[k, i], unsigned(columns[k, i])
             for j in range(i, unsigned(columns.shape[1])):
                 gram[row, unsigned(columns[k, j])] += weight * values[k, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def local_total(first: Indices, weights: Array, out: Array) -> None:
-    """Add the sum of a local family over time, first (T,) and weights (T, s), to out (functions,)."""
-    for i in range(unsigned(weights.shape[1])):
-        for t in range(unsigned(first.size)):
-            out[unsigned(first[t]) + i] += weights[t, i]

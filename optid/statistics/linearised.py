@@ -12,10 +12,14 @@ from typing import Literal
 import numpy as np
 
 from optid.arrays import Array
-from optid.statistics.factors import add_to_root, conditioning
+from optid.statistics.factors import add_to_root, any_root_of_gram, conditioning
 
 CONDITION_LIMIT = 1e6
 """Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
+
+
+Method = Literal["auto", "gram", "qr"]
+"""Gram matrix, QR decomposition (slower, twice the digits), or "qr" where the condition number asks for it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +84,7 @@ class Linearised:
 
 
 def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
-               gauge: Array | None = None, method: Literal["auto", "gram", "qr"] = "auto") -> Linearised:
+               gauge: Array | None = None, method: Method = "auto") -> Linearised:
     """Compress the errors of all experiments with their sensitivities.
 
     Args:
@@ -90,7 +94,7 @@ def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments
         n: size of an initial state.
         p: number of shared unknowns.
         gauge: (rows, p) directions without effect, which are given weight; None for none.
-        method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
+        method: see `Method`.
     """
     use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
     factors, rows = zip(*(compressed(blocks(i), n + p + 1, use, gauge, n) for i in range(experiments)))
@@ -134,22 +138,9 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
         extra = np.zeros((len(gauge), columns))
         extra[:, span] = gauge * np.where(lengths > 0, lengths, 1.0)[:, None]
         total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
-    return total if method == "qr" else _factor(total), rows
+    return total if method == "qr" else any_root_of_gram(total), rows
 
 
 def eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
     """Split an upper triangular factor of [x0 | shared | errors] into the part of x0 and the rest."""
     return (factor[:n, :n], factor[:n, n:-1], factor[:n, -1]), factor[n:, n:]
-
-
-def _factor(gram: Array) -> Array:
-    """Return F (square) with F^T F = gram, whatever its rank; the columns are scaled to norm one in between."""
-    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    size[size == 0] = 1.0
-    scaled = gram / np.outer(size, size)
-    try:
-        return np.asarray(np.linalg.cholesky(scaled).T * size, dtype=float)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(scaled)
-        root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"), dtype=float)
-        return root * size

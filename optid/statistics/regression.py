@@ -14,12 +14,12 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
-from optid.data.workers import available_threads, mapped
+from optid.data.reduction import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
-from optid.statistics.blocks import CHUNK, NO_WEIGHTS, Stretch, blocks_of, check_channels, cut
+from optid.statistics.blocks import CHUNK, Frame, Stretch, blocks_of, check_channels, cut, records, stretches, used_rows
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
-from optid.statistics.sums import Factor, Sums, Total, rows_present, stretches
+from optid.statistics.sums import Factor, Sums, Total
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -31,7 +31,7 @@ CONDITION_LIMIT = 1e7
 LEAST_REMAINDER = 1e-6
 """Share of an output that least squares leaves, below which its difference of sums has too few digits left."""
 
-RETAINED = 1 << 23
+RETAINED = 1 << 24
 """Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
 long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
 
@@ -181,12 +181,8 @@ def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] |
     This is for parts of a record that are to be added; arguments and errors as `collect`.
     """
     threads = available_threads(threads)
-    sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout))
-    complete = sums.complete()
-    if sums.cancelled(complete):
-        sums = _total(data, layout, weights, chunk, threads, partial(Sums, layout, direct=True))
-        complete = sums.complete()
-    gram = layout.contrasted(layout.contrasted(complete).T)
+    sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout)))
+    gram = layout.contrasted(layout.contrasted(sums.complete()).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 
@@ -196,7 +192,7 @@ def factorise(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | 
 
     Arguments and errors as `collect`, without its checks of rank.
     """
-    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout))
+    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout.n_columns + layout.l, layout.contrasted))
     return Statistics(layout, total.root.T @ total.root, total.rows, total.candidates, total.root)
 
 
@@ -236,7 +232,7 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) 
                 at = slice(reach - lag, reach - lag + count)
                 for i, weight in enumerate(values[at].T):
                     error -= weight[:, None] * column[first[at] + i]
-        error[~rows_present(part_u, part_y, layout)] = np.nan
+        error[~used_rows(part_u, part_y, layout)] = np.nan
         result[start : start + count] = error
         start += count
     return result
@@ -247,11 +243,12 @@ def _total(
 ) -> Any:
     """Return the sums over all rows of a record; `start` returns empty ones."""
     np.empty(RETAINED, dtype=np.uint8)  # freed at once
+    check_channels(data, layout)
+    if weights is not None and not hasattr(data, "experiments"):
+        raise DataError("weights are for records in memory; a stream has none.")
     if getattr(data, "parts", ()):
         from optid.statistics.joining import total_of_parts
 
-        if weights is not None:
-            raise DataError(NO_WEIGHTS)
         return total_of_parts(data, layout, start, chunk, threads)
 
     def sum_part(part: Stretch) -> Total:
@@ -261,7 +258,8 @@ def _total(
         return sums
 
     total = start()
-    for sums in mapped(sum_part, cut(data, layout, weights, chunk), threads):
+    parts = (part for name, chunks in records(data, layout, weights) for part in cut(chunks, name, layout, chunk))
+    for sums in mapped(sum_part, parts, threads):
         total.merge(sums)
     return total
 

@@ -104,7 +104,7 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
         l21, l31 = l21 @ weight, l31 @ weight
     residual = triangle[order.size - y.size :, of_y]
     scaled = l21 / size[:, None]
-    discarded, condition = 0, _condition(scaled)
+    discarded, condition = 0, float(np.linalg.cond(scaled))
     if tolerance is None:
         if not condition < 1 / TINY:
             lost = dependent_signal(statistics, phi)
@@ -121,8 +121,3 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
         gain = (l31 @ right[:kept].T / values[:kept]) @ left[:, :kept].T
     return RQ(r22, residual.T, gain / size, condition, statistics.windows, discarded, triangle[: z.size, : z.size],
               (l21, l31))
-
-
-def _condition(matrix: Array) -> float:
-    values = np.linalg.svd(matrix, compute_uv=False)
-    return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")

@@ -18,8 +18,7 @@ zero; otherwise the initial state of the plant is unknown, and the noise starts 
 """
 
 from collections.abc import Iterator, Sequence
-from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,7 +26,8 @@ from optid.arrays import Array
 from optid.models import noise_filter
 from optid.models.layout import Layout
 from optid.models.noise_filter import DEAD, PRESENT, Filtered
-from optid.statistics.linearised import Linearised, compressed, eliminated, linearised
+from optid.models.recursions import late_njit
+from optid.statistics.linearised import Linearised, Method, compressed, eliminated, linearised
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, .
 
 
 def linearise(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, *, gauge: Array | None = None,
-              method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK,
+              method: Method = "auto", chunk: int = CHUNK,
               functions: Sequence[Array] | None = None) -> Linearised:
     """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
 
@@ -69,7 +69,7 @@ def linearise(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, *,
         point: where; C must be invertible, and A stable where D is not A.
         gauge: (rows, p) directions of the shared unknowns that change no prediction (the scale between mu and b).
             They are given weight in the factor, so that it is not singular; at the point they contribute nothing.
-        method: "gram", "qr" (slower, twice the digits), or "auto": "qr" where the condition number asks for it.
+        method: see `optid.statistics.linearised.Method`.
         chunk: samples at a time.
         functions: what `expanded` returned for the record.
     """
@@ -126,12 +126,13 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
     """
     e, layout, at, n = data.experiments[index], unknowns.layout, unknowns.slices, unknowns.memory
     y, na, extra = e.y[:, 0], layout.na, layout.na if measured else 0
-    noise, x, explained = None, np.zeros(0), np.zeros(0)
+    noise, x, innovations, explained = None, np.zeros(0), np.zeros(0), np.zeros(0)
+    depth = max(unknowns.nc, len(point.d))
     if not unknowns.plain:
         x = _simulated(data, unknowns, point, index, functions, chunk)
         noise = predict(data, unknowns, point, index, x)
-        explained = np.nan_to_num(noise.filled)
-    depth = max(unknowns.nc, len(point.d))
+        innovations, explained = (np.pad(signal, (depth, 0)) for signal in (noise.innovations, noise.filled))
+        explained = np.nan_to_num(explained)
     history, kinds = np.zeros((depth, n + unknowns.shared + 1)), np.full(depth, DEAD, dtype=np.int8)
     head, run = n, _Run(unknowns, point, index, whitened=True)
     past = np.zeros((na + len(run.d), 1 + measured))  # outputs of the plant and measured ones through 1 / A
@@ -161,7 +162,7 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
                     rows[:, head + unknowns.shared + i - 1] = -lines[na - i : na - i + count, 1]
         elif noise is not None:
             for i in range(1, na + 1):
-                rows[:, head + i - 1] = -_delayed(explained, part, i)
+                rows[:, head + i - 1] = -explained[depth + start - i :][:count]
         for c, lags in enumerate(layout.lags):
             if unknowns.free[c]:
                 rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
@@ -173,12 +174,12 @@ def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index
             rows[:, -1] = output - y[part]
             present = np.isfinite(y[part])
         else:
-            for name, signal, sign in (("c", noise.innovations, 1.0), ("d", explained, -1.0)):
+            for name, signal, sign in (("c", innovations, 1.0), ("d", explained, -1.0)):
                 for i in range(at[name].stop - at[name].start):
-                    rows[:, head + at[name].start + i] = sign * _delayed(signal, part, i + 1)
+                    rows[:, head + at[name].start + i] = sign * signal[depth + start - i - 1 :][:count]
             rows[:, -1] = -noise.innovations[part]
             state = np.concatenate([kinds, noise.state[part]])
-            _kernels()[1](block, state, np.ascontiguousarray(point.c), np.ascontiguousarray(point.d), depth)
+            late_njit(_mixed)(block, state, np.ascontiguousarray(point.c), np.ascontiguousarray(point.d), depth)
             history, kinds, present = block[count:].copy(), state[count:], state[depth:] == PRESENT
         rows[~present] = 0.0
         yield rows, int(np.count_nonzero(present))
@@ -254,13 +255,6 @@ def _simulated(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, i
     return np.concatenate(found)
 
 
-def _delayed(signal: Array, part: slice, lag: int) -> Array:
-    first = part.start - lag
-    if first >= 0:
-        return signal[first : part.stop - lag]
-    return np.concatenate([np.zeros(min(-first, part.stop - part.start)), signal[: max(part.stop - lag, 0)]])
-
-
 def through(d: Array, table: Array) -> Array:
     """Return the columns of a table (nd + T, K) through D (T, K): its first rows are history."""
     total = table[len(d) :]
@@ -278,7 +272,7 @@ def all_pole(a: Array, table: Array, first: int) -> None:
         first: rows of history.
     """
     if len(a):
-        _kernels()[0](np.ascontiguousarray(a), table, first)
+        late_njit(_march)(np.ascontiguousarray(a), table, first)
 
 
 def _march(a: Array, table: Array, first: int) -> None:
@@ -305,10 +299,3 @@ def _mixed(table: Array, state: Any, c: Array, d: Array, first: int) -> None:
             if weight != 0.0:
                 for j in range(table.shape[1] - 1):
                     table[k, j] -= weight * table[k - 1 - i, j]
-
-
-@cache
-def _kernels() -> tuple[Any, Any]:
-    from numba import njit
-
-    return njit(cache=True, nogil=True)(_march), njit(cache=True, nogil=True)(_mixed)

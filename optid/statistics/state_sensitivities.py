@@ -14,7 +14,7 @@ from optid.errors import DataError
 from optid.models import state_simulation as simulation
 from optid.models.state_signals import Signals, Stretch
 from optid.models.state_space import StateSpace
-from optid.statistics.linearised import Linearised, linearised
+from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ NUMBERS = 500_000
 
 
 def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any,
-                     gauge: Array | None = None, *, limits: Any = None, chunk: int = 0, method: str = "auto"
+                     gauge: Array | None = None, *, limits: Any = None, chunk: int = 0, method: Method = "auto"
                      ) -> Linearised:
     """Run a model over all experiments and compress its errors (model less record) with their sensitivities.
 
@@ -42,7 +42,7 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
         gauge: (rows, shared) directions that change no output; they get weight in the factor, not in the errors.
         limits: range that the outputs of every experiment must not leave, from `allowed_range`; None for none.
         chunk: samples at a time; chosen by their size where 0.
-        method: of compression, see `optid.statistics.linearised.linearised`.
+        method: see `optid.statistics.linearised.Method`.
 
     Returns:
         The errors near x; of infinite value where a run leaves the range allowed.

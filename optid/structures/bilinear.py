@@ -1,20 +1,18 @@
-"""Local solution of rank-one least squares: Newton's method on the manifold, and alternating least squares.
+"""Local solution of rank-one least squares by Newton's method on the manifold, from several starts.
 
-The method is Newton's with Levenberg damping in one factor, the other one eliminated, in Kronecker-whitened
-coordinates, from several starts. :func:`alternate` is the classical alternating least squares (Bai, Automatica 34,
-1998), an independent method for comparison.
+Newton's method with Levenberg damping acts in one factor, the other one eliminated, in Kronecker-whitened coordinates.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
+from scipy.linalg import get_lapack_funcs
 
-from optid.structures.rank_one import Array, Core, Point, RankOne, block_slices, matrices, reduce
+from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
+from optid.structures.whitening import block_slices
 
-(_posv,) = get_lapack_funcs(("posv",), dtype=float)
+_posv, _trtrs = get_lapack_funcs(("posv", "trtrs"), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +87,8 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
         point = core.point([], [])
         return LocalSolution(point, core.problem.value(point.lift()), 0, 0.0, True)
     target, root = core.target, core.root
-    pieces, start = [], 0
-    for p, nb in core.shapes:  # (nb, k, P) contiguous, so that both half-Jacobians are plain products
-        part = root[:, start:start + p * nb].reshape(-1, nb, p)
-        pieces.append(np.ascontiguousarray(part.transpose(1, 0, 2)))
-        start += p * nb
+    pieces = [np.ascontiguousarray(root[:, where].reshape(-1, nb, p).transpose(1, 0, 2))  # (nb, k, P) contiguous, so
+              for where, (p, nb) in zip(block_slices(core.shapes), core.shapes)]  # both half-Jacobians are products
     reference = max(float(np.linalg.norm(root.T @ target)), np.finfo(float).tiny)
     noise = 1e-30 * float(target @ target)
     if alternations:
@@ -158,7 +153,7 @@ class _Projected:
         if not np.min(diagonal) > 1e-13 * np.max(diagonal):  # an input without effect, or two that are one
             mus = np.linalg.lstsq(design, target, rcond=1e-13)[0]
         else:
-            mus = solve_triangular(triangle, basis.T @ target)
+            mus = _trtrs(triangle, basis.T @ target)[0]
         split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
         return cls(pieces, units, split, basis, triangle, design @ mus - target)
 
@@ -179,24 +174,26 @@ class _Projected:
 
     def curvature(self, root: Array, shapes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
         """Gradient and Hessian of half the value in the b_i, definite along each b_i, which changes nothing."""
-        regressors, forces, gauges = [], [], []
+        regressors, row, column = [], 0, 0
+        forces = np.zeros((len(self.triangle), sum(b.size for b in self.bs)))
         gradients = matrices(root.T @ self.residual, tuple(shapes))
         for piece, mu, b, size, gradient in zip(self.pieces, self.mus, self.bs, self.sizes, gradients):
             scale = 1.0 / size if size > 0 else 0.0
             regressors.append((piece @ (scale * mu)).T)
-            forces.append(scale * gradient)
-            gauges.append(np.outer(b, b))
+            forces[row : row + mu.size, column : column + b.size] = scale * gradient
+            row, column = row + mu.size, column + b.size
         across = np.concatenate(regressors, axis=1)
         diagonal = np.abs(np.diag(self.triangle))
         usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
         mixed = self.basis.T @ across
         if usable:
-            forced: Any = solve_triangular(self.triangle, block_diag(*forces), trans=1)
-            mixed = mixed + forced
+            mixed = mixed + _trtrs(self.triangle, forces, trans=1)[0]
         hessian = across.T @ across - mixed.T @ mixed
-        weight = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny)
-        gauge: Any = block_diag(*gauges)
-        return across.T @ self.residual, hessian + weight * gauge
+        weight, column = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny), 0
+        for b in self.bs:
+            hessian[column : column + b.size, column : column + b.size] += weight * np.outer(b, b)
+            column += b.size
+        return across.T @ self.residual, hessian
 
 
 def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
@@ -254,41 +251,3 @@ def best_of(core: Core, count: int = 8, seed: int = 0, tolerance: float = 1e-12,
     found = [descend(core, mus, bs, tolerance, iterations, alternations=0 if k < 2 else 2)
              for k, (mus, bs) in enumerate(starts(core, count, seed)) if k >= first]
     return min(found, key=lambda solution: solution.value)
-
-
-def alternate(problem: RankOne, start: Point, *, tolerance: float = 1e-12, sweeps: int = 5000) -> LocalSolution:
-    """Alternating least squares on the original root: all mu_i and w for fixed b_i, then all b_i and w.
-
-    Independent of the whitening and of Newton's method; converges linearly.
-
-    Args:
-        problem: the least-squares problem.
-        start: starting factors.
-        tolerance: on the relative decrease of the objective in one sweep.
-        sweeps: at most.
-    """
-    w, mus, bs = start.w, list(start.mus), list(start.bs)
-    pieces = [problem.root[:, columns].reshape(-1, nb, p)
-              for columns, (p, nb) in zip(block_slices(problem), problem.blocks)]
-    head = problem.root[:, :problem.linear]
-    value, done, sweep = np.inf, False, 0
-    while not done and sweep < sweeps:
-        designs = [np.einsum("njp,j->np", piece, b) for piece, b in zip(pieces, bs)]
-        _, *mus = _split_solution(head, designs, problem.target)
-        designs = [piece @ mu for piece, mu in zip(pieces, mus)]
-        w, *bs = _split_solution(head, designs, problem.target)
-        point = Point(w, tuple(mus), tuple(bs)).normalised()
-        mus, bs = list(point.mus), list(point.bs)
-        new = problem.value(point.lift())
-        done = value - new <= tolerance * max(new, 1e-16 * problem.scale)
-        value, sweep = new, sweep + 1
-    core = reduce(problem)
-    _, white_mus, white_bs = core.factors(point)
-    gradient = descend(core, white_mus, white_bs, iterations=0).gradient
-    return LocalSolution(point, value, sweep, gradient, done)
-
-
-def _split_solution(head: Array, designs: Sequence[Array], target: Array) -> list[Array]:
-    whole = np.concatenate([head, *designs], axis=1)
-    solution = np.linalg.lstsq(whole, target, rcond=None)[0]
-    return np.split(solution, np.cumsum([head.shape[1], *(d.shape[1] for d in designs)])[:-1])

@@ -1,12 +1,14 @@
 """Least squares behind a programme, with and without products of its variables."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.program.structure import Structure, relative_gradient, variable_size
-from optid.structures.rank_one import RankOne
+from optid.structures.rank_one import Point, RankOne
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,25 +29,26 @@ class LeastSquaresStructure(Structure):
     linear: tuple[str, ...]
     blocks: tuple[tuple[str, str], ...] = ()
 
+    def flat(self, values: Mapping[str, Any]) -> Array:
+        """Return the linear variables among named values as they follow one another in z."""
+        return np.concatenate([*(np.ravel(values[name], order="F") for name in self.linear), np.zeros(0)])
+
     def measure(self, program: Any) -> tuple[float, float]:
         """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
         problem = self.problem
         flat = {name: np.ravel(v.value, order="F") for name, v in program.variables.items()}
         pairs = [(flat[mu], flat[b]) for mu, b in self.blocks]
-        z = np.concatenate([*(flat[name] for name in self.linear), *(np.kron(b, mu) for mu, b in pairs), np.zeros(0)])
+        products = (np.outer(b, mu).ravel() for mu, b in pairs)
+        z = np.concatenate([*(flat[name] for name in self.linear), *products, np.zeros(0)])
         r = problem.root @ z - problem.target
         value = float(r @ r) + problem.remainder
         pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
-        parts, position = [], 0
-        for name in self.linear:
-            span = slice(position, position + flat[name].size)
-            parts.append((name, pull[span], effort[span]))
-            position = span.stop
-        for (mu_name, b_name), (mu, b) in zip(self.blocks, pairs):
-            span = slice(position, position + mu.size * b.size)
-            block, terms = (part[span].reshape(b.size, mu.size) for part in (pull, effort))
+        sizes = [*(flat[name].size for name in self.linear), *(mu.size * b.size for mu, b in pairs)]
+        pulls, efforts = (np.split(part, np.cumsum(sizes)[:-1]) for part in (pull, effort))
+        parts, count = list(zip(self.linear, pulls, efforts)), len(self.linear)
+        for (mu_name, b_name), (mu, b), *both in zip(self.blocks, pairs, pulls[count:], efforts[count:]):
+            block, terms = (part.reshape(b.size, mu.size) for part in both)
             parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
-            position = span.stop
         yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
         for name, gradient, terms in parts:
             size = variable_size(flat[name], usual.get(program.variables[name].id))
@@ -69,6 +72,19 @@ class RankOneStructure(LeastSquaresStructure):
     def about(self) -> str:
         """What the programme is and how large."""
         return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
+
+    def point(self, values: Mapping[str, Any]) -> Point:
+        """Read a point from named values."""
+        return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
+                     tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
+
+    def named(self, point: Point, variables: Mapping[str, Any]) -> dict[str, Array]:
+        """Name the parts of a point, in the shapes of the variables."""
+        parts = np.split(point.w, np.cumsum([variables[name].size for name in self.linear])[:-1])
+        found = dict(zip(self.linear, parts))
+        for (mu, b), *pair in zip(self.blocks, point.mus, point.bs):
+            found |= zip((mu, b), pair)
+        return {name: np.reshape(part, variables[name].shape, order="F") for name, part in found.items()}
 
 
 def rank_one_of(program: Any) -> RankOneStructure | None:

@@ -44,14 +44,27 @@ class Predictor:
 
     @property
     def size(self) -> int:
-        """Number of coefficients for one output."""
+        """Number of coefficients for one output: those of `places`, then the constants."""
         return len(self.places) + self.constant * len(self.windows)
 
     @cached_property
     def stacked(self) -> Array:
-        """(alpha d, j)."""
+        """(alpha d + 1, j) the signals, and a row of ones for the constants."""
         alpha, d, j = self.windows.shape
-        return self.windows.reshape(alpha * d, j)
+        return np.vstack([self.windows.reshape(alpha * d, j), np.ones(j)])
+
+    @cached_property
+    def entries(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For every block row the rows of `stacked` that enter it, and the coefficients they are multiplied by."""
+        alpha, d, _ = self.windows.shape
+        k, c = self.places.T
+        found = []
+        for i in range(alpha):
+            inside = np.flatnonzero(k <= i)
+            rows = (i - k[inside]) * d + c[inside]
+            found.append((np.append(rows, alpha * d), np.append(inside, len(k) + i)) if self.constant
+                         else (rows, inside))
+        return found
 
     @cached_property
     def inverse(self) -> Array:
@@ -63,66 +76,35 @@ class Predictor:
     @cached_property
     def gram(self) -> Array:
         """(size, size) inner products of the matrices the coefficients multiply."""
-        alpha, d, j = self.windows.shape
-        products = (self.stacked @ self.stacked.T).reshape(alpha, d, alpha, d)
-        sums = self.stacked.sum(axis=1).reshape(alpha, d)
-        table = np.zeros((alpha, d, alpha, d))  # by (lag, signal, lag, signal)
-        for k in range(alpha):
-            for kk in range(alpha):
-                i = np.arange(max(k, kk), alpha)
-                table[k, :, kk, :] = products[i - k, :, i - kk, :].sum(axis=0)
-        k, c = self.places.T
-        whole = np.zeros((self.size, self.size))
-        n = len(self.places)
-        whole[:n, :n] = table[k[:, None], c[:, None], k[None], c[None]]
-        if self.constant:
-            for i in range(alpha):
-                inside = k <= i
-                whole[:n, n + i][inside] = sums[i - k[inside], c[inside]]
-            whole[n:, :n] = whole[:n, n:].T
-            whole[n:, n:] = j * np.eye(alpha)
+        products, whole = self.stacked @ self.stacked.T, np.zeros((self.size, self.size))
+        for rows, inside in self.entries:
+            whole[np.ix_(inside, inside)] += products[np.ix_(rows, rows)]
         return whole
 
     def toeplitz(self, theta: Array) -> Array:
-        """Return T (alpha l, alpha d) of coefficients theta (size, l), without the constants."""
-        alpha, d, _ = self.windows.shape
-        blocks = np.zeros((alpha, theta.shape[1], d))
-        blocks[self.places[:, 0], :, self.places[:, 1]] = theta[: len(self.places)]
-        whole = np.zeros((alpha, theta.shape[1], alpha, d))
-        for k in range(alpha):
-            i = np.arange(k, alpha)
-            whole[i, :, i - k, :] = blocks[k]
-        return whole.reshape(alpha * theta.shape[1], alpha * d)
+        """Return T (alpha l, alpha d + 1) of coefficients theta (size, l), the constants in the last column."""
+        whole = np.zeros((len(self.windows), theta.shape[1], len(self.stacked)))
+        for block, (rows, inside) in zip(whole, self.entries):
+            block[:, rows] = theta[inside].T
+        return whole.reshape(-1, len(self.stacked))
 
     def apply(self, theta: Array) -> Array:
         """Return ``T(theta) Phi`` plus constants, (alpha l, j)."""
-        found = self.toeplitz(theta) @ self.stacked
-        if self.constant:
-            found += theta[len(self.places) :].reshape(-1)[:, None]
-        return found
+        return self.toeplitz(theta) @ self.stacked
 
     def adjoint(self, z: Array, outputs: int) -> Array:
         """Return (size, l): inner products of z with the matrices the coefficients multiply."""
-        alpha, d, _ = self.windows.shape
-        products = (z @ self.stacked.T).reshape(alpha, outputs, alpha, d)
-        lags = np.array([np.einsum("iocd->ocd", products[np.arange(k, alpha), :, np.arange(alpha - k), :][:, :, None])
-                         [:, 0] for k in range(alpha)])
-        found = lags[self.places[:, 0], :, self.places[:, 1]]
-        if self.constant:
-            found = np.vstack([found, z.sum(axis=1).reshape(alpha, outputs)])
+        products = (z @ self.stacked.T).reshape(len(self.windows), outputs, -1)
+        found = np.zeros((self.size, outputs))
+        for block, (rows, inside) in zip(products, self.entries):
+            found[inside] += block[:, rows].T
         return found
 
     def coupling(self, starts: np.ndarray, samples: int) -> Array:
         """Return (samples, size): adjoint of the Hankel operator of one output on every coefficient's matrix."""
-        alpha = len(self.windows)
         found = np.zeros((samples, self.size))
-        n = len(self.places)
-        for i in range(alpha):
-            inside = np.flatnonzero(self.places[:, 0] <= i)
-            k, c = self.places[inside].T
-            found[np.ix_(starts + i, inside)] += self.windows[i - k, c, :].T
-            if self.constant:
-                found[starts + i, n + i] += 1.0
+        for i, (rows, inside) in enumerate(self.entries):
+            found[np.ix_(starts + i, inside)] += self.stacked[rows].T
         return found
 
 
@@ -353,13 +335,11 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
         rows: samples of a window.
         usable: (N,) per experiment.
     """
-    found, offset = [], 0
-    for length, good in zip(lengths, usable):
-        if length >= rows:
-            whole = np.lib.stride_tricks.sliding_window_view(good, rows).all(axis=1)
-            found.append(offset + np.flatnonzero(whole))
-        offset += length
-    return np.concatenate(found) if found else np.zeros(0, dtype=int)
+    if sum(lengths) < rows:
+        return np.zeros(0, dtype=int)
+    whole = np.lib.stride_tricks.sliding_window_view(np.concatenate(usable), rows).all(axis=1)
+    experiment = np.repeat(np.arange(len(lengths)), lengths)
+    return np.flatnonzero(whole & (experiment[: whole.size] == experiment[rows - 1 :]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from scipy.linalg import get_lapack_funcs
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
-from optid.structures.whitening import Whitening, whiten
+from optid.structures.whitening import Whitening, block_slices, whiten
 
 (_trtrs,) = get_lapack_funcs(("trtrs",), dtype=float)
 
@@ -55,20 +55,10 @@ class RankOne:
         if np.isnan(self.scale):
             object.__setattr__(self, "scale", float(self.target @ self.target) + self.remainder)
 
-    @property
-    def H(self) -> Array:  # noqa: N802 - the letter of the quadratic form
-        """Gram matrix R^T R (n, n)."""
-        return self.root.T @ self.root
-
-    @property
-    def g(self) -> Array:
-        """R^T s (n,)."""
-        return self.root.T @ self.target
-
-    @property
-    def c(self) -> float:
-        """Objective at z = 0."""
-        return float(self.target @ self.target) + self.remainder
+    @cached_property
+    def slices(self) -> list[slice]:
+        """Columns of every block in the lifted vector."""
+        return block_slices(self.blocks, self.linear)
 
     @cached_property
     def core(self) -> "Core":
@@ -79,10 +69,6 @@ class RankOne:
         """Objective at the lifted vector z (n,)."""
         residual = self.root @ z - self.target
         return float(residual @ residual) + self.remainder
-
-    def gap(self, value: float, bound: float) -> float:
-        """Relative gap (F - D) / max(F, 1e-9 Y^T Y)."""
-        return max(value - bound, 0.0) / max(value, 1e-9 * self.scale, np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +81,7 @@ class Point:
 
     def lift(self) -> Array:
         """Return z = [w; kron(b_1, mu_1); ...]."""
-        return np.concatenate([self.w, *(np.kron(b, mu) for mu, b in zip(self.mus, self.bs))])
+        return np.concatenate([self.w, *(np.outer(b, mu).ravel() for mu, b in zip(self.mus, self.bs))])
 
     def normalised(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""
@@ -178,13 +164,13 @@ class Core:
         """Back substitution: the best point of the problem for these whitened factors (and w, where it is kept)."""
         mus, bs = self.whitening.back(mus, bs)
         kept_w = _solve_upper(self.whitening.factor_w, w) if w is not None else np.empty(0)
-        core = np.concatenate([kept_w, *(np.kron(b, mu) for mu, b in zip(mus, bs))])
+        core = np.concatenate([kept_w, *(np.outer(b, mu).ravel() for mu, b in zip(mus, bs))])
         k = self.eliminated
         z = np.empty(len(self.order))
         z[self.order[k:]] = core
         z[self.order[:k]] = _solve_upper(self.triangle[:k, :k], self.rotated[:k] - self.triangle[:k, k:] @ core)
         all_mus, all_bs = [], []
-        for i, (columns, (_, nb)) in enumerate(zip(block_slices(self.problem), self.problem.blocks)):
+        for i, (columns, (_, nb)) in enumerate(zip(self.problem.slices, self.problem.blocks)):
             if i in self.kept:
                 mu, b = mus[self.kept.index(i)], bs[self.kept.index(i)]
             else:
@@ -192,12 +178,6 @@ class Core:
             all_mus.append(mu)
             all_bs.append(b)
         return Point(z[:self.problem.linear], tuple(all_mus), tuple(all_bs)).normalised()
-
-
-def block_slices(problem: RankOne) -> list[slice]:
-    """Columns of every block in the lifted vector."""
-    edges = problem.linear + np.cumsum([0, *(p * nb for p, nb in problem.blocks)])
-    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:])]
 
 
 def _solve_upper(triangle: Array, right: Array) -> Array:
@@ -224,7 +204,7 @@ def reduce(problem: RankOne, keep: tuple[int, ...] = (), keep_linear: bool = Fal
 
 
 def _reduced(problem: RankOne, keep: tuple[int, ...], keep_linear: bool) -> Core:
-    slices = block_slices(problem)
+    slices = problem.slices
     kept = tuple(i for i, shape in enumerate(problem.blocks) if min(shape) > 1 or i in keep)
     chunks = [slices[i] for i in range(len(slices)) if i not in kept]
     w = slice(0, problem.linear)
@@ -244,5 +224,4 @@ def _reduced(problem: RankOne, keep: tuple[int, ...], keep_linear: bool) -> Core
 
 def matrices(theta: Array, shapes: tuple[tuple[int, int], ...]) -> list[Array]:
     """Split a vector into its matrices (P_i, nb_i)."""
-    edges = np.cumsum([p * nb for p, nb in shapes])[:-1]
-    return [part.reshape(nb, p).T for part, (p, nb) in zip(np.split(theta, edges), shapes)]
+    return [theta[where].reshape(nb, p).T for where, (p, nb) in zip(block_slices(shapes), shapes)]

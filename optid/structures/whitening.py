@@ -5,6 +5,7 @@ singular value decomposition in the coordinates ``L_mu^T Theta L_b`` (G = L L^T)
 Kronecker product still makes starts, Newton steps and proofs of optimality well conditioned, and it keeps rank one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +66,12 @@ def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array
     return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
 
 
+def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slice]:
+    """Columns of every block in a lifted vector whose first block begins at a column."""
+    edges = first + np.cumsum([0, *(p * nb for p, nb in shapes)])
+    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
+
+
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``.
@@ -89,30 +96,17 @@ class Whitening:
     def columns(self, rows: Array) -> Array:
         """Return ``rows @ K^-1``: linear forms in the old unknowns (k, n) written in the new ones."""
         new = np.empty((len(rows), rows.shape[1]))
-        start = self.linear
-        new[:, :start] = rows[:, :start] @ invert_triangular(self.factor_w, lower=False) if start else 0.0
-        for (p, nb), factor_mu, factor_b in zip(self.shapes, self.factors_mu, self.factors_b):
-            stop = start + p * nb
-            block = rows[:, start:stop].reshape(-1, p) @ invert_triangular(factor_mu).T
-            new[:, start:stop] = np.matmul(invert_triangular(factor_b), block.reshape(-1, nb, p)).reshape(-1, p * nb)
-            start = stop
+        w = self.linear
+        new[:, :w] = rows[:, :w] @ invert_triangular(self.factor_w, lower=False) if w else 0.0
+        for where, (p, nb), factor_mu, factor_b in zip(
+                block_slices(self.shapes, w), self.shapes, self.factors_mu, self.factors_b):
+            block = rows[:, where].reshape(-1, p) @ invert_triangular(factor_mu).T
+            new[:, where] = np.matmul(invert_triangular(factor_b), block.reshape(-1, nb, p)).reshape(-1, p * nb)
         return new
 
     def cone(self, block: int, rows: Array) -> Array:
         """Rows (r, P) that act on mu of a block, written for the new coordinates."""
         return rows @ invert_triangular(self.factors_mu[block]).T
-
-    def matrix(self) -> Array:
-        """The (n, n) matrix K of the change of coordinates ``z' = K z``."""
-        size = self.linear + sum(p * nb for p, nb in self.shapes)
-        whole = np.zeros((size, size))
-        start = self.linear
-        whole[:start, :start] = self.factor_w
-        for (p, nb), factor_mu, factor_b in zip(self.shapes, self.factors_mu, self.factors_b):
-            stop = start + p * nb
-            whole[start:stop, start:stop] = np.kron(factor_b.T, factor_mu.T)
-            start = stop
-        return whole
 
     def forward(self, mus: tuple[Array, ...], bs: tuple[Array, ...]) -> tuple[list[Array], list[Array]]:
         """Factors (mu_i, b_i) in the new coordinates."""
@@ -133,12 +127,6 @@ def whiten(root: Array, shapes: tuple[tuple[int, int], ...], linear: int = 0) ->
         shapes: (P_i, nb_i) of every block, in the order of the columns.
         linear: number of leading columns outside the blocks.
     """
-    factors_mu, factors_b = [], []
-    start = linear
-    for p, nb in shapes:
-        part = root[:, start:start + p * nb]
-        factor_mu, factor_b = kronecker_factors(part.T @ part, (p, nb))
-        factors_mu.append(factor_mu)
-        factors_b.append(factor_b)
-        start += p * nb
-    return Whitening(shapes, tuple(factors_mu), tuple(factors_b), root[:linear, :linear].copy())
+    parts = [root[:, where] for where in block_slices(shapes, linear)]
+    pairs = [kronecker_factors(part.T @ part, shape) for part, shape in zip(parts, shapes)]
+    return Whitening(shapes, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), root[:linear, :linear].copy())

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.arrays import check_integer
 from optid.errors import StructureError, nearest
 from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
 from optid.faults.nuisance import uncertain_start
@@ -50,8 +51,7 @@ class Question:
                 raise StructureError(f"{word}={value!r}; a probability between 0 and 1 is needed.")
         if self.method not in METHODS:
             raise StructureError(f"method={self.method!r}. {nearest(str(self.method), METHODS)}")
-        if self.max_faults != int(self.max_faults) or self.max_faults < 1:
-            raise StructureError(f"max_faults={self.max_faults!r}; a whole number from 1 is needed.")
+        check_integer(self.max_faults, "max_faults")
         if self.method == "exact" and self.max_faults > 2:
             raise StructureError(
                 f"max_faults={self.max_faults}: the exact search covers one or two faults; the number of triples is "

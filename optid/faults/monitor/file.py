@@ -11,8 +11,7 @@ from optid.faults.monitor.arl import Calibration
 from optid.faults.monitor.tables import blank
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
-from optid.models.files import from_content
-from optid.models.state_file import read_state, write_state
+from optid.models.files import from_content, read_state, write_state
 
 if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor

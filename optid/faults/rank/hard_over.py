@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults.rank.order_power import Positions, coefficients, least_order
@@ -253,8 +253,7 @@ def hard_over_test(
     """
     if instruments not in INSTRUMENTS:
         raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
-    if isinstance(block_rows, bool) or not isinstance(block_rows, int | np.integer) or block_rows < 2:
-        raise StructureError(f"block_rows={block_rows!r}: a whole number from 2 is needed.")
+    check_integer(block_rows, "block_rows", 2)
     if not 0 < level < 1:
         raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
     data, healthy = data.raw(), healthy.raw()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, StructureError
 
 if TYPE_CHECKING:
@@ -65,9 +65,8 @@ class Controller:
             raise StructureError(f"route={route!r}: use 'qp' or 'nlp'.")
         if route == "qp" and allocation.problem is None:
             raise StructureError("The plant is not linear in f(u): use route='nlp'.")
-        if horizon < 1 or horizon != int(horizon):
-            raise StructureError(f"horizon={horizon!r}: a whole number from 1 is needed.")
-        self.allocation, self.horizon, self.effort, self.route = allocation, int(horizon), float(effort), route
+        self.horizon = check_integer(horizon, "horizon")
+        self.allocation, self.effort, self.route = allocation, float(effort), route
         m = allocation.model.m
         self.rates = None if rates is None else np.broadcast_to(np.asarray(rates, dtype=float), (m,)).copy()
         if self.rates is not None and not np.all(self.rates > 0):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
@@ -212,8 +212,7 @@ def _check_words(stage: str, nodes: int, if_ambiguous: str) -> None:
                                ("if_ambiguous", if_ambiguous, ("auto", "wait", "probe", "robust"))):
         if given not in known:
             raise StructureError(f"{word}={given!r}: use one of {', '.join(map(repr, known))}.")
-    if isinstance(nodes, bool) or nodes != int(nodes) or nodes < 3:
-        raise StructureError(f"nodes={nodes!r}: a whole number from 3 is needed.")
+    check_integer(nodes, "nodes", 3)
 
 
 def _member(model: "HammersteinSS", damage: Damage, data: Data | None, how: dict[str, Any], bounds: dict[str, Any]

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import channel_of
-from optid.models.experiments import in_units_of, one_or_all
+from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.search.calibration import EXCEEDING, Thresholds, simulated, thresholds
 from optid.faults.search.sweeps import sweep
@@ -90,8 +90,7 @@ def sliding_scan(
         raise StructureError(
             "The uncertainty of the model has been taken out of the record as a whole: whiten it without uncertainty."
         )
-    if hop < 1:
-        raise StructureError(f"hop={hop}: a whole number from 1 is needed.")
+    check_integer(hop, "hop")
     count = len(whitened.r)
     if count < window:
         raise DataError(f"The record has {count} samples: a window of {window} does not fit.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
 from optid.faults.search.sweeps import inverse_roots
 from optid.faults.signatures import Dictionary
@@ -89,8 +89,7 @@ def state_jumps(
         raise DataError(f"The window has {l} outputs; the dictionary is of {found.model.l}.")
     if whitened.nuisance is not None:
         raise StructureError("An uncertain model ties all segments together: whiten without it for this search.")
-    if most != int(most) or most < 0:
-        raise StructureError(f"most={most!r}; a whole number from 0 is needed.")
+    check_integer(most, "most", 0)
     if count > LONGEST:
         raise StructureError(f"{count} samples are too many for all segments ({LONGEST}): use a shorter window.")
     if not np.isfinite(whitened.r).all():

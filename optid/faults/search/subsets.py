@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import StructureError
 from optid.faults.search.atoms import Atoms, atoms_of
 from optid.faults.search.exchange import exchanged
@@ -138,8 +138,7 @@ def polish(
     Raises:
         StructureError: too many subsets for an exact search, or an impossible number of faults.
     """
-    if max_faults != int(max_faults) or max_faults < 1:
-        raise StructureError(f"max_faults={max_faults!r}; a whole number from 1 is needed.")
+    check_integer(max_faults, "max_faults")
     count = found.statistic.shape[1]
     mask = np.ones(count, dtype=bool) if sparse is None else sparse.near(reach)
     atoms = atoms_of(found, limits, mask) if mask.any() else ()

@@ -1,7 +1,6 @@
 """Experiment design: rules an excitation has to obey, the response a record shows, excitations with a promise."""
 
-from optid.identify.design.excitation import Excitation, design
-from optid.identify.design.promises import Promise
+from optid.identify.design.excitation import Excitation, Promise, design
 from optid.identify.design.response import FrequencyResponse, frequency_response
 from optid.identify.design.rules import Check
 

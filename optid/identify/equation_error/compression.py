@@ -10,21 +10,23 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import solve_triangular
 
+from optid.arrays import check_integer
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.identify.arguments import per_channel, whole_number
-from optid.models import HammersteinARX, Nonlinearity
+from optid.identify.arguments import per_channel
+from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.program.view import View
 from optid.statistics import Layout, Statistics, collect
+from optid.structures.lifted_regression import lifted_problem, positions
 from optid.structures.rank_one import RankOne
 
 
@@ -127,7 +129,7 @@ class EquationError:
         return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
-              gauge: str, flip: bool = True) -> HammersteinARX:
+              gauge: str, flip: bool = True) -> HammersteinTF:
         """Build the model in the units of the record from one (mu, b) per input, b of shape `b_shape`.
 
         Args:
@@ -142,7 +144,7 @@ class EquationError:
         if ny > 1:
             a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
         signs = [leading_sign(np.asarray(b)) if flip else 1.0 for b in bs]
-        model = HammersteinARX(
+        model = HammersteinTF(
             a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),
@@ -174,7 +176,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     inputs, outputs = data.inputs, data.outputs
     nbs = per_channel("nb", nb, inputs, low=1)
     nks = per_channel("nk", nk, inputs, low=0)
-    order = whole_number("na", na, 0, "the number of past outputs")
+    order = check_integer(na, "na (the number of past outputs)", 0)
     bases = fitted_bases(data, basis)
     units = Transform.identity(len(inputs), len(outputs))
     if own:
@@ -190,52 +192,3 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     columns = positions(layout)
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
-
-
-def positions(layout: Layout) -> np.ndarray:
-    """Return the position (n_columns, l) in z of the coefficient of every column of the regressor in every output."""
-    ny, past = layout.l, layout.na * layout.l
-    found = np.empty((layout.n_columns, ny), dtype=int)
-    found[:past] = np.arange(past * ny).reshape(past, ny)
-    found[-1] = past * ny + np.arange(ny)
-    for c in range(layout.m):
-        block = layout.block(c)
-        start, count = (block.start + 1) * ny, block.stop - block.start
-        found[block] = start + np.arange(count * ny).reshape(ny, count).T
-    return found
-
-
-def lifted_problem(statistics: Statistics, columns: np.ndarray, ridge: float = 0.0, curvature: float = 0.0,
-                   scales: Sequence[float] = ()) -> RankOne:
-    """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
-
-    Args:
-        statistics: of the record.
-        columns: see `EquationError`.
-        ridge: weight of ``‖Theta‖²``.
-        curvature: weight of the integral of ``f''²``.
-        scales: unit of every input: Theta in the units of the record is Theta / scale.
-    """
-    layout, (n, ny), root = statistics.layout, columns.shape, statistics.root
-    blocks = tuple((basis.size, q * ny) for basis, q in zip(layout.bases, layout.nb))
-    linear, total = (layout.na * ny + 1) * ny, columns.size
-    system = np.zeros((total, total + 1))
-    for o, rows in enumerate(np.split(system, ny)):
-        rows[:, columns[:, o]] = root[:n, :n]
-        rows[:, -1] = root[:n, n + o]
-    remainder = float(np.sum(root[n:, n:] ** 2))
-    if ridge or curvature:
-        penalties = [ridge / scale**2 * np.eye(basis.size) + curvature * np.asarray(basis.penalty(2))
-                     for basis, scale in zip(layout.bases, scales)]
-        roots = [np.kron(np.eye(q), _square_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
-        system = np.vstack([system, np.pad(np.asarray(block_diag(*roots)), ((0, 0), (linear, 1)))])
-    triangle = np.triu(np.linalg.qr(system, mode="r"))
-    triangle = triangle * np.where(np.diag(triangle[:, : len(triangle)]) < 0, -1.0, 1.0)[:, None]  # one of many signs
-    remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
-    return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,
-                   blocks=blocks, scale=float(np.sum(root[:, n:] ** 2)))
-
-
-def _square_root(matrix: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

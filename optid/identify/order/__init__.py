@@ -1,8 +1,7 @@
 """Orders and lags before a model: singular values and their distribution, criteria, hold-out, scan of lags."""
 
 from optid.identify.order.lags import Lags, LagScan, scan_lags
-from optid.identify.order.ranks import RankTest, rank_test
-from optid.identify.order.signals import order_test
+from optid.identify.order.ranks import RankTest, order_test, rank_test
 from optid.identify.order.study import OrderStudy, order
 
 __all__ = ["LagScan", "Lags", "OrderStudy", "RankTest", "order", "order_test", "rank_test", "scan_lags"]

@@ -6,17 +6,17 @@ then every lag of an input has one column, f(u(k - lag)), and one coefficient.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases.basis import Basis
 from optid.data.record import Data
-from optid.errors import RankError, StructureError
+from optid.errors import RankError
 from optid.identify.order.states import criteria
 from optid.statistics import Layout, Statistics, accumulate, collect
-from optid.structures.rank_one import RankOne
+from optid.structures.lifted_regression import lifted_problem, positions
 
 ROWS_PER_COLUMN = 3
 CLOSE = 0.1
@@ -54,12 +54,9 @@ class LagScan:
     @property
     def at_the_edge(self) -> tuple[str, ...]:
         """Which of na, nb and nk are the largest ones compared, so that larger ones may be better."""
-        best, found = self.best(), []
-        for name in ("na", "nb", "nk"):
-            values = [np.max(getattr(c, name)) for c in self.candidates]
-            if np.max(getattr(best, name)) == max(values):
-                found.append(name)
-        return tuple(found)
+        best = self.best()
+        return tuple(name for name in ("na", "nb", "nk")
+                     if np.max(getattr(best, name)) == max(np.max(getattr(c, name)) for c in self.candidates))
 
     def best(self, criterion: str = "bic") -> Lags:
         """The best by "aic", "aicc", "bic" or "fit"; of fits within 0.1 points the one with the least BIC."""
@@ -82,25 +79,25 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
         test: a part held out, judged by the coefficients of `data`; None for none.
 
     Raises:
-        StructureError: orders that are not whole numbers, na, nk >= 0 and nb >= 1.
+        StructureError: orders that are not integers, na, nk >= 0 and nb >= 1.
         RankError: too short a record, or one that does not excite the basis.
     """
     for name, value, least in (("na", na, 0), ("nb", nb, 1), ("nk", nk, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise StructureError(f"{name}: a whole number from {least} is needed; got {value!r}.")
+        check_integer(value, name, least)
     width, rows = sum(basis.size for basis in bases), data.n_samples
     while na * data.l + (nb + nk) * width + 1 > rows / ROWS_PER_COLUMN and na + nb + nk > 1:
         na, nb, nk = max(na - 1, 0), max(nb - 1, 1), max(nk - 1, 0)
     layout = Layout(na, (nb + nk,) * data.m, (0,) * data.m, tuple(bases), data.outputs, data.inputs)
     statistics = collect(data, layout)
     change = _contraction(statistics)
-    root = statistics.root @ change
-    other = None
+    scan = _Scan(layout, statistics.root @ change, statistics.rows)
     if test is not None:
-        other_statistics = collect_part(test, layout)
-        other = change.T @ other_statistics.gram @ change, other_statistics.rows
-    shape = sum(basis.size - 1 for basis in bases)
-    scan = _Scan(root, statistics.rows, data.m, data.l, na, nb + nk, shape, other)
+        long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
+        if not long:
+            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or "
+                            "nothing.")
+        part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
+        scan = replace(scan, other=(change.T @ part.gram @ change, part.rows))
     found = [scan.judged(a, (b,) * data.m, (k,) * data.m)
              for a in range(na + 1) for k in range(nk + 1) for b in range(1, nb + 1)]
     if data.m > 1:
@@ -113,59 +110,52 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     return LagScan(tuple(dict.fromkeys(found)), statistics.rows)
 
 
-def collect_part(data: Data, layout: Layout) -> Statistics:
-    """Take the statistics of a part that need not determine the parameters."""
-    long = [i for i, e in enumerate(data.experiments) if e.n_samples > layout.first_row]
-    if not long:
-        raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or nothing.")
-    return accumulate(data.select(experiments=long), layout)
-
-
 @dataclass(frozen=True, eq=False)
 class _Scan:
+    layout: Layout
     root: Array
     rows: int
-    m: int
-    l: int  # noqa: E741
-    na: int
-    lags: int
-    shape: int
-    other: tuple[Array, int] | None
+    other: tuple[Array, int] | None = None
 
     def judged(self, na: int, nb: tuple[int, ...], nk: tuple[int, ...]) -> Lags:
-        past = self.na * self.l
-        inputs = [past + c * self.lags + lag for c in range(self.m) for lag in range(nk[c], nk[c] + nb[c])]
-        constant = past + self.m * self.lags
-        columns = np.array([*range(na * self.l), *inputs, constant])
-        targets = np.arange(constant + 1, constant + 1 + self.l)
+        layout, l, lags = self.layout, self.layout.l, self.layout.nb[0]  # noqa: E741
+        past = layout.na * l
+        inputs = [past + c * lags + lag for c in range(layout.m) for lag in range(nk[c], nk[c] + nb[c])]
+        constant = past + layout.m * lags
+        columns = np.array([*range(na * l), *inputs, constant])
+        targets = np.arange(constant + 1, constant + 1 + l)
         theta, *_ = np.linalg.lstsq(self.root[:, columns], self.root[:, targets], rcond=1e-12)
         error = self.root[:, targets] - self.root[:, columns] @ theta
         energy = np.sum(self.root[:, targets] ** 2, axis=0)
         covariance = (error.T @ error + np.diag(1e-16 * energy)) / self.rows
-        k = self.l * columns.size + self.shape
+        k = l * columns.size + sum(basis.size - 1 for basis in layout.bases)
         likelihood = self.rows * float(np.linalg.slogdet(covariance)[1])
         fit = float("nan")
         if self.other is not None:
             gram, rows = self.other
             both = np.concatenate([columns, targets])
             gram = gram[np.ix_(both, both)]
-            weights = np.vstack([-theta, np.eye(self.l)])
+            weights = np.vstack([-theta, np.eye(l)])
             mean = gram[columns.size - 1, columns.size :] / rows
             spread = np.diag(gram)[columns.size :] / rows - mean**2
             errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / rows
             fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
-        aic, aicc, bic = criteria(likelihood, k, self.rows, self.l)
+        aic, aicc, bic = criteria(likelihood, k, self.rows, l)
         return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
 
 
 def _contraction(statistics: Statistics) -> Array:
-    """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit."""
+    """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit.
+
+    That fit takes every output in units of its residual, which only changes the scale of its coefficients.
+    """
     from optid.structures.bilinear import minimise
 
     layout = statistics.layout
     shapes = [np.ones(1)] * layout.m
     if any(basis.size > 1 for basis in layout.bases):
-        shapes = list(minimise(weighted_problem(statistics), count=3).point.mus)
+        problem = lifted_problem(statistics, positions(layout), weights=residual_weights(statistics))
+        shapes = list(minimise(problem, count=3).point.mus)
     past, lags = layout.na * layout.l, layout.nb[0]
     change = np.zeros((layout.n_columns + layout.l, past + layout.m * lags + 1 + layout.l))
     change[:past, :past] = np.eye(past)
@@ -176,39 +166,13 @@ def _contraction(statistics: Statistics) -> Array:
     return change
 
 
-def weighted_problem(statistics: Statistics) -> RankOne:
-    """Write the regression of all outputs as one rank-one problem, each output in units of its residual.
-
-    Unknowns: the linear coefficients of each output (past outputs, constant), then Theta_c (P_c, nb_c l), outputs
-    outermost.
-    """
-    layout, root = statistics.layout, statistics.root
-    n, outputs = layout.n_columns, layout.l
-    past = np.arange(layout.na * outputs)
-    linear = past.size + 1
-    sizes = [nb * basis.size for nb, basis in zip(layout.nb, layout.bases)]
-    total = outputs * (linear + sum(sizes))
-    system = np.zeros((outputs * n, total + 1))
-    remainder = 0.0
-    for o in range(outputs):
-        rest = float(np.sum(root[n:, n + o] ** 2))
-        energy = float(np.sum(root[:, n + o] ** 2))
-        weight = 1.0 if outputs == 1 else 1 / np.sqrt(max(rest / statistics.rows, 1e-24 * energy, 1e-300))
-        where = np.empty(n, dtype=int)
-        where[past], where[layout.offset] = o * linear + past, (o + 1) * linear - 1
-        start = outputs * linear
-        for c, size in enumerate(sizes):
-            where[layout.block(c)] = start + o * size + np.arange(size)
-            start += outputs * size
-        rows = slice(o * n, (o + 1) * n)
-        system[rows, where] = weight * root[:n, :n]
-        system[rows, -1] = weight * root[:n, n + o]
-        remainder += weight**2 * rest
-    triangle: Array = np.asarray(np.linalg.qr(system, mode="r"))
-    blocks = tuple((basis.size, nb * outputs) for nb, basis in zip(layout.nb, layout.bases))
-    if len(triangle) > total:
-        remainder += float(triangle[total, total] ** 2)
-    return RankOne(triangle[:total, :total], triangle[:total, total], remainder, blocks, outputs * linear)
+def residual_weights(statistics: Statistics) -> Array:
+    """Return what puts every output (l,) into units of its residual; one where there is one output."""
+    n, root = statistics.layout.n_columns, statistics.root
+    rest, energy = np.sum(root[n:, n:] ** 2, axis=0), np.sum(root[:, n:] ** 2, axis=0)
+    if rest.size == 1:
+        return np.ones(1)
+    return 1 / np.sqrt(np.maximum(np.maximum(rest / statistics.rows, 1e-24 * energy), 1e-300))
 
 
 def _put(values: tuple[int, ...], c: int, value: int) -> tuple[int, ...]:

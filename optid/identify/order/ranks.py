@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
-from optid.statistics.hankel import HankelStatistics
+from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 LEVEL = 0.01
@@ -46,7 +47,7 @@ class RankTest:
         floor: singular values up to here are rounding.
         level: probability with which a true order is to be rejected.
         windows: number j of windows.
-        largest: largest order that the shift of the block rows can show, or None.
+        largest: largest order that the shift of the block rows can show.
     """
 
     singular_values: Array
@@ -57,14 +58,13 @@ class RankTest:
     floor: float
     level: float
     windows: int
-    largest: int | None = None
+    largest: int
 
     @property
     def order(self) -> int:
         """The smallest order that is not rejected; the largest possible one where all are."""
         accepted = np.flatnonzero((self.statistics <= self.thresholds) | (self.singular_values <= self.floor))
-        chosen = int(accepted[0]) if accepted.size else self.singular_values.size
-        return chosen if self.largest is None else min(chosen, self.largest)
+        return min(int(accepted[0]) if accepted.size else self.singular_values.size, self.largest)
 
     @property
     def choice(self) -> tuple[int, str]:
@@ -81,16 +81,13 @@ class RankTest:
     @property
     def exhausted(self) -> bool:
         """Whether every order that the block rows can show was rejected."""
-        limit = self.singular_values.size if self.largest is None else self.largest
-        return self.order == limit and not (
-            limit < self.singular_values.size and self.statistics[limit] <= self.thresholds[limit]
-        )
+        n = self.largest
+        return self.order == n and not (n < self.singular_values.size and self.statistics[n] <= self.thresholds[n])
 
     @property
     def ratios(self) -> Array:
         """s_i / s_{i+1} for i = 1 ... r - 1, singular values below the floor raised to it."""
-        raised = np.maximum(self.singular_values, max(self.floor, np.finfo(float).tiny))
-        return raised[:-1] / raised[1:]
+        return ratios_of(self.singular_values, self.floor)
 
     @property
     def ratio_order(self) -> int:
@@ -98,7 +95,7 @@ class RankTest:
         size = self.singular_values.size
         if self.singular_values[0] <= self.floor or size < 2:
             return 0
-        return int(np.argmax(self.ratios[: max(1, min(size - 2, size // 2))])) + 1
+        return largest_gap(self.singular_values, min(size - 2, size // 2), self.floor)
 
     @property
     def reason(self) -> str:
@@ -110,6 +107,40 @@ class RankTest:
             return f"{n}: every smaller order is rejected and the block rows show no larger one; use more block rows"
         before = f", order {n - 1} is rejected (p = {self.p_values[n - 1]:.1g})" if n else ""
         return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
+
+
+def ratios_of(values: Array, floor: float) -> Array:
+    """Return s_i / s_(i+1) of singular values (r,), largest first, those below the floor raised to it: (r - 1,)."""
+    raised = np.maximum(values, max(floor, np.finfo(float).tiny))
+    return raised[:-1] / raised[1:]
+
+
+def largest_gap(values: Array, most: int, floor: float) -> int:
+    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. most (SLICOT IB01OD with its default tolerance)."""
+    return int(np.argmax(ratios_of(values, floor)[: max(1, most)])) + 1
+
+
+def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, instruments: str = "simulated",
+               offset: bool = True, level: float | None = None) -> RankTest:
+    """Test the ranks of the projected outputs; several outputs count relative to their sizes.
+
+    Args:
+        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs.
+        expansion: the signals.
+        alpha: future block rows; the past has as many, and so has the reach of the serial correlation.
+        instruments: as in `Expansion.positions`; noise of any colour leaves past and future inputs valid, and functions
+            of outputs simulated from them.
+        offset: whether a constant is among instruments and regressors.
+        level: as in `rank_test`.
+
+    Raises:
+        RankError: too short a record, or instruments that do not reach the regressors.
+    """
+    statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
+                                   centre="mean" if offset else None)
+    z, phi, y = expansion.positions(statistics.at, instruments, alpha, offset)
+    scale = np.tile(statistics.sizes(expansion.y, offset), alpha) if expansion.l > 1 else None
+    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
 
 
 def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: Positions, outputs: Positions, *,
@@ -136,10 +167,9 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
 
     reach = statistics.rows - rows
     if reach < 1:
-        raise StructureError(
-            f"The windows have {statistics.rows} block rows and {rows} are used: take windows that are longer by the "
-            "number of future block rows, so that they tell the correlation between windows."
-        )
+        raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
+                             "are longer by the number of future block rows, so that they tell the correlation between "
+                             "windows.")
     z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
     width = 1 + rows * statistics.d
     if max(z.max(), phi.max(), y.max()) >= width:
@@ -149,10 +179,8 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     if not 0 < level < 1:
         raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
     if j <= 1.1 * z.size + y.size:
-        raise RankError(
-            f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a longer "
-            "record, fewer block rows or fewer basis functions."
-        )
+        raise RankError(f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a "
+                        "longer record, fewer block rows or fewer basis functions.")
     sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
     if sizes.shape != (y.size,) or not (sizes > 0).all():
         raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
@@ -174,7 +202,8 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
         g, h = variance / (2 * mean), 2 * mean**2 / variance
         thresholds[n0] = g / j * chdtri(h, level)
         p_values[n0] = chdtrc(h, tails[n0] * j / g)
-    return RankTest(values, tails, expected, thresholds, p_values, floor, level, j, largest)
+    return RankTest(values, tails, expected, thresholds, p_values, floor, level, j,
+                    values.size if largest is None else largest)
 
 
 def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp],

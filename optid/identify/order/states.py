@@ -47,14 +47,7 @@ class StateCriteria:
 
 
 def criteria(likelihood: Any, parameters: Any, samples: int, outputs: int) -> tuple[Any, Any, Any]:
-    """Return AIC, AIC with the small-sample correction, and BIC.
-
-    Args:
-        likelihood: minus twice the logarithm of the likelihood, up to a constant.
-        parameters: their number.
-        samples: number of samples of every output.
-        outputs: number of outputs.
-    """
+    """Return AIC, AIC with the small-sample correction, and BIC, from minus twice the logarithm of a likelihood."""
     aic = likelihood + 2 * parameters
     spare = np.maximum(samples * outputs - parameters - 1, 1)
     return aic, aic + 2 * parameters * (parameters + 1) / spare, likelihood + np.log(samples) * parameters

@@ -7,19 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.bases import Linear, feedback_bases, fitted_bases
+from optid.arrays import Array, check_integer
+from optid.bases import Bases, FeedbackBases, Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order.lags import LagScan, scan_lags
-from optid.identify.order.ranks import RankTest
-from optid.identify.order.signals import block_rows_for, order_test, with_simulated_outputs
+from optid.identify.order.ranks import RankTest, order_test
 from optid.identify.order.states import StateCriteria, state_criteria
 from optid.registry import render
 from optid.statistics.channels import check_channels
-from optid.statistics.expansion import expand
+from optid.statistics.expansion import Expansion, expand
 from optid.statistics.hankel import hankel_statistics
+
+FEWEST, PER_ROW = 2, 1.5
+"""Block rows at least; windows per row of the longest windows that are wanted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class OrderStudy:
         return render(self, "figure")
 
 
-def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = None, feedback_basis: Any = None,
+def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBases = None,
           block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6, nk: int = 8,
           holdout: float = 0.3, level: float | None = None) -> OrderStudy:
     """Find the order of a record without a model of its noise.
@@ -89,27 +91,23 @@ def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = N
     """
     if not 0 <= holdout < 1:
         raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}.")
-    if nx is not None and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
-        raise StructureError(f"nx={nx!r}: a whole number from 1 is needed.")
+    if nx is not None:
+        check_integer(nx, "nx")
     data = data.raw()
     records = _records(data)
     check_channels(records, data.inputs, data.outputs)
-    bases = fitted_bases(data, Linear() if basis is None else basis)
-    expansion = expand(records, bases, feedback_bases(data, feedback_basis), data.inputs, data.outputs)
+    expansion = expand(data, Linear() if basis is None else basis, feedback_basis)
     alpha = block_rows_for(records, expansion, block_rows, nx)
     notes: list[str] = []
-    shown, extended = expansion, records
-    if expansion.q:
-        extended, shown = with_simulated_outputs(records, expansion, alpha)
-    statistics = hankel_statistics(extended, 3 * alpha, shown, names=shown.names, centre="mean")
-    ranks = order_test(extended, shown, alpha, level=level, statistics=statistics)
+    ranks = order_test(*(with_simulated_outputs(records, expansion, alpha) if expansion.q else (records, expansion)),
+                       alpha, level=level)
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
-    centre = statistics.centre[: expansion.p + expansion.q + expansion.l]
-    moments = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=centre)
-               for part in (data, train, test) if part is not None]
-    states = state_criteria(moments[0], expansion, alpha, max(largest, 1), *moments[1:])
-    lags = _lags(data, train, test, bases, na, nb, nk, notes)
+    whole = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names, centre="mean")
+    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
+             for part in (train, test) if part is not None]
+    states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
+    lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
                      "inputs if the plant is not linear.")
@@ -119,6 +117,53 @@ def order(data: Data, *, basis: "Basis | str | Sequence[Basis | str] | None" = N
     return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], *(
         (best.na, best.nb, best.nk) if best is not None else (None, None, None)),
         _reasons(ranks, states, lags), tuple(notes))
+
+
+def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
+    """Return the future block rows: as given, or 10, or more for a large order, or fewer on a short record.
+
+    Raises:
+        StructureError: fewer than 2, or not more than the order asked for per output.
+        RankError: an experiment shorter than three times the block rows, which is named.
+    """
+    alpha = check_integer(given, "block_rows", FEWEST) if given is not None else expansion.block_rows(
+        records, nx, spans=3, per_row=PER_ROW, least=FEWEST)
+    if nx is not None and (alpha - 1) * expansion.l < nx:
+        raise StructureError(f"{alpha} block rows of {expansion.l} outputs show orders up to "
+                             f"{(alpha - 1) * expansion.l}, not {nx}: use block_rows={-(-nx // expansion.l) + 1} or "
+                             "more.")
+    for i, record in enumerate(records):
+        if len(record) < 3 * alpha:
+            raise RankError(f"Experiment {i + 1} has {len(record)} samples, fewer than three times the {alpha} block "
+                            "rows: leave it out or use fewer block rows.")
+    return alpha
+
+
+def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha: int) -> tuple[list[Array], Expansion]:
+    """Append outputs simulated from the inputs alone: least squares on the functions of the last 2 alpha samples.
+
+    They are free of noise, so that functions of them are valid instruments for functions of measured outputs. The
+    first 2 alpha - 1 samples of an experiment, and those after a missing input, are missing.
+    """
+    rows = 2 * alpha
+    open_loop = expansion.without_feedback()
+    statistics = hankel_statistics(records, rows, open_loop, names=open_loop.names, centre="mean")
+    statistics.check()
+    past = np.concatenate([[0], statistics.at(open_loop.eta)])
+    now = statistics.at(open_loop.y, [rows - 1])
+    theta = np.linalg.lstsq(statistics.gram[np.ix_(past, past)], statistics.gram[np.ix_(past, now)], rcond=1e-12)[0]
+    weights = theta[1:].reshape(rows, open_loop.p, expansion.l)
+    m, centre = expansion.m, statistics.centre
+    extended = []
+    for record in records:
+        eta = open_loop(record)[:, : open_loop.p] - centre[: open_loop.p]
+        count = len(record) - rows + 1
+        simulated = np.full((len(record), expansion.l), np.nan)
+        simulated[rows - 1 :] = theta[0] + centre[open_loop.p :]
+        for i in range(rows):
+            simulated[rows - 1 :] += eta[i : i + count] @ weights[i]
+        extended.append(np.hstack([record[:, : m + expansion.l], simulated]))
+    return extended, expansion.with_simulated()
 
 
 def _records(data: Data) -> list[Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.statistics.linearised import Linearised
+from optid.statistics.linearised import Linearised, Method
 from optid.statistics.unknowns import Unknowns
 
 STATIONARY = 1e-12
@@ -66,8 +66,8 @@ class Criterion(ABC):
         """Name a quantity of a channel, such as "mu" of input 0."""
 
     @abstractmethod
-    def linearise(self, x: Array, method: str = "auto") -> Linearised:
-        """Return the errors near x, compressed as in `optid.statistics.linearised.linearised`."""
+    def linearise(self, x: Array, method: Method = "auto") -> Linearised:
+        """Return the errors near x, compressed by a method of `optid.statistics.linearised`."""
 
     @abstractmethod
     def value(self, x: Array) -> float:

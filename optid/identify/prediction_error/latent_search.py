@@ -55,22 +55,21 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         RankError: no direction of z leads to a model whose run stays finite.
     """
     rng, figures = np.random.default_rng(seed), {}
-    x, steps = best.x, best.steps
+    end, steps = best, best.steps
     for number, latent in enumerate(channels, start=1):
-        errors, x = whitened(errors, x)
+        errors, x = whitened(errors, end.x)
         part = _first(errors, RANKED)
         ranked = sorted(_ranked(part, x, latent, candidates, rng), key=lambda one: -one[0])
-        ends = [end for one in ranked[:finalists] if (end := _short(part, x, latent, *one[1:])) is not None]
+        ends = [one for _, *chosen in ranked[:finalists] if (one := _short(part, x, latent, *chosen)) is not None]
         if not ends:
             raise RankError(f"no direction of latent signal {number} leads to a model that stays finite: use fewer "
                             "latent signals, another basis, or latent='states'.")
         errors = _widened(errors, (latent,))
-        starts = [end.x for end in sorted(ends, key=lambda end: end.value)]
+        starts = [one.x for one in sorted(ends, key=lambda one: one.value)]
         for size in sorted({min(STAGE, errors.data.n_samples), errors.data.n_samples}):
             stage = _first(errors, size)
             end = descend(stage, _finite(stage, starts), iterations=iterations, start=best.start)
             steps, starts = steps + end.steps, [end.x]
-        x = end.x
         figures[f"gain promised by latent signal {number}"] = ranked[0][0]
     return errors, replace(end, steps=steps), figures
 

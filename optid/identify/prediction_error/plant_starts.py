@@ -13,7 +13,6 @@ from optid.arrays import Array
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
-from optid.identify.equation_error.compression import lifted_problem, positions
 from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
@@ -24,6 +23,7 @@ from optid.statistics.regression import collect
 from optid.statistics.sensitivities import instruments
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
+from optid.structures.lifted_regression import lifted_problem, positions
 
 PASSES = 8
 """Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""
@@ -144,7 +144,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
         return None
     records = [np.hstack([e.u, e.y]) for e in data.experiments]
     try:
-        expansion = expand(records, layout.bases, (), layout.inputs, layout.outputs)
+        expansion = expand(data, layout.bases)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # as in `arx_start`
             found = project(records, expansion, expansion.block_rows(records, layout.na), instruments="past")

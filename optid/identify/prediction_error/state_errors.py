@@ -4,7 +4,7 @@ Unknowns live in the full matrices; the directions along which a change of state
 and b, are projected out at every iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -13,15 +13,14 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Linear
-from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.prediction_error.descent import Criterion
+from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
 from optid.models.state_simulation import allowed_range
-from optid.statistics.expansion import Expansion
-from optid.statistics.linearised import Linearised
+from optid.statistics.linearised import Linearised, Method
 from optid.statistics.state_sensitivities import linearise_states, residuals, squares
 from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
@@ -80,7 +79,7 @@ class StateErrors(Criterion):
             return None
         return tuple(allowed_range([e.y]) for e in self.data.experiments)
 
-    def linearise(self, x: Array, method: str = "auto") -> Linearised:
+    def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
         return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x),
                                 limits=self.limits, method=method)
@@ -185,28 +184,3 @@ class StateErrors(Criterion):
         cs = tuple(np.linalg.lstsq(one.vectors, h.mu)[0] for one, h in zip(unknowns.latent, model.latent))
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0, cs,
                           model.Ez + injection @ model.Fz, model.Fz, model.Cz, model.Dz, model.offset_z)
-
-
-def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
-                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
-    """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
-
-    Args:
-        expansion: the signals of the fit.
-        data: the record, for names, units and sampling time.
-        matrices: A (n, n), B (n, m), C (l, n) and D (l, m).
-        mus: coefficients of the nonlinearity of every input.
-        nus: coefficients of every feedback family in its orthonormal coordinates.
-        e: (n, s), one column per family.
-        K: (n, l), zero where None.
-        offset: (l,) of the output, zero where None.
-    """
-    families = expansion.feedback
-    parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
-    injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
-    A, B, C, D = matrices
-    return HammersteinSS(
-        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
-        nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
-        feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
-        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.certificate.simulation_bound import simulation_bound
+from optid.certificate.hankel import simulation_bound
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, NoiseCovariances
-from optid.models.balancing import balancing
 from optid.models.roots import spectral_radius
+from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
 

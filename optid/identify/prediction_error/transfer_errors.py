@@ -18,7 +18,7 @@ from optid.models import noise_filter, roots
 from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
-from optid.statistics.linearised import Linearised
+from optid.statistics.linearised import Linearised, Method
 from optid.statistics.regression import ROWS_PER_COLUMN, collect
 from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict, simulate
 from optid.statistics.unknowns import TransferUnknowns
@@ -72,7 +72,7 @@ class TransferErrors(Criterion):
         y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
         return float(np.nansum((y - np.nanmean(y)) ** 2))
 
-    def linearise(self, x: Array, method: str = "auto") -> Linearised:
+    def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
         return linearise(self.data, self.unknowns, self.unknowns.unpack(x), gauge=self.gauge_rows(x),
                          functions=self.functions, method=method)

@@ -8,7 +8,6 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import StructureError
 from optid.models.layout import Layout
-from optid.structures import whitening
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,28 +69,3 @@ def theta_matrices(theta: Array, layout: Layout) -> tuple[Array, ...]:
     blocks = (theta[layout.block(c)].reshape(b, basis.size, -1)
               for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)))
     return tuple(block.transpose(1, 2, 0).reshape(block.shape[1], -1) for block in blocks)
-
-
-def block_grams(root: Array, layout: Layout) -> list[Array]:
-    """Gram matrices (P_c nb_c square) of the inputs' columns, what A and the constant explain removed."""
-    n, past = layout.n_columns, layout.na * layout.l
-    order = np.concatenate([np.arange(past), [layout.offset], np.arange(past, layout.offset)])
-    rest = np.asarray(np.linalg.qr(root[:n, order], mode="r"))[past + 1 :, past + 1 :]
-    parts = [rest[:, layout.block(c).start - past : layout.block(c).stop - past] for c in range(layout.m)]
-    return [part.T @ part for part in parts]
-
-
-def leading_pair(matrix: Array, gram: Array | None, lags: int, outputs: int) -> tuple[Array, Array]:
-    """Return (mu, b) with mu b^T nearest to Theta, in the Frobenius norm or in the Kronecker metric of its Gram matrix.
-
-    Args:
-        matrix: (P, nb l) Theta, lags inner, outputs outer.
-        gram: (P nb, P nb) Gram matrix of the columns of Phi, or None for the Frobenius norm.
-        lags: nb.
-        outputs: l.
-    """
-    factor_mu, factor_b = np.eye(len(matrix)), np.eye(lags)
-    if gram is not None:
-        factor_mu, factor_b = whitening.kronecker_factors(gram, (len(matrix), lags))
-    # every output has the same regressor
-    return whitening.leading_pair(matrix, factor_mu, np.kron(np.eye(outputs), factor_b))

@@ -1,4 +1,4 @@
-"""What a recursion is given, prior, samples and weights, becomes arrays or a named error."""
+"""Intake of a recursion: prior, forgetting factor and samples become arrays or a named error."""
 
 from typing import Any
 
@@ -68,15 +68,8 @@ def as_block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array
     return samples
 
 
-def row_weights(weights: Any, count: int) -> Array:
-    """Return the weights as (count,).
-
-    Raises:
-        DataError: wrong shape, or a weight that is negative or not finite.
-    """
-    given = np.asarray(weights, dtype=float)
-    if given.shape not in ((), (count,)):
-        raise DataError(f"weights have shape {given.shape}: one number, or one for each of the {count} samples.")
-    if not np.all(np.isfinite(given) & (given >= 0)):
-        raise DataError("weights must be finite and not negative; 0 leaves a row out.")
-    return np.array(np.broadcast_to(given, count))
+def forgetting_factor(value: float) -> float:
+    """Return a forgetting factor, or refuse one outside (0, 1] (`StructureError`)."""
+    if not 0 < value <= 1:
+        raise StructureError(f"forgetting={value!r}: a factor above 0 and at most 1, such as 0.995.")
+    return float(value)

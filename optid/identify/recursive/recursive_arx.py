@@ -17,28 +17,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
-from optid.bases import from_dict, parse
+from optid.bases import fitted_bases, from_dict, parse
 from optid.bases.basis import Basis
-from optid.data.channels import channel_units, check_distinct, listed, sampling_time
+from optid.data.channels import channel_fields, listed, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.recursive.estimates import Trace, block_grams, leading_pair, past_coefficients, theta_matrices
-from optid.identify.recursive.intake import as_block, prior_factor, row_weights
+from optid.identify.recursive.estimates import Trace, past_coefficients, theta_matrices
+from optid.identify.recursive.intake import as_block, forgetting_factor, prior_factor
 from optid.identify.recursive.saved_state import SavedState
-from optid.models import HammersteinARX
+from optid.models import HammersteinTF
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
-from optid.statistics.blocks import check_inside
+from optid.statistics.blocks import check_inside, row_weights, used_rows
 from optid.statistics.factors import dependent_column
-from optid.statistics.sums import rows_present
+from optid.structures.lifted_regression import leading_pairs, lifted_problem, positions
 from optid.structures.whitening import invert_triangular
 
 CHUNK = 4096  # samples whose basis functions are evaluated at a time
 SPLITS = ("whitened", "plain")
 
-SETTINGS = ("input_units", "output_units", "dt", "forgetting")
 COUNTS = ("samples", "candidates", "rows", "since_restart")
 
 
@@ -63,6 +62,7 @@ class RecursiveARX(SavedState):
     """
 
     kind, arrays = "recursion", ("root", "past_u", "past_y")
+    settings = ("input_units", "output_units", "dt", "forgetting")
 
     def __init__(
         self, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -95,18 +95,15 @@ class RecursiveARX(SavedState):
         m = len(names_u)
         bases = tuple(parse(b) if isinstance(b, str) else b for b in _each(basis, m))
         self.layout = Layout(na, _each(nb, m), _each(nk, m), bases, tuple(names_y), tuple(names_u))
-        check_distinct(names_u + names_y)
+        names = channel_fields(m, len(names_y), names_u, names_y, input_units, output_units)
         for channel, one in zip(names_u, bases):
             if one.interval is None and type(one).__name__ != "Linear":
                 raise StructureError(
                     f"The basis of input {channel!r} has no interval: a recursion does not know the range of the input "
                     f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper)).")
-        if not 0 < forgetting <= 1:
-            raise StructureError(f"forgetting={forgetting!r}: a factor above 0 and at most 1, such as 0.995.")
-        self.forgetting = float(forgetting)
+        self.forgetting = forgetting_factor(forgetting)
         self.dt = sampling_time(dt)
-        self.input_units = channel_units(input_units, m, "input_units")
-        self.output_units = channel_units(output_units, self.layout.l, "output_units")
+        self.input_units, self.output_units = names["input_units"], names["output_units"]
         self.samples = self.candidates = self.rows = 0
         self.root = prior_factor(theta0, P0, self.layout)
         self.restart()
@@ -123,10 +120,8 @@ class RecursiveARX(SavedState):
             DataError: detrended or scaled data.
         """
         _check_raw(data)
-        bases = [parse(b) if isinstance(b, str) else b for b in _each(settings.pop("basis"), data.m)]
-        return cls(
-            basis=[b.fitted(float(x), float(z)) for b, x, z in zip(bases, *data.ranges())], inputs=data.inputs,
-            outputs=data.outputs, dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
+        return cls(basis=fitted_bases(data, settings.pop("basis")), inputs=data.inputs, outputs=data.outputs,
+                   dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     # -- samples ---------------------------------------------------------------------------------------------------
 
@@ -202,7 +197,7 @@ class RecursiveARX(SavedState):
             part = slice(start, start + CHUNK)
             past_u, past_y = np.concatenate([self.past_u, u[part]]), np.concatenate([self.past_y, y[part]])
             count, marked = len(past_y) - reach, int(marks[part].sum())
-            used = rows_present(past_u, past_y, layout) & (weights[part] > 0)
+            used = used_rows(past_u, past_y, layout) & (weights[part] > 0)
             signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
             self.rows = recursion_kernel.absorb(
                 self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
@@ -265,13 +260,13 @@ class RecursiveARX(SavedState):
         """
         return theta_matrices(self.theta, self.layout)
 
-    def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinARX:
+    def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinTF:
         """Split off the rank-one factors of the present estimate.
 
         Args:
             split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or
                 "plain" (SVD of Theta, as in the dissertation).
-            gauge: "norm", "gain" or "b0", as in `HammersteinARX.regauge`.
+            gauge: "norm", "gain" or "b0", as in `HammersteinTF.regauge`.
 
         Raises:
             RankError: as `theta`.
@@ -280,9 +275,9 @@ class RecursiveARX(SavedState):
         if split not in SPLITS:
             raise StructureError(f"split={split!r}: use one of {', '.join(map(repr, SPLITS))}.")
         layout, theta = self.layout, self.theta
-        grams = block_grams(self.root, layout) if split == "whitened" else [None] * layout.m
-        pairs = [leading_pair(matrix, gram, b, layout.l) for matrix, gram, b in zip(self.matrices, grams, layout.nb)]
-        return HammersteinARX(
+        core = lifted_problem(self.statistics, positions(layout)).core
+        pairs = leading_pairs(core, theta_matrices(theta, layout), split == "whitened")
+        return HammersteinTF(
             a=past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
@@ -300,8 +295,8 @@ class RecursiveARX(SavedState):
 
     def _head(self) -> dict[str, Any]:
         layout = self.layout
-        settings = {"na": int(layout.na), "nb": [int(b) for b in layout.nb], "nk": [int(k) for k in layout.nk],
-                    "inputs": layout.inputs, "outputs": layout.outputs, **{key: getattr(self, key) for key in SETTINGS}}
+        orders = {"na": int(layout.na), "nb": [int(b) for b in layout.nb], "nk": [int(k) for k in layout.nk]}
+        settings = super()._head()["settings"] | orders | {"inputs": layout.inputs, "outputs": layout.outputs}
         return {"settings": settings, "bases": [basis.to_dict() for basis in layout.bases],
                 "counts": {name: getattr(self, name) for name in COUNTS}}
 

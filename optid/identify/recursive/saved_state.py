@@ -1,34 +1,35 @@
 """The state of an estimator that runs on, as a file."""
 
-from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from optid.errors import ModelFileError, OptidError
-from optid.models.state_file import read_state, set_arrays, write_state
+from optid.models.files import read_state, set_arrays, write_state
 
 VERSION = 1  # version of the file
 
 
-class SavedState(ABC):
+class SavedState:
     """An estimator that restarts from a file and continues bit for bit.
 
     Attributes:
         kind: word for it in the file and in messages.
         arrays: names of the attributes that are arrays of the state.
+        settings: names of the attributes that are arguments, in JSON types.
     """
 
     kind: ClassVar[str]
     arrays: ClassVar[tuple[str, ...]]
+    settings: ClassVar[tuple[str, ...]]
 
-    @abstractmethod
     def _head(self) -> dict[str, Any]:
         """Everything beside the arrays, in JSON types."""
+        return {"settings": {name: getattr(self, name) for name in self.settings}}
 
     @classmethod
-    @abstractmethod
     def _of_head(cls, head: dict[str, Any], functions: dict[str, Any] | None) -> Self:
         """Build a fresh estimator from what `_head` returned."""
+        return cls(**head["settings"])
 
     def save(self, path: str | Path) -> Path:
         """Write the whole state to an npz file for `load`; the file appears complete or not at all."""

@@ -8,15 +8,13 @@ true model is a fixed point.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.data.stretches import interpolated, runs_of
+from optid.data.stretches import interpolated
 from optid.errors import DataError, RankError
-from optid.identify.subspace.instruments import clipping_range
 from optid.models.hammerstein_ss import HammersteinSS
 
 ROUNDS = 12
@@ -25,60 +23,39 @@ ROUNDS = 12
 SETTLED = 1e-3
 """Change of the estimates (root mean square, in standard deviations of their outputs) below which no model follows."""
 
-
-@dataclass(frozen=True, eq=False)
-class Imputation:
-    """A record whose missing outputs are estimated.
-
-    Attributes:
-        records: (N, m + l) arrays [u | y], one per experiment; an output that could not be predicted is NaN.
-        missing: number of missing outputs.
-        samples: number of outputs, present or missing.
-        rounds: number of models.
-        change: last change of the estimates, in standard deviations of their outputs.
-    """
-
-    records: list[Array]
-    missing: int
-    samples: int
-    rounds: int
-    change: float
-
-    def __str__(self) -> str:
-        """Say what was estimated and how."""
-        return (f"{self.missing} of {self.samples} estimated for the projections by {self.rounds} preliminary models, "
-                f"the first from interpolated outputs (last change {self.change:.1e} standard deviations)")
+BEYOND = 0.2
+"""Estimated outputs are clipped to the range of the record, wider by this share of it on either side."""
 
 
-def count_windows(records: Sequence[Array], rows: int) -> tuple[int, int]:
-    """Return the number of windows of so many samples in which nothing is missing, and of all windows."""
-    complete = whole = 0
-    for record in records:
-        whole += max(len(record) - rows + 1, 0)
-        lengths = np.diff(runs_of(~np.isnan(record).any(axis=1)), axis=1)
-        complete += int(np.sum(np.maximum(lengths - rows + 1, 0)))
-    return complete, whole
+def clipping_range(outputs: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the limits (l,) of simulated outputs: those of outputs (N, l) on record, and `BEYOND`."""
+    low = np.nanmin([np.nanmin(y, axis=0) for y in outputs], axis=0)
+    high = np.nanmax([np.nanmax(y, axis=0) for y in outputs], axis=0)
+    return low - BEYOND * (high - low), high + BEYOND * (high - low)
 
 
 def _predicted(model: HammersteinSS, data: Data, filled: Sequence[Array]) -> list[Array]:
     """Return the predictions (N, l); those from the estimates so far where a feedback of predictions runs away."""
-    try:
-        found = model.predict(data)
-    except DataError:
+    completed = Data([e.u for e in data.experiments], list(filled), data.dt, list(data.inputs), list(data.outputs))
+    for record in (data, completed):
         try:
-            found = model.predict(Data([e.u for e in data.experiments], list(filled), data.dt, list(data.inputs),
-                                       list(data.outputs)))
+            found = model.predict(record)
+            return list(found) if isinstance(found, tuple) else [found]
         except DataError as error:
-            raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {error}") from error
-    return list(found) if isinstance(found, tuple) else [found]
+            reason = error
+    raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {reason}")
 
 
-def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Imputation:
+def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> tuple[list[Array], str]:
     """Estimate the missing outputs of a record.
 
     Args:
         data: the record.
         estimate: returns the model, with its gain K, of records (N, m + l) whose outputs are complete.
+
+    Returns:
+        Arrays [u | y], (N, m + l), one per experiment, in which an output that could not be predicted is NaN; and what
+        was estimated and how, in words.
 
     Raises:
         RankError: an output with fewer than two samples present, or as `estimate`.
@@ -99,5 +76,6 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> Impu
         moved = np.vstack([a - b for a, b in zip(new, filled)]) / spread
         change = float(np.sqrt(np.nansum(moved**2) / count))
         filled = new
-    return Imputation([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)], count, stacked.size, rounds,
-                      change)
+    return ([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)],
+            f"{count} of {stacked.size} estimated for the projections by {rounds} preliminary models, the first from "
+            f"interpolated outputs (last change {change:.1e} standard deviations)")

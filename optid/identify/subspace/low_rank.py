@@ -9,7 +9,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.subspace.observability import Observability, Preliminary, prepared
+from optid.identify.subspace.observability import Observability, prepared
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
 from optid.identify.validation import fit_percent
@@ -21,8 +21,7 @@ from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_star
 
 Values = Mapping[str, Array]
 
-RANK = 1e-3  # singular values below this part of the largest are none
-NOTHING = 1e-5  # of the largest singular value of the measured outputs' matrix
+RANK, NOTHING = 1e-3, 1e-5  # singular values below this part of the largest, of that of measured outputs, are none
 LARGEST = 10  # order at most where it is chosen
 SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposition costs
 
@@ -32,21 +31,28 @@ class Structured:
     """The structured problem of a record, in outputs of mean zero and unit variance.
 
     Attributes:
+        plan: what was asked for.
+        expansion: the signals.
         problem: the numbers.
         centre: (l,) subtracted from the outputs.
         scale: (l,) by which they were divided.
         size: largest singular value of the matrix of the measured outputs.
     """
 
+    plan: Plan
+    expansion: Expansion
     problem: NuclearProblem
     centre: Array
     scale: Array
     size: float
 
-    @property
-    def floor(self) -> float:
-        """Singular values below it are none: a weight so small that nothing is left of the matrix has rank zero."""
-        return NOTHING * self.size
+    def rank(self, sizes: Array) -> int:
+        """Return how many singular values count; with a weight so small that nothing is left of the matrix, none."""
+        return int(np.sum((sizes > RANK * sizes[0]) & (sizes > NOTHING * self.size)))
+
+    def order(self, sizes: Array) -> int:
+        """Return the rank, one at least, `LARGEST` and what the block rows can carry at most."""
+        return int(np.clip(self.rank(sizes), 1, min(LARGEST, self.problem.rows - 1)))
 
     def penalty(self, weight: float) -> float:
         """Return lambda for a weight: the inverse noise variance times the size per output sample."""
@@ -61,11 +67,13 @@ class Structured:
             left = np.linalg.solve(problem.left, left)
         return left * np.tile(self.scale, problem.rows)[:, None], sizes
 
-    def gamma(self, vectors: Array, sizes: Array, nx: int, values: Values) -> Array:
-        """Return the observability matrix (rows l, nx) of (A, C) in coordinates with states of about unit size.
+    def observability(self, values: Values, parts: tuple[Array, Array], nx: int) -> Observability:
+        """Return the observability matrix of a decomposed point, in coordinates with states of about unit size."""
+        gamma = self._gamma(values, *parts, nx)
+        return Observability(self.plan, self.plan.records, self.expansion, gamma, self.scale)
 
-        What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T.
-        """
+    def _gamma(self, values: Values, vectors: Array, sizes: Array, nx: int) -> Array:
+        """What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T."""
         found = vectors[:, :nx] * np.sqrt(sizes[:nx]) / self.problem.shape[1] ** 0.25
         predictor, l = self.problem.predictor, self.problem.l  # noqa: E741
         if predictor is None:
@@ -83,29 +91,22 @@ class Structured:
         return np.vstack(blocks)
 
 
-def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program],
-                  preliminary: Preliminary) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
+def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program]
+                  ) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
     """Return the weight, and where it is free the order, whose model simulates the parts held out best, and figures.
 
-    Args:
-        plan: what was asked for.
-        weights: those to try.
-        hold_out: part of every experiment that is held out.
-        pose: returns the programme of a structured problem, with a parameter "weight".
-        preliminary: returns the least-squares model of an observability matrix.
+    ``hold_out`` is a fraction of every experiment; ``pose`` returns the programme of a structured problem, with a
+    parameter "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
-    train = replace(plan, data=part)
-    expansion, alpha = prepared(replace(train, block_rows=prepared(plan)[1]))
-    structured = structure(train, expansion, alpha)
-    trials: list[tuple[float, float, int]] = []
+    structured, trials = structure(replace(plan, data=part, block_rows=prepared(plan)[1])), []
     program = pose(structured)
     for weight in weights:
         program.parameters["weight"].value = structured.penalty(weight)
         solution = yield program
         if solution.has_point:
             program = replace(program, start={name: solution.values[name] for name in program.start})
-            scores = order_scores(train, expansion, structured, solution.values, rest, preliminary)
+            scores = order_scores(structured, solution.values, rest)
             trials += [(score, weight, nx) for nx, score in scores.items()]
     if not trials:
         return weights[-1], plan.nx, {"weights tried": len(weights)}
@@ -113,30 +114,18 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
     return weight, nx, {"weights tried": len(weights), "simulation fit on the part held out in %": score}
 
 
-def order_scores(plan: Plan, expansion: Expansion, structured: Structured, values: Values, rest: Data,
-                 preliminary: Preliminary) -> dict[int, float]:
-    """Return the simulation fit in % on another record of the model of every order that a point allows.
-
-    Args:
-        plan: what was asked for; with an order, that one alone.
-        expansion: the signals of its record.
-        structured: the problem.
-        values: a point of its programme.
-        rest: the other record.
-        preliminary: as in `choose_weight`.
-    """
-    vectors, sizes = structured.decomposed(values)
-    most = min(rank_of(sizes, structured.floor), structured.problem.rows - 1)
-    orders = range(1, min(most, LARGEST) + 1) if plan.order is None else [plan.order] * (plan.order <= most)
-    found = {}
-    for nx in orders:
+def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
+    """Return the simulation fit in %, on another record, of the models of a point, by order: that asked for, or all."""
+    order, parts, found = structured.plan.order, structured.decomposed(values), {}
+    most = min(structured.rank(parts[1]), structured.problem.rows - 1)
+    for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
         try:
-            gamma = structured.gamma(vectors, sizes, nx, values)
-            model = preliminary(Observability(plan, plan.records, expansion, gamma, structured.scale))
-            found[nx] = held_out_fit(model, rest)
+            score = held_out_fit(structured.observability(values, parts, nx).model(), rest)
         except (RankError, DataError):  # an order this part of the record cannot carry is no candidate
             continue
-    return {nx: score for nx, score in found.items() if np.isfinite(score)}
+        if np.isfinite(score):
+            found[nx] = score
+    return found
 
 
 def held_out_fit(model: Any, data: Data) -> float:
@@ -145,28 +134,14 @@ def held_out_fit(model: Any, data: Data) -> float:
     return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(outputs))))
 
 
-def rank_of(sizes: Array, floor: float = 0.0) -> int:
-    """Return the number of singular values above a thousandth of the largest and above a floor."""
-    return int(np.sum((sizes > RANK * sizes[0]) & (sizes > floor)))
-
-
-def order_of(sizes: Array, most: int, floor: float = 0.0) -> int:
-    """Return the rank, one at least, `LARGEST` at most."""
-    return int(np.clip(rank_of(sizes, floor), 1, min(LARGEST, most)))
-
-
-def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
-    """Build the structured problem of a record.
-
-    Args:
-        plan: what was asked for; its instruments word is the form.
-        expansion: the signals.
-        alpha: number of block rows.
+def structure(plan: Plan) -> Structured:
+    """Build the structured problem of the record of a plan, whose instruments word is the form.
 
     Raises:
         StructureError: feedback in a form other than "predictor", or a record too long.
         RankError: too few usable windows.
     """
+    expansion, alpha = prepared(plan)
     l, form = expansion.l, plan.instruments  # noqa: E741
     if form != "predictor" and expansion.q:
         raise StructureError(f"form={form!r} projects on the complement of the inputs, which outputs that are fed back "
@@ -202,7 +177,7 @@ def structure(plan: Plan, expansion: Expansion, alpha: int) -> Structured:
         known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known
         problem = _weighted(problem, known, np.nan_to_num(np.hstack([signals, outputs])) if past else None)
     measured = problem.matrix(problem.data, problem.explained(problem.hankel(problem.data)))
-    return Structured(problem, centre, scale, float(np.linalg.norm(measured, 2)))
+    return Structured(plan, expansion, problem, centre, scale, float(np.linalg.norm(measured, 2)))
 
 
 def _weighted(problem: NuclearProblem, known: Array, instruments: Array | None) -> NuclearProblem:

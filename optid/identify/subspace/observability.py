@@ -1,32 +1,25 @@
 """The observability matrix of a record: order, weighting, missing outputs and simulated instruments."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
-from optid.identify.order.signals import order_test
-from optid.identify.subspace.imputation import count_windows, impute
-from optid.identify.subspace.instruments import simulate_clipped
-from optid.identify.subspace.observer import ObserverForm, ObserverProblem, observer_gain, observer_problem
+from optid.identify.noise import observer_gain, with_noise_or_reason
+from optid.identify.order.ranks import largest_gap, order_test
+from optid.identify.subspace.imputation import clipping_range, impute
 from optid.identify.subspace.plan import BEST, Plan
-from optid.identify.subspace.projection import (
-    WEIGHTINGS,
-    Projection,
-    check_order,
-    largest_gap,
-    project,
-    scaled_pair,
-    weakest_feedback,
-)
+from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
+from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.statistics.channels import check_channels
 from optid.statistics.expansion import Expansion
+from optid.statistics.hankel import complete_runs
 
 WEAK = 0.1
 """Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
@@ -34,6 +27,10 @@ WEAK = 0.1
 SCARCE, INTACT = 20, 0.8
 """Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 smaller share than this of all windows."""
+
+GRID, CHUNK = 2001, 8192
+"""Points at which feedback functions are tabulated for simulated instruments, which need not be exact, and samples
+expanded at a time."""
 
 INSIDE = 0.999
 """Modulus to which the poles of an unstable estimate are brought."""
@@ -59,17 +56,22 @@ class Observability:
     scale: Array
     figures: dict[str, Any] = field(default_factory=dict)
 
-    def pair(self) -> tuple[Array, Array, Array]:
-        """Return (A, C) by least squares, and gamma of the outputs divided by their sizes."""
-        return scaled_pair(self.gamma, self.scale)
+    @property
+    def scaled(self) -> Array:
+        """Gamma of the outputs divided by their sizes: least squares on it weighs all outputs alike."""
+        return self.gamma / np.tile(self.scale, len(self.gamma) // len(self.scale))[:, None]
+
+    def least_squares(self) -> Array:
+        """Return A (n, n) by least squares."""
+        return realise(self.scaled, len(self.scale))[0]
 
     def contracted(self) -> Array:
         """Return A by least squares, contracted where it is unstable: for simulations and comparisons."""
-        a = self.pair()[0]
+        a = self.least_squares()
         radius = spectral_radius(a)
         return a if radius < 1 else a * (INSIDE / radius)
 
-    def step(self, a: Array, *, instruments: bool = True) -> ObserverProblem:
+    def step(self, a: Array, *, instruments: bool = True) -> Realisation:
         """Compress the least squares for B, D, E, offset and x0 with a given A.
 
         Args:
@@ -79,15 +81,20 @@ class Observability:
         """
         plan, c = self.plan, self.gamma[: len(self.scale)].copy()
         closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
-        gain = observer_gain(a, c) if closed else np.zeros((len(a), len(c)))
+        gain = observer_gain(a, c, 1.0) if closed else np.zeros((len(a), len(c)))
         form = ObserverForm(a, c, gain, self.expansion, len(self.records), plan.direct(), plan.offset, 1 / self.scale)
         coloured = instruments and self.expansion.simulated and not plan.instruments.endswith("past")
         return observer_problem(self.records, form, instruments=coloured,
                                 targets=[record[:, plan.data.m :] for record in plan.records])
 
+    def model(self) -> HammersteinSS:
+        """Return the least-squares model, for comparisons: no constraints, A contracted.
 
-Preliminary = Callable[[Observability], HammersteinSS]
-"""Returns the least-squares model with its noise model, without constraints."""
+        Raises:
+            RankError: the record does not determine it.
+        """
+        step = self.step(self.contracted())
+        return step.model(self.plan.data, step.start())
 
 
 def prepared(plan: Plan) -> tuple[Expansion, int]:
@@ -97,25 +104,18 @@ def prepared(plan: Plan) -> tuple[Expansion, int]:
         StructureError: an order that the block rows cannot carry.
         DataError: a constant channel.
     """
-    expansion, given = plan.expansion(), plan.block_rows
+    expansion, nx = plan.expansion(), plan.order
     check_channels(plan.records, plan.data.inputs, plan.data.outputs)
-    if given is None:
-        alpha = expansion.block_rows(plan.records, plan.order)
-    elif isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 2:
-        raise StructureError(f"block_rows={given!r}: a whole number from 2, larger than the order.")
-    else:
-        alpha = int(given)
-    if plan.order is not None:
-        check_order(plan.order, alpha, plan.data.l)
+    alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
+             else check_integer(plan.block_rows, "block_rows", 2))
+    if nx is not None and alpha <= nx:
+        raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are needed; use "
+                             f"block_rows={nx + 1} or more, or nx={alpha - 1} or less.")
     return expansion, alpha
 
 
-def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observability:
+def estimate_observability(plan: Plan) -> Observability:
     """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
-
-    Args:
-        plan: what is asked for.
-        preliminary: of a record with estimated outputs.
 
     Raises:
         RankError: the record does not determine the model.
@@ -124,18 +124,18 @@ def estimate_observability(plan: Plan, preliminary: Preliminary) -> Observabilit
         DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
     """
     expansion, alpha = prepared(plan)
-    windows, imputed = _Windows(plan, plan.records, expansion, alpha, plan.instruments), {}
+    windows, imputed = _Windows(plan, plan.records, expansion, alpha), {}
     if _lacks_windows(plan, expansion, alpha):
-        imputation = impute(plan.data, lambda filled: _estimated(replace(windows, records=filled), preliminary))
-        windows, imputed = replace(windows, records=imputation.records), {"missing outputs": str(imputation)}
-        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {imputation}. The "
+        filled, how = impute(plan.data, lambda records: _preliminary(replace(windows, records=records)))
+        windows, imputed = replace(windows, records=filled), {"missing outputs": how}
+        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {how}. The "
                       "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
     windows = windows.instrumented()
     projection, expansion = windows.projected(), windows.expansion
     nx, reason = windows.order(projection)
     figures: dict[str, Any] = {
         "order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-        "windows": projection.statistics.windows, **imputed, "instruments": windows.instruments}
+        "windows": projection.statistics.windows, **imputed, "instruments": windows.plan.instruments}
     if plan.weighting == BEST:
         projection = windows.best_weighting(projection, nx)
         figures["weighting"] = f"{projection.weighting}: the smallest error on the record"
@@ -161,35 +161,36 @@ def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
     gaps = any(plan.data.missing[name] for name in plan.data.outputs)
     if not gaps or plan.block_rows is not None and not plan.imputes:
         return False
-    complete, candidates = count_windows(plan.records, 2 * alpha)
-    return complete < INTACT * candidates and complete < SCARCE * 2 * alpha * (expansion.p + expansion.q + expansion.l)
+    rows, runs = 2 * alpha, [run for record in plan.records for run in complete_runs(record, 2 * alpha)]
+    complete, candidates = (sum(max(len(part) - rows + 1, 0) for part in parts) for parts in (runs, plan.records))
+    return complete < INTACT * candidates and complete < SCARCE * rows * (expansion.p + expansion.q + expansion.l)
 
 
-def _estimated(windows: "_Windows", preliminary: Preliminary) -> HammersteinSS:
-    """Return the preliminary model of records whose missing outputs are estimated."""
+def _preliminary(windows: "_Windows") -> HammersteinSS:
+    """Return the model, with its noise model, of records whose missing outputs are estimated."""
     plan = windows.plan
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
         if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
             plan = replace(plan, instruments=f"{plan.instruments}+past")
-        return preliminary(replace(windows, plan=plan, instruments=plan.instruments).instrumented().ordered())
+        found = replace(windows, plan=plan).instrumented().ordered()
+        return with_noise_or_reason(found.model(), plan.data)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """Signals in windows of 2 alpha samples, and the instruments for them."""
+    """Signals in windows of 2 alpha samples."""
 
     plan: Plan
     records: list[Array]
     expansion: Expansion
     alpha: int
-    instruments: str
 
     def projected(self) -> Projection:
         plan = self.plan
-        return project(self.records, self.expansion, self.alpha, instruments=self.instruments, offset=plan.offset,
-                       form=plan.form, tolerance=plan.tolerance,
-                       weighting=WEIGHTINGS[0] if plan.weighting == BEST else plan.weighting)
+        found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
+                        form=plan.form, tolerance=plan.tolerance)
+        return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
     def ordered(self) -> Observability:
         """Return the observability matrix in the weighting that was asked for."""
@@ -209,21 +210,22 @@ class _Windows:
         if not plan.instruments.startswith("simulated"):
             return self
         if not self.expansion.q:
-            return replace(self, instruments=plan.instruments.replace("simulated", "inputs"))
-        windows = replace(self, instruments="inputs+past")
+            return replace(self, plan=replace(plan, instruments=plan.instruments.replace("simulated", "inputs")))
+        windows = replace(self, plan=replace(plan, instruments="inputs+past"))
         for i in range(plan.iterations):
             try:
                 found = windows.ordered()
             except RankError:
                 if i:
                     raise
-                found = replace(self, expansion=self.expansion.without_feedback(), instruments="inputs").ordered()
+                found = replace(self, plan=replace(plan, instruments="inputs"),
+                                expansion=self.expansion.without_feedback()).ordered()
             a = found.contracted()
             step = found.step(a)
             bu, du, ez, d, _ = step.matrices(step.least_squares())
             outputs = simulate_clipped(raw, found.expansion, a, step.form.c, bu, du, ez, d)
             windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
-                              expansion=self.expansion.with_simulated(), instruments=plan.instruments)
+                              expansion=self.expansion.with_simulated())
         return windows
 
     def best_weighting(self, projection: Projection, nx: int) -> Projection:
@@ -238,7 +240,7 @@ class _Windows:
             weighted = replace(projection, weighting=word)
             found = self.observability(weighted, nx)
             error = found.step(found.contracted(), instruments=False).problem.remainder
-            tried.append((spectral_radius(found.pair()[0]) >= 1, error, weighted))
+            tried.append((spectral_radius(found.least_squares()) >= 1, error, weighted))
         return min(tried, key=lambda one: one[:2])[2]
 
     def order(self, projection: Projection) -> tuple[int, str]:
@@ -249,15 +251,48 @@ class _Windows:
             nx, reason = rank, f"{rank}: the singular values after it are rounding"
         elif self.plan.nx == "auto":
             try:
-                nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.instruments,
+                nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.plan.instruments,
                                         offset=self.plan.offset).choice
             except RankError:  # singular regressors, or a record too short for the distribution
                 nx = None
         if nx is None:
-            nx = largest_gap(values, min(self.alpha - 1, values.size // 2))
+            floor = 10 * values.size * np.finfo(float).eps * values[0]  # the rounding of the decomposition
+            nx = largest_gap(values, min(self.alpha - 1, values.size // 2), floor)
             following = values[nx] if nx < values.size else 0.0
             reason = f"{nx}: the largest gap of the singular values, {values[nx - 1]:.3g} before {following:.3g}"
         if nx > rank:
             raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more "
                             "block rows or a richer input.")
         return nx, reason
+
+
+def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
+                     ez: Array, d: Array) -> list[Array]:
+    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
+
+    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
+    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
+    """
+    from optid.statistics.subspace_kernels import clipped_run
+
+    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
+    low, high = clipping_range([record[:, m : m + l] for record in records])
+    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
+    start = 0
+    for family in expansion.feedback:
+        e = ez[:, start : start + family.size]
+        grid = np.linspace(low[family.output], high[family.output], GRID)
+        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
+        start += family.size
+    simulated = []
+    open_loop = expansion.without_feedback()
+    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
+    for record in records:
+        out, x = np.empty((len(record), l)), np.zeros(n)
+        for first in range(0, len(record), CHUNK):
+            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
+            eta = np.where(np.isnan(eta), 0.0, eta)
+            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
+                        out[first : first + CHUNK])
+        simulated.append(out)
+    return simulated

@@ -1,15 +1,17 @@
 """What a subspace method is asked for, on a record in its own units."""
 
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from optid.arrays import Array, check_integer
 from optid.bases import Linear, UserFunctions, feedback_bases, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
+from optid.identify.arguments import one_of
 from optid.identify.subspace.projection import WEIGHTINGS
 from optid.program.units import in_units, inner_bases, own_units
 from optid.solving.solve import Evidence, Procedure
@@ -31,7 +33,6 @@ class Plan:
     Attributes:
         imputes: whether missing outputs may be estimated although ``block_rows`` is given.
         units: from those of the data above to those of the record; the identity where not given.
-        records: (N, m + l) raw channels [u | y], one array per experiment.
     """
 
     name: str
@@ -53,18 +54,19 @@ class Plan:
     constraints: tuple[Any, ...] = ()
     imputes: bool = False
     units: Transform = Transform((), (), (), ())
-    records: list[np.ndarray] = field(init=False, repr=False, default_factory=list)
 
     def __post_init__(self) -> None:
         for name, known in WORDS.items():
-            if (value := getattr(self, name)) not in known:
-                raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
-        nx: Any = self.nx
-        if nx not in ("auto", "gap") and (isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1):
-            raise StructureError(f"nx={self.nx!r}: a whole number from 1, 'auto' or 'gap'.")
+            one_of(name, getattr(self, name), known)
+        if self.nx not in ("auto", "gap"):
+            check_integer(self.nx, "nx, unless 'auto' or 'gap',")
         if not self.units.y_scale:
             object.__setattr__(self, "units", Transform.identity(self.data.m, self.data.l))
-        self.records.extend(np.hstack([e.u, e.y]) for e in self.data.experiments)
+
+    @cached_property
+    def records(self) -> list[Array]:
+        """Raw channels [u | y], (N, m + l), one array per experiment."""
+        return [np.hstack([e.u, e.y]) for e in self.data.experiments]
 
     @property
     def order(self) -> int | None:
@@ -73,8 +75,7 @@ class Plan:
 
     def expansion(self) -> Expansion:
         """Return the signals of the record, expanded in its bases."""
-        return expand(self.records, fitted_bases(self.data, self.basis),
-                      feedback_bases(self.data, self.feedback_basis), self.data.inputs, self.data.outputs)
+        return expand(self.data, self.basis, self.feedback_basis)
 
     def about(self, what: str) -> tuple[Any, ...]:
         """Constraints about "poles" or about "coefficients"."""
@@ -93,15 +94,9 @@ class Plan:
 
 def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
             ) -> Plan:
-    """Plan a method on a record taken to its own units (`optid.program.units`), see `in_record_units`.
+    """Plan a method on a record in memory, taken to its own units (`optid.program.units`); see `in_record_units`.
 
-    Args:
-        name: of the formulation.
-        data: the record, in memory.
-        basis: of the inputs.
-        feedback_basis: of the outputs, None without feedback.
-        offset: whether the model has a constant; without one nothing is centred.
-        settings: further fields of the plan.
+    Without an offset nothing is centred. The settings are further fields of the plan.
     """
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")

@@ -8,12 +8,11 @@ from functools import cached_property
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import DataWarning, StructureError
+from optid.errors import DataWarning
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import RQ, rq
 
-INSTRUMENTS = ("past", "inputs", "inputs+past", "simulated", "simulated+past")
 WEIGHTINGS = ("moesp", "cva", "plain")
 
 KEPT = 0.5
@@ -27,7 +26,6 @@ class Projection:
     Attributes:
         statistics: moments of the windows of 2 block_rows samples.
         blocks: the RQ decomposition.
-        instruments: word of the instruments.
         scale: (l,) standard deviations of the outputs; one output is left as it is.
         weighting: of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not
             lost), "cva" (the inverse root of the covariance of the future outputs with the regressors removed, so that
@@ -37,7 +35,6 @@ class Projection:
 
     statistics: HankelStatistics
     blocks: RQ
-    instruments: str
     scale: Array
     weighting: str = WEIGHTINGS[0]
 
@@ -77,25 +74,16 @@ class Projection:
 
 
 def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, instruments: str, offset: bool = True,
-            form: str = "projection", tolerance: float | None = None, weighting: str = "moesp") -> Projection:
-    """Take the statistics and decompose.
+            form: str = "projection", tolerance: float | None = None) -> Projection:
+    """Take the statistics of raw channels [u | y] or [u | y | simulated y] per experiment, and decompose.
 
-    Args:
-        records: raw channels [u | y] or [u | y | simulated y] per experiment.
-        expansion: the signals.
-        block_rows: of the future; the past has as many.
-        instruments: as in `Expansion.positions`.
-        offset: whether the system has a constant.
-        form: "projection" or "correlation".
-        tolerance: of the pseudo-inverse; None asks for regular regressors.
-        weighting: of the projected outputs.
+    Instruments are words as in `Expansion.positions`, ``form`` and ``tolerance`` as in `optid.statistics.rq.rq`; the
+    past has as many block rows as the future.
 
     Raises:
-        StructureError: unknown words.
+        StructureError: an unknown form.
         RankError: records that are too short, or do not excite the regressors.
     """
-    if instruments not in INSTRUMENTS:
-        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
     statistics.check()
@@ -105,7 +93,7 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     z, phi, y = expansion.positions(statistics.at, instruments, block_rows, offset)
     blocks = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
     scale = statistics.sizes(expansion.y, offset) if expansion.l > 1 else np.ones(1)
-    return Projection(statistics, blocks, instruments, scale, weighting)
+    return Projection(statistics, blocks, scale)
 
 
 def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
@@ -113,52 +101,8 @@ def realise(gamma: Array, l: int) -> tuple[Array, Array]:  # noqa: E741
     return np.asarray(np.linalg.lstsq(gamma[:-l], gamma[l:], rcond=None)[0], dtype=float), gamma[:l].copy()
 
 
-def scaled_pair(gamma: Array, scale: Array) -> tuple[Array, Array, Array]:
-    """Return (A, C) by least squares that weighs all outputs alike, and Gamma of the outputs divided by their sizes.
-
-    Args:
-        gamma: (rows l, n) in units of the outputs.
-        scale: (l,) sizes of the outputs.
-    """
-    scaled = gamma / np.tile(scale, len(gamma) // len(scale))[:, None]
-    return realise(scaled, len(scale))[0], gamma[: len(scale)].copy(), scaled
-
-
-def largest_gap(values: Array, largest: int) -> int:
-    """Return the order at the largest ratio s_i / s_(i+1), i = 1 .. largest (SLICOT IB01OD with its default tolerance).
-
-    Values below the rounding of the decomposition count as that rounding.
-
-    Args:
-        values: singular values, largest first.
-        largest: highest order to consider.
-    """
-    floor = np.maximum(values, 10 * values.size * np.finfo(float).eps * values[0])
-    ratios = floor[:-1] / floor[1:]
-    return int(np.argmax(ratios[: max(1, min(largest, ratios.size))])) + 1
-
-
-def check_order(nx: int, block_rows: int, outputs: int) -> None:
-    """Refuse an order that the block rows cannot carry.
-
-    Raises:
-        StructureError: with the largest order possible.
-    """
-    if block_rows <= nx:
-        raise StructureError(f"{block_rows} block rows for order {nx}: more block rows than states are needed; use "
-                             f"block_rows={nx + 1} or more, or nx={block_rows - 1} or less.")
-    if nx > (block_rows - 1) * outputs:
-        raise StructureError(f"order {nx} with {block_rows} block rows and {outputs} outputs: at most "
-                             f"{(block_rows - 1) * outputs}.")
-
-
 def weakest_feedback(projection: Projection, expansion: Expansion) -> tuple[float, str]:
-    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output.
-
-    Args:
-        projection: with simulated feedback functions among its signals.
-        expansion: the signals.
-    """
+    """Return the smallest share of an output's feedback functions that the simulated ones explain, and the output."""
     statistics, shares, start = projection.statistics, [], 0
     simulated = np.concatenate([[0], statistics.at(expansion.zeta_simulated, [0])])
     for family in expansion.feedback:

@@ -38,22 +38,18 @@ class Shift:
         a: (n, n), or None where no programme had a point.
         residual: ‖Gamma_up A - Gamma_dn‖ (Frobenius) at ``a``; nan without a point.
         bound: the least-squares residual, below which no A can come.
-        least_squares: (n, n) the unconstrained solution.
         applied: whether constraints were needed.
         status: OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the
             suboptimality is positive, INACCURATE where a back end was or where a pole lies outside its region.
         reason: one sentence for people.
-        certificate: (n, n) P of the inequalities; None where no programme had a point, and after a deflation.
     """
 
     a: Array | None
     residual: float
     bound: float
-    least_squares: Array
     applied: bool
     status: Status
     reason: str
-    certificate: Array | None = None
 
     @property
     def suboptimality(self) -> float:
@@ -104,9 +100,9 @@ class ShiftStep:
         return self.basis @ a @ self.change
 
 
-Programmes = tuple[Callable[..., Program], Callable[..., Program], Callable[..., Program]]
-"""The programmes of the step: (step, rules) -> joint, in P and Q = A P, its residual weighted by P; (step, P, A, rules)
--> refined, in A alone from a start, its residual unweighted; (step, A, rules) -> centred, the largest margin of P."""
+Programmes = tuple[Callable[..., Program], Callable[..., Program]]
+"""The programmes of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
+besides, in A alone from that A, its residual unweighted; (step, A, rules) -> the largest margin of P."""
 
 Shifting = Generator[Program, Solution, Shift]
 
@@ -137,39 +133,42 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     bound = float(np.linalg.norm(up @ free - down))
     verified = all(getattr(rule, "verify", None) is not None for rule in rules)
     if not _disobeyed(free, rules) and verified:
-        return Shift(free, bound, bound, free, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
-    if len(free) > LARGEST and verified and (blocks := _pole_blocks(free, rules)) is not None:
-        return (yield from _deflated(up, down, free, blocks, rules, programmes))
-    step, (joint, refined, centred) = ShiftStep.of(up, down, free), programmes
-    solution = yield joint(step, rules)
+        return Shift(free, bound, bound, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
+    if len(free) > LARGEST and verified:
+        shift = yield from _deflated(up, down, free, bound, rules, programmes)
+        if shift is not None:
+            return shift
+    step, (fitted, centred) = ShiftStep.of(up, down, free), programmes
+    solution = yield fitted(step, rules)
     if not solution.has_point or not _definite(solution.values["P"]):
         status = solution.status  # a singular P is no point
         status = Status.FAILED if status in (Status.OPTIMAL, Status.LOCAL) else status
-        return Shift(None, float("nan"), bound, free, True, status, solution.reason or solution.claimed)
-    p, a = solution.values["P"], step.recover(solution.values)
-    best, status, reason = float(np.linalg.norm(up @ a - down)), solution.status, solution.reason
+        return Shift(None, float("nan"), bound, True, status, solution.reason or solution.claimed)
+    p, a, found = solution.values["P"], step.recover(solution.values), solution
+    best = float(np.linalg.norm(up @ a - down))
     for last in [False] * (ROUNDS - 1) + [True]:
-        solution = yield refined(step, p, a, rules)
+        solution = yield fitted(step, rules, (p, a))
         if not solution.has_point:
             break
         trial = step.recover(solution.values)
         residual, fall = float(np.linalg.norm(up @ trial - down)), 0.0
         if residual < best and not set(_disobeyed(trial, rules)) - set(_disobeyed(a, rules)):
-            fall, a, best = best - residual, trial, residual
-            status, reason = solution.status, solution.reason
+            fall, a, best, found = best - residual, trial, residual, solution
         if last or fall <= ENOUGH * (best - bound) or best - bound <= TINY * step.size:
             break
         solution = yield centred(step, a, rules)
         if not solution.has_point or not _definite(solution.values["P"]):
             break
         p = solution.values["P"]
-    return _judged((best, a, p), bound, free, status, reason, rules, step.size)
+    return _judged(a, up, down, bound, found.status, found.reason, rules)
 
 
-def _pole_blocks(free: Array, rules: Sequence[Any]) -> tuple[Array, Array, list[int]] | None:
-    """Return the real Schur form of A, its basis, and the ends of its blocks: poles that obey, then some at a time.
+def _deflated(up: Array, down: Array, free: Array, bound: float, rules: Sequence[Any], programmes: Programmes
+              ) -> Generator[Program, Solution, Shift | None]:
+    """Solve the step block by block of the real Schur form A = Z T Z': poles that obey, then a few at a time.
 
-    None where the rules speak of the poles together: none of them disobeys by itself.
+    The columns of ``(up A - down) Z`` that belong to a block are ``up_1 X + up_2 S - down_2``, with X free: without the
+    range of up_1, a small step in S. None where the rules speak of the poles together: none disobeys by itself.
     """
     from scipy.linalg import schur
 
@@ -181,58 +180,40 @@ def _pole_blocks(free: Array, rules: Sequence[Any]) -> tuple[Array, Array, list[
     except np.linalg.LinAlgError:  # poles too close to be told from each other: all of them are constrained
         found = (*schur(free, output="real"), 0)
     triangle, basis, kept = found
-    n, ends = len(free), [int(kept)]
+    n, ends, status, reason = len(free), [int(kept)], Status.LOCAL, ""
     if ends[0] == n:
         return None
     while ends[-1] < n:
         end = min(ends[-1] + AT_ONCE, n)
         ends.append(end - (end < n and triangle[end, end - 1] != 0))  # a pair stays together
-    return triangle, basis, ends
-
-
-def _deflated(up: Array, down: Array, free: Array, blocks: tuple[Array, Array, list[int]],
-              rules: Sequence[Any], programmes: Programmes) -> Shifting:
-    """Solve the step block by block of a Schur form: A = Z T Z', T block upper triangular.
-
-    The columns of ``(up A - down) Z`` that belong to a block are ``up_1 X + up_2 S - down_2``, with X free: without the
-    range of up_1, a small step in S.
-    """
-    triangle, basis, ends = blocks
     up_z, down_z = up @ basis, down @ basis
     t = np.zeros_like(triangle)
     t[: ends[0], : ends[0]] = triangle[: ends[0], : ends[0]]
-    statuses, reasons = [], []
     for first, last in zip(ends, ends[1:]):
         own, before = slice(first, last), slice(0, first)
         range_before = np.linalg.qr(up_z[:, before])[0]
         outside = [part - range_before @ (range_before.T @ part) for part in (up_z[:, own], down_z[:, own])]
         shift = yield from constrained_shift(outside[0], outside[1], rules, programmes)
         if shift.a is None:
-            return replace(shift, bound=float(np.linalg.norm(up @ free - down)), least_squares=free)
+            return replace(shift, bound=bound)
         t[own, own] = shift.a
         t[before, own] = np.linalg.lstsq(up_z[:, before], down_z[:, own] - up_z[:, own] @ shift.a, rcond=None)[0]
-        statuses.append(shift.status)
-        reasons.append(shift.reason)
-    a, bound = basis @ t @ basis.T, float(np.linalg.norm(up @ free - down))
-    worst = next(((s, r) for s, r in zip(statuses, reasons) if s not in (Status.OPTIMAL, Status.LOCAL)),
-                 (Status.LOCAL, ""))
-    return _judged((float(np.linalg.norm(up @ a - down)), a, None), bound, free, *worst, rules,
-                   float(np.linalg.norm(down)))
+        if status is Status.LOCAL and shift.status not in (Status.OPTIMAL, Status.LOCAL):  # the first that went wrong
+            status, reason = shift.status, shift.reason
+    return _judged(basis @ t @ basis.T, up, down, bound, status, reason, rules)
 
 
-def _judged(best: tuple[float, Array, Array | None], bound: float, free: Array, status: Status,
-            reason: str, rules: Sequence[Any], size: float) -> Shift:
-    residual, a, p = best
+def _judged(a: Array, up: Array, down: Array, bound: float, status: Status, reason: str, rules: Sequence[Any]) -> Shift:
+    residual = float(np.linalg.norm(up @ a - down))
     excess = residual - bound
     said = f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"
-    outside = _disobeyed(a, rules)
-    if outside:
+    if outside := _disobeyed(a, rules):
         status, reason = Status.INACCURATE, "; ".join(outside)
     if status in (Status.OPTIMAL, Status.LOCAL):
-        status, reason = (Status.OPTIMAL if excess <= TINY * size else Status.LOCAL), said
+        status, reason = (Status.OPTIMAL if excess <= TINY * np.linalg.norm(down) else Status.LOCAL), said
     else:
         reason = f"{said}; {reason}" if reason else said
-    return Shift(a, residual, bound, free, True, status, reason, p)
+    return Shift(a, residual, bound, True, status, reason)
 
 
 def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:

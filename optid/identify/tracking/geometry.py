@@ -100,6 +100,11 @@ def orthonormal(basis: ArrayLike, what: str = "basis", n: int | None = None) -> 
     return left
 
 
+def _checked(covariance: ArrayLike, basis: ArrayLike) -> tuple[Array, Array]:
+    c = as_covariance(covariance)
+    return c, as_basis(basis, len(c))
+
+
 def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
     """Return the principal angles between two column spaces, ascending, in radians.
 
@@ -122,23 +127,20 @@ def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
 
 def projection_loss(covariance: ArrayLike, basis: ArrayLike) -> float:
     """Return J(W) for a covariance (n, n) and W (n, r) of any rank."""
-    c = as_covariance(covariance)
-    w = as_basis(basis, len(c))
+    c, w = _checked(covariance, basis)
     inner = w.T @ c @ w
     return float(np.trace(c) - 2 * np.trace(inner) + np.sum(inner * (w.T @ w)))
 
 
 def loss_gradient(covariance: ArrayLike, basis: ArrayLike) -> Array:
     """Return the gradient (n, r) of J at W: -4 C W + 2 C W W^T W + 2 W W^T C W."""
-    c = as_covariance(covariance)
-    w = as_basis(basis, len(c))
+    c, w = _checked(covariance, basis)
     return -4 * c @ w + 2 * c @ w @ (w.T @ w) + 2 * w @ (w.T @ c @ w)
 
 
 def loss_hessian(covariance: ArrayLike, basis: ArrayLike) -> Array:
     """Return the Hessian (n r, n r) of J at W, for vec(W) by columns."""
-    c = as_covariance(covariance)
-    w = as_basis(basis, len(c))
+    c, w = _checked(covariance, basis)
     n, r = w.shape
     cw, gram, inner = c @ w, w.T @ w, w.T @ c @ w
     hessian = np.kron(gram - 2 * np.eye(r), 2 * c) + np.kron(inner, 2 * np.eye(n))
@@ -151,8 +153,7 @@ def loss_hessian(covariance: ArrayLike, basis: ArrayLike) -> Array:
 
 def stationary_point(covariance: ArrayLike, basis: ArrayLike, indices: Sequence[int] = ()) -> StationaryPoint:
     """Judge one W (n, r) by gradient and curvature of J."""
-    c = as_covariance(covariance)
-    w = as_basis(basis, len(c))
+    c, w = _checked(covariance, basis)
     scale = float(np.linalg.norm(c, 2)) * max(1.0, float(np.linalg.norm(w, 2)) ** 3)
     gradient = float(np.linalg.norm(loss_gradient(c, w)))
     curvatures = np.asarray(np.linalg.eigvalsh(loss_hessian(c, w)), dtype=float)

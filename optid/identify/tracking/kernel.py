@@ -17,9 +17,6 @@ WEAK = 1e-8
 """Pivot of the Gram matrix of the rows of W that are present, relative to its diagonal, below which they do not
 determine the coordinates of a sample."""
 
-RENEWED = 1024
-"""Samples after which the columns of an orthonormal W are orthonormalised again, against the creep of rounding."""
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def track(
@@ -92,8 +89,6 @@ def track(
                 step = tau * inside + scale * e[i]
                 for j in range(r):
                     basis[i, j] += step * g[j]
-            if counts[1] % RENEWED == 0:
-                _orthonormalise(basis)
         else:
             for i in range(n):
                 for j in range(r):
@@ -137,22 +132,3 @@ def _solved(basis: Array, x: Array, factor: Array, y: Array) -> bool:
                 return False
     _gain(factor, y, y)
     return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _orthonormalise(basis: Array) -> None:
-    """Gram-Schmidt on columns that are nearly orthonormal."""
-    n, r = basis.shape
-    for j in range(r):
-        for k in range(j):
-            inner = 0.0
-            for i in range(n):
-                inner += basis[i, k] * basis[i, j]
-            for i in range(n):
-                basis[i, j] -= inner * basis[i, k]
-        length = 0.0
-        for i in range(n):
-            length += basis[i, j] * basis[i, j]
-        length = np.sqrt(length)
-        for i in range(n):
-            basis[i, j] /= length

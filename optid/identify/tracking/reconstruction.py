@@ -62,9 +62,7 @@ class Reconstruction:
 
 def optimal_reconstruction(covariance: ArrayLike, r: int) -> Reconstruction:
     """Project on the r dominant eigenvectors of a covariance (n, n): P = U_1 U_1^T."""
-    check_integer(r, "r", high=len(np.asarray(covariance)))
-    found = suboptimal_reconstruction(covariance, range(r))
-    return replace(found, worst_loss=found.loss, kind="optimal")
+    return replace(constrained_reconstruction(covariance, r), kind="optimal")
 
 
 def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> Reconstruction:

@@ -5,20 +5,21 @@ A. Chkeif and Y. Hua, Fast orthonormal PAST algorithm, IEEE Signal Processing Le
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
-from optid.identify.recursive.intake import as_block
+from optid.identify.recursive.intake import as_block, forgetting_factor
 from optid.identify.recursive.saved_state import SavedState
 from optid.identify.tracking.geometry import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
-SETTINGS = ("n", "r", "method", "forgetting", "missing", "names")
+RENEWED = 1024
+"""Samples after which the columns of an orthonormal W are orthonormalised again, against the creep of rounding."""
 
 
 class SubspaceTracker(SavedState):
@@ -42,6 +43,7 @@ class SubspaceTracker(SavedState):
     """
 
     kind, arrays = "tracker", ("W", "root", "sums", "counts")
+    settings = ("n", "r", "method", "forgetting", "missing", "names")
 
     def __init__(
         self, n: int, r: int, *, method: Literal["past", "opast"] = "opast", forgetting: float = 0.995,
@@ -69,11 +71,9 @@ class SubspaceTracker(SavedState):
         if method not in METHODS or missing not in MISSING:
             raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
                                  f"{', '.join(MISSING)}.")
-        if not 0 < forgetting <= 1:
-            raise StructureError(f"forgetting={forgetting!r}: a number above 0, at most 1, is needed.")
         if not (np.isfinite(information) and information > 0):
             raise StructureError(f"information={information!r}: a positive number is needed.")
-        self.method, self.forgetting, self.missing = method, float(forgetting), missing
+        self.method, self.forgetting, self.missing = method, forgetting_factor(forgetting), missing
         self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
         if len(self.names) != self.n:
             raise StructureError(f"{len(self.names)} names for {self.n} coordinates.")
@@ -103,9 +103,15 @@ class SubspaceTracker(SavedState):
                             "'skip'.")
         if self.missing == "skip":
             block = np.where(lost.any(axis=1, keepdims=True), np.nan, block)
-        residuals = np.empty(len(block))
-        track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block), self.forgetting,
-              self.method == "opast", residuals)
+        residuals, start = np.empty(len(block)), 0
+        while start < len(block):
+            part = slice(start, start + RENEWED - int(self.counts[0]) % RENEWED)
+            track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block[part]), self.forgetting,
+                  self.method == "opast", residuals[part])
+            if self.method == "opast" and self.counts[0] % RENEWED == 0:
+                columns, triangle = np.linalg.qr(self.W)
+                self.W[:] = columns * np.sign(np.diag(triangle))
+            start = part.stop
         return residuals
 
     @property
@@ -150,13 +156,6 @@ class SubspaceTracker(SavedState):
     def angles(self, nominal: ArrayLike) -> Array:
         """Return the principal angles to a nominal subspace (n, s), ascending, in radians."""
         return principal_angles(self.W, as_basis(nominal, self.n, "nominal"))
-
-    def _head(self) -> dict[str, Any]:
-        return {"settings": {name: getattr(self, name) for name in SETTINGS}}
-
-    @classmethod
-    def _of_head(cls, head: dict[str, Any], functions: dict[str, Any] | None) -> "SubspaceTracker":
-        return cls(**head["settings"])
 
     def __str__(self) -> str:
         seen, used, passed = self.counts.tolist()

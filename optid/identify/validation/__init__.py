@@ -4,13 +4,5 @@ from optid.identify.validation.checks import Validation, validate
 from optid.identify.validation.comparison import Comparison, compare_models
 from optid.identify.validation.predictions import HorizonCurve, Measures, fit_by_horizon, fit_percent
 
-__all__ = [
-    "Comparison",
-    "HorizonCurve",
-    "Measures",
-    "Validation",
-    "compare_models",
-    "fit_by_horizon",
-    "fit_percent",
-    "validate",
-]
+__all__ = ["Comparison", "HorizonCurve", "Measures", "Validation", "compare_models", "fit_by_horizon", "fit_percent",
+           "validate"]

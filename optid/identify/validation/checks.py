@@ -7,18 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
-from optid.identify.validation.correlations import (
-    LEVEL,
-    Correlation,
-    autocorrelation,
-    between_outputs,
-    cross_correlation,
-)
+from optid.identify.record_checks import list_outside
+from optid.identify.validation.correlations import LEVEL, Correlation, autocorrelation, cross_correlation
 from optid.identify.validation.predictions import (
-    MEASURED,
     ONE_STEP,
     SIMULATION,
     Measures,
@@ -27,7 +21,6 @@ from optid.identify.validation.predictions import (
     simulated,
 )
 from optid.identify.validation.structure import Structure, structure_test
-from optid.models.experiments import checked_horizon
 from optid.models.functions import has_feedback, static_functions
 from optid.registry import render
 
@@ -76,16 +69,6 @@ class Validation:
         return self.predictors[ONE_STEP]
 
     @property
-    def ahead(self) -> dict[str, Measures]:
-        """Errors of the prediction `horizon` samples ahead, by output; empty with a horizon of 1."""
-        return self.predictors.get(f"{self.horizon} steps", {})
-
-    @property
-    def measured_feedback(self) -> dict[str, Measures]:
-        """Errors of the simulation with measured feedback, by output; empty where there is none."""
-        return self.predictors.get(MEASURED, {})
-
-    @property
     def simulation(self) -> dict[str, Measures]:
         """Errors of simulation by output; empty where there is none."""
         return self.predictors.get(SIMULATION, {})
@@ -116,7 +99,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
     Args:
         model: the model.
         data: the record; detrended or scaled data are taken back to raw units first.
-        x0: initial state of the simulation, as in `HammersteinARX.simulate`.
+        x0: initial state of the simulation, as in `HammersteinTF.simulate`.
         lags: largest lag of the residual tests; fewer when the record is shorter than four times that.
         horizon: how many samples ahead to predict, besides one; see `fit_by_horizon` for a whole curve.
 
@@ -128,7 +111,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         DataWarning: the record does not look Hammerstein or does not determine a free model, the model is unstable, no
             simulation is possible, or inputs lie outside the interval of their basis; also in `Validation.notes`.
     """
-    horizon, raw = checked_horizon(horizon), data.raw()
+    horizon, raw = check_integer(horizon, "horizon"), data.raw()
     predicted = {ONE_STEP: tuple(one_step(model, raw))}
     residuals = tuple(e.y - p for e, p in zip(raw.experiments, predicted[ONE_STEP]))
     present = np.sum([np.sum(~np.isnan(r), axis=0) for r in residuals], axis=0)
@@ -173,8 +156,8 @@ def _residual_tests(data: Data, residuals: Sequence[Array], lags: int) -> dict[s
         "autocorrelations": {name: autocorrelation(r, name, lags) for name, r in columns.items()},
         "cross_correlations": {(name, channel): cross_correlation(r, u, name, channel, lags)
                                for name, r in columns.items() for channel, u in inputs.items()},
-        "between": {(name, other): between_outputs(r, columns[other], name, other, lags)
-                    for name, r in columns.items() for other in columns if other != name}}
+        "between": {(name, other): autocorrelation(r, name, lags, past=past, other=other)
+                    for name, r in columns.items() for other, past in columns.items() if other != name}}
 
 
 def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> tuple[Array, ...]:
@@ -197,11 +180,8 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
             continue
         name, basis, samples = function.name, function.nonlinearity.basis, function.samples(data)
         shares[name] = basis.n_outside(samples) / max(int(np.sum(~np.isnan(samples))), 1)
-        if shares[name] and basis.interval is not None:
-            lo, hi = basis.interval
-            channel = "output" if function.fed_back else "input"
-            notes.append(f"{100 * shares[name]:.2g} % of {channel} {name!r} lies outside [{lo:g}, {hi:g}], where "
-                         f"{function.word} was identified; there it is set to {basis.outside!r}.")
+        found = list_outside("output" if function.fed_back else "input", name, shares[name], basis)
+        notes.extend(note for note in found if note not in notes)
     return shares
 
 

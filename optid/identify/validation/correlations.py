@@ -48,38 +48,34 @@ class Correlation:
         return int(np.sum(counts[self.lags != 0] if self.input is None else counts))
 
 
-def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25) -> Correlation:
-    """Test the residuals (N,) of each experiment for whiteness by Ljung and Box's statistic; NaN = missing."""
-    parts = _standardised(residuals)
-    values, counts = _products(parts, parts, range(lags + 1))
-    inflation = 1 + 2 / max(counts[0], 1)
-    return Correlation(output, None, np.arange(lags + 1), values, _band(counts),
-                       _portmanteau(values[1:], counts[1:], inflation))
+def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25, *, past: Sequence[Array] | None = None,
+                    other: str | None = None) -> Correlation:
+    """Test whether residuals depend on their own past by Ljung and Box's statistic, or on that of another output.
 
+    Samples of the same instant may be correlated: the noises of two outputs often are. The residuals of another output
+    are taken to be white, too, which their own test decides.
 
-def between_outputs(residuals: Sequence[Array], others: Sequence[Array], output: str, other: str, lags: int = 25
-                    ) -> Correlation:
-    """Test whether the residual of an output depends on the past of the residual of another one, at lags 1 .. lags.
-
-    Samples of the same instant may be correlated: the noises of two outputs often are. Both residuals are taken to be
-    white, which their own tests decide. Arguments as in `cross_correlation`, with another output for the input.
+    Args:
+        residuals: (N,) per experiment, NaN = missing.
+        output: name of the output.
+        lags: largest lag.
+        past: (N,) residuals of the other output per experiment; its own when not given.
+        other: name of the other output.
     """
-    values, counts = _products(_standardised(residuals), _standardised(others), range(1, lags + 1))
-    return Correlation(output, other, np.arange(1, lags + 1), values, _band(counts), _portmanteau(values, counts))
+    first = int(past is not None)
+    own = _standardised(residuals)
+    values, counts = _products(own, own if past is None else _standardised(past), range(first, lags + 1))
+    late, inflation = slice(1 - first, None), 1.0 if first else 1 + 2 / max(counts[0], 1)
+    return Correlation(output, other, np.arange(first, lags + 1), values, _band(counts),
+                       _portmanteau(values[late], counts[late] * inflation))
 
 
 def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
                       ) -> Correlation:
     """Test whether the residuals depend on the input at lags 0 .. lags; negative lags show feedback.
 
-    The statistic takes the autocorrelation of the input into account.
-
-    Args:
-        residuals: (N,) per experiment, NaN = missing.
-        inputs: (N,) per experiment, NaN = missing.
-        output: name of the output.
-        channel: name of the input.
-        lags: largest lag.
+    The statistic takes the autocorrelation of the input into account. Arguments as in `autocorrelation`, with the
+    samples (N,) per experiment and the name of an input.
     """
     e, u = _standardised(residuals), _standardised(inputs)
     around = np.arange(-lags, lags + 1)
@@ -95,9 +91,9 @@ def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], outpu
     return Correlation(output, channel, around, values, _band(counts), p_value)
 
 
-def _portmanteau(values: Array, weights: Array, inflation: float = 1.0) -> float:
+def _portmanteau(values: Array, weights: Array) -> float:
     """Probability that a chi-square variable exceeds the weighted sum of squares of so many values."""
-    return float(chdtrc(values.size, float(np.sum(weights * values**2) * inflation)))
+    return float(chdtrc(values.size, float(np.sum(weights * values**2))))
 
 
 def _band(counts: Array) -> Array:

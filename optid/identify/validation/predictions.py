@@ -120,6 +120,25 @@ def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
     return np.array([fit_percent(y, predicted) for predicted in stacked])
 
 
+def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
+    """Return the fit in % of one predictor on a record, (l,); NaN where there is no such simulation.
+
+    Args:
+        model: the model.
+        data: the record.
+        word: "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
+    """
+    raw = data.raw()
+    if word == ONE_STEP:
+        return common_fits(raw, [one_step(model, raw)])[0]
+    if not any(data.missing[name] for name in data.inputs):
+        try:
+            return common_fits(raw, [simulated(model, raw, word)])[0]
+        except DataError:  # it leaves the range of the data
+            pass
+    return np.full(data.l, np.nan)
+
+
 @dataclass(frozen=True, eq=False)
 class HorizonCurve:
     """Fits of the predictions so many samples ahead; `print` it.

@@ -8,9 +8,9 @@ Two consequences are tested, and neither needs an order or a noise model: (1) fu
 all of y that the input explains, so that products of samples at different lags and functions of a filtered input, the
 mark of a Wiener system, save nothing; (2) the matrix of coefficients, lags times functions, has rank one.
 
-Lags are compressed by a few filters (`lag_filters`). An autoregression fitted to the residuals makes the noise white,
-and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of any
-colour. All columns exist chunk by chunk only.
+Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals makes the noise
+white, and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of
+any colour. All columns exist chunk by chunk only.
 Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher-order correlations as structure tests
 (Billings and Voon 1986); rank one (Bai 1998).
 """

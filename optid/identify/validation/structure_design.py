@@ -1,15 +1,34 @@
-"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record."""
+"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record.
+
+The functions follow any static nonlinearity, and the filters are found whatever the nonlinearity and the noise are.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.data.stretches import interpolated
-from optid.identify.validation.lag_filters import Family, convolved, delay_of, orthonormal_filters, poles_of
+from optid.errors import RankError
+from optid.identify.order.ranks import rank_test
+from optid.models.recursions import lfilter
+from optid.statistics.hankel import HankelStatistics, hankel_statistics
+from optid.statistics.rq import rq
+
+BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
+LATEST = 30  # longest delay looked for, in samples
+LEVEL = 0.01
+SPARE = 1  # poles more than the order that the data show: what is too weak for that may still matter to a sharp test
+FEW = 3  # functions per input with which the dynamics are looked for
+RADIUS, SLOWEST = 0.98, 20
+"""Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
+
+SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
 
 DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
@@ -22,6 +41,163 @@ LONGEST = 600  # samples after which the filters are cut, at most
 CHUNK = 16384
 PRESENT = 0.9
 """Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Functions of one input: powers, which follow its tails, and hats between quantiles, which follow its kinks.
+
+    Attributes:
+        centre, spread: mean and standard deviation of the samples.
+        degree: largest power.
+        nodes: (k + 2,) increasing; k hats, one for each inner node.
+    """
+
+    centre: float
+    spread: float
+    degree: int
+    nodes: Array
+
+    @classmethod
+    def of(cls, data: Data, c: int, degree: int, hats: int) -> "Family":
+        """Place the functions for input c; no more than it has levels less one.
+
+        Raises:
+            RankError: a constant input.
+        """
+        samples = np.concatenate([e.u[:, c] for e in data.experiments])
+        samples = samples[~np.isnan(samples)]
+        levels = np.unique(samples).size
+        if levels < 2:
+            raise RankError(f"Input {data.inputs[c]!r} is constant: nothing depends on it.")
+        degree = min(degree, levels - 1)
+        room = max(0, min(hats, levels - 1 - degree))
+        nodes = np.unique(np.quantile(samples, np.linspace(0, 1, room + 2))) if room else np.zeros(0)
+        return cls(float(samples.mean()), float(samples.std()), degree, nodes)
+
+    @property
+    def size(self) -> int:
+        """Number of functions."""
+        return self.degree + max(self.nodes.size - 2, 0)
+
+    def values(self, u: Array) -> Array:
+        """Evaluate the functions of complete samples, (N, size)."""
+        x = (u - self.centre) / self.spread
+        powers = np.asarray(np.polynomial.hermite_e.hermevander(x, self.degree)[:, 1:], dtype=float)
+        if self.nodes.size < 3:
+            return powers
+        hats = [np.interp(u, self.nodes, one) for one in np.eye(self.nodes.size)[1:-1]]
+        return np.column_stack([powers, *hats])
+
+
+def delay_of(data: Data) -> int:
+    """Estimate the delay of a record: samples before which no function of any input matters.
+
+    Least squares of the outputs on three functions of the inputs at all lags; one less than the first lag whose
+    coefficients look significant. A delay too short costs a few filters, one too long is wrong: hence the generous
+    level. Zero where the record is too short to tell.
+    """
+    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
+    p = sum(family.size for family in families)
+    shortest = min(e.n_samples for e in data.experiments)
+    lags = min(LATEST + 10, data.n_samples // (6 * p), shortest // 3)
+    if lags < 3:
+        return 0
+    statistics = _statistics(data, families, lags, 0)
+    past = np.concatenate([[0], *(statistics.at(range(p), [lags - 1 - lag]) for lag in range(lags))])
+    spare = statistics.windows - past.size
+    if spare < past.size:
+        return 0
+    now = statistics.at(range(p, p + data.l), [lags - 1])
+    gram = statistics.gram
+    inverse = np.linalg.pinv(gram[np.ix_(past, past)], hermitian=True)
+    theta = inverse @ gram[np.ix_(past, now)]
+    rest = np.maximum(np.diag(gram[np.ix_(now, now)] - theta.T @ gram[np.ix_(past, now)]), 1e-300)
+    for lag in range(lags):
+        block = slice(1 + lag * p, 1 + (lag + 1) * p)
+        weight = np.linalg.pinv(inverse[block, block], hermitian=True)
+        energy = np.einsum("io,ij,jo->o", theta[block], weight, theta[block])
+        if (fdtrc(p, spare, (energy / p) / (rest / spare)) < LEVEL).any():
+            return min(max(lag - 1, 0), LATEST)
+    return 0
+
+
+def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
+    """Estimate the poles between inputs and outputs by a subspace method with inputs alone as instruments.
+
+    The inputs enter through three functions each, so that a static nonlinearity at the input is no obstacle, and noise
+    of any colour only costs accuracy. The order is that of `rank_test`.
+
+    Args:
+        data: the record.
+        delay: samples by which the inputs are delayed.
+
+    Returns:
+        (n,) complex poles well within the unit circle, in conjugate pairs; empty for a static record.
+
+    Raises:
+        RankError: the record is too short or does not excite the functions.
+    """
+    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
+    p, outs = sum(family.size for family in families), data.l
+    alpha = BLOCK_ROWS
+    while alpha > FEWEST and 6 * alpha * (p + outs) > data.n_samples:
+        alpha -= 1
+    statistics = _statistics(data, families, 3 * alpha, delay)
+    z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
+    phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
+    y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
+    order = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=(alpha - 1) * outs).order
+    if order == 0:
+        return np.zeros(0, dtype=complex)
+    observability = rq(statistics, z, phi, y).decomposition[0][:, : min(order + SPARE, (alpha - 1) * outs)]
+    a = np.linalg.lstsq(observability[:-outs], observability[outs:])[0]
+    poles = np.asarray(np.linalg.eigvals(a), dtype=complex)
+    radius = min(RADIUS, 1 - SLOWEST / data.n_samples)
+    return poles * np.minimum(1.0, radius / np.maximum(np.abs(poles), 1e-300))
+
+
+def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, longest: int) -> Array:
+    """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
+
+    With A^2 in the denominator the span contains B / A' for poles near the given ones, up to the square of their error.
+
+    Args:
+        poles: (n,) in conjugate pairs.
+        extra: lags beyond those of A^2, for pulses and further delays.
+        delay: samples before all responses begin.
+        longest: samples after which the responses are cut at the latest.
+    """
+    a = np.asarray(np.real(np.poly(np.concatenate([poles, poles]))), dtype=float) if len(poles) else np.ones(1)
+    count = a.size + extra
+    response = lfilter([1.0], a, np.eye(1, max(longest, count + 1))[0])
+    large = np.flatnonzero(np.abs(response) > SETTLED * np.abs(response).max())
+    length = min(response.size, int(large[-1]) + 1 + count)
+    shifted = np.column_stack([np.concatenate([np.zeros(i), response[: length - i]]) for i in range(count)])
+    orthonormal = np.asarray(np.linalg.qr(shifted)[0], dtype=float)
+    return np.concatenate([np.zeros((delay, count)), orthonormal])
+
+
+def convolved(values: Array, filters: Array) -> Array:
+    """Filter every column of values (T, P) with every response of filters (L, J) where it fits: (T - L + 1, J, P)."""
+    size = next_fast_len(len(values), real=True)
+    spectra = np.asarray(rfft(values, size, axis=0))
+    found = np.empty((len(values) - len(filters) + 1, filters.shape[1], values.shape[1]))
+    for j, response in enumerate(filters.T):
+        whole = np.asarray(irfft(spectra * np.asarray(rfft(response, size))[:, None], size, axis=0))
+        found[:, j] = whole[len(filters) - 1 : len(values)]
+    return found
+
+
+def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:
+    m = data.m
+
+    def expand(raw: Array) -> Array:
+        return np.hstack([*(family.values(raw[:, c]) for c, family in enumerate(families)), raw[:, m:]])
+
+    # windows without a gap would be few; interpolation adds noise and a zero, but leaves the poles where they are
+    records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
+    return hankel_statistics([r for r in records if len(r) >= rows] or records, rows, expand, centre="mean")
 
 
 @dataclass(frozen=True, eq=False)

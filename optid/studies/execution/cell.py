@@ -169,7 +169,7 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
         row |= _figures(fitted.model, record, remarks)
     row["reason"] = "; ".join(filter(None, remarks)) or None
     row |= _finiteness(fitted, row)
-    plain = not fitted.procedure and len(fitted.steps) == 1 and fitted.solution.has_point
+    plain = fitted.outcome.evidence is None and len(fitted.steps) == 1 and fitted.solution.has_point
     return row, fitted if cell.warm and plain and row["outcome"] == DONE else None
 
 

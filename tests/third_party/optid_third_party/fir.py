@@ -6,7 +6,7 @@ from functools import partial
 import cvxpy as cp
 import numpy as np
 
-from optid import Data, HammersteinARX, Linear, Nonlinearity, Program
+from optid import Data, HammersteinTF, Linear, Nonlinearity, Program
 from optid.bases import Basis
 from optid.errors import RankError, StructureError
 from optid.program.view import View
@@ -67,7 +67,7 @@ def line(data: Data) -> Basis:
     return Linear().fitted(float(low), float(high))
 
 
-def recover(data: Data, values: Mapping[str, np.ndarray]) -> HammersteinARX:
+def recover(data: Data, values: Mapping[str, np.ndarray]) -> HammersteinTF:
     """Return the model: A = 1, B the impulse response."""
-    return HammersteinARX(np.zeros(0), (values["b"],), (Nonlinearity(line(data), np.ones(1)),), (0,), values["offset"],
+    return HammersteinTF(np.zeros(0), (values["b"],), (Nonlinearity(line(data), np.ones(1)),), (0,), values["offset"],
                           data.dt, data.inputs, data.outputs, data.input_units, data.output_units)

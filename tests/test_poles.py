@@ -6,9 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from formulations.constraints import pole_regions
-from formulations.constraints.pole_regions import damping_sides, disc, disc_side, sector, strip, wedge_side
-from formulations.constraints.stability import stable
+from formulations.constraints.poles import damped, damping_sides, disc, disc_side, sector, stable, strip, wedge_side
 from optid.errors import StructureError
 from optid.program.view import View
 from optid.registry import named_constraint
@@ -38,7 +36,7 @@ def member(name, z):
 
 
 RULES = {"stable": stable(0.8), "disc": disc(0.4, 0.5), "strip": strip(-0.1, 0.7), "sector": sector(0.9),
-         "damped": pole_regions.damped(0.3)}
+         "damped": damped(0.3)}
 
 
 @pytest.mark.slow
@@ -97,7 +95,7 @@ def test_every_region_has_a_word_and_is_about_poles(word, name):
     (lambda: strip(), "low= and/or high="),
     (lambda: strip(0.9, 0.1), "low < high"),
     (lambda: sector(2.0), r"\(0, pi/2\]"),
-    (lambda: pole_regions.damped(1.0), r"\(0, 1\)"),
+    (lambda: damped(1.0), r"\(0, 1\)"),
     (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(2)})), "only 'stable' is available"),
     (lambda: stable(real=0.3).build(View({"P": cp.Variable((2, 2)), "Q": cp.Variable((2, 2))})), "not for a matrix A"),
 ])
@@ -110,5 +108,5 @@ def test_verification_names_the_pole_outside():
     class Model:
         poles = np.array([0.5, 0.95 + 0.1j, 0.95 - 0.1j])
 
-    assert pole_regions.strip(high=0.9).verify(Model()) and "0.95" in strip(high=0.9).verify(Model())
+    assert strip(high=0.9).verify(Model()) and "0.95" in strip(high=0.9).verify(Model())
     assert strip(high=0.96).verify(Model()) == ""

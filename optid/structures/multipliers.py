@@ -1,0 +1,45 @@
+"""Multipliers of linear constraints by nonnegative least squares."""
+
+import numpy as np
+from scipy.optimize import nnls
+
+from optid.arrays import Array
+
+
+def fit_multipliers(rows: Array, target: Array, equality: np.ndarray) -> tuple[Array, float]:
+    """Return the w that minimises ``‖rowsᵀ w - target‖``, and the norm that is left.
+
+    Args:
+        rows: (r, n).
+        target: (n,).
+        equality: (r,) which w may have either sign; the others are >= 0.
+
+    Raises:
+        RuntimeError: the iterations did not suffice.
+    """
+    if not len(rows):  # which SciPy's solver does not survive
+        return np.zeros(0), float(np.linalg.norm(target))
+    both = np.vstack([rows, -rows[equality]])
+    weights, rest = nnls(both.T, target, maxiter=30 * len(both))
+    found = weights[: len(rows)].copy()
+    found[equality] -= weights[len(rows) :]
+    return found, float(rest)
+
+
+def least_distance(rows: Array, need: Array, equality: np.ndarray) -> Array | None:
+    """Return the w with which ``x = -rowsᵀ w`` is the shortest x with ``rows x + need <= 0``, None without such an x.
+
+    Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
+
+    Args:
+        rows: (r, n), of about one length.
+        need: (r,), of about the size one.
+        equality: (r,) rows that hold as ``rows x + need = 0``.
+
+    Raises:
+        RuntimeError: the iterations did not suffice.
+    """
+    system, target = np.column_stack([-rows, need]), np.append(np.zeros(rows.shape[1]), 1.0)
+    weights, _ = fit_multipliers(system, target, equality)
+    rest = 1.0 - float(need @ weights)
+    return weights / rest if rest > 1e-12 else None  # empty as far as the rounding tells
