@@ -359,7 +359,7 @@ def test_long_records_are_searched_in_part():
     ({"nb": [1, 2]}, StructureError, "2 entries for 1 inputs"),
     ({"nk": -1}, StructureError, "nk of input 'u' must be a nonnegative integer"),
     ({"gauge": "nrom"}, StructureError, "norm, gain, b0"),
-    ({"starts": 0}, StructureError, "starts .the number of starts. must be"),
+    ({"starts": 0}, StructureError, "starts must be a positive integer"),
     ({"na": 70}, RankError, "150 output samples for 14. unknowns"),
     ({"na": 200}, RankError, "150 samples, but the lags reach back 200"),
     ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "function . of the basis of input 'u' is never excited"),
