@@ -9,13 +9,14 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
-from optid.identify.noise import observer_gain, with_noise_or_reason
+from optid.identify.noise import with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
 from optid.identify.subspace.imputation import clipping_range, impute
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
 from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
 from optid.models.hammerstein_ss import HammersteinSS
+from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
 from optid.statistics.channels import check_channels
 from optid.statistics.expansion import Expansion
@@ -81,7 +82,9 @@ class Observability:
         """
         plan, c = self.plan, self.gamma[: len(self.scale)].copy()
         closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
-        gain = observer_gain(a, c, 1.0) if closed else np.zeros((len(a), len(c)))
+        # noise of one size at all outputs, which are in units of their own: what states hardly explain counts as noisy
+        level = float(np.mean(np.sum(c**2, axis=1))) * np.eye(len(c))
+        gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
         form = ObserverForm(a, c, gain, self.expansion, len(self.records), plan.direct(), plan.offset, 1 / self.scale)
         coloured = instruments and self.expansion.simulated and not plan.instruments.endswith("past")
         return observer_problem(self.records, form, instruments=coloured,
