@@ -57,7 +57,8 @@ def identified(data: optid.Data, exact: bool | int, p: str, **settings: object) 
     basis = {"basis": f"polynomial:{p}", "feedback_basis": f"polynomial:{p}"}
     if exact is not False:
         settings |= {} if exact is True else {"iterations": exact}
-        return optid.fit(data, "hammerstein_ss.exact", prove=False, **basis, **settings).model
+        settings |= {"criterion": "measured feedback", "prove": False}
+        return optid.fit(data, "hammerstein_ss.exact", **basis, **settings).model
     return optid.fit(data, "hammerstein_ss.asivid", **ASIVID, **basis, **settings).model
 
 

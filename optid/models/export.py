@@ -74,6 +74,10 @@ def to_casadi(model: Any) -> Any:
     y, following = c @ x + d @ f, a @ x + b @ f
     if model.structure == "ss":
         y += ca.DM(model.offset_y)
+        z = ca.DM(model.Cz) @ x + ca.DM(model.Dz) @ u + ca.DM(model.offset_z)
+        for j, h in enumerate(model.latent):
+            inner = symbolic(h, z[j])
+            y, following = y + ca.DM(model.Fz[:, j]) * inner, following + ca.DM(model.Ez[:, j]) * inner
         following += ca.DM(model.L) @ y + ca.DM(model.offset_x)
         for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
             following += ca.DM(model.E[:, j]) * symbolic(g, y[o])

@@ -57,6 +57,13 @@ def static_functions(model: Any) -> list[StaticFunction]:
     return found
 
 
+def latent_names(model: Any) -> tuple[list[str], list[str]]:
+    """Words of the functions of latent signals and of the signals: h and z, numbered where there are several."""
+    count = len(getattr(model, "latent", ()))
+    numbers = [""] if count == 1 else [str(i + 1) for i in range(count)]
+    return [f"h{number}" for number in numbers], [f"z{number}" for number in numbers]
+
+
 def has_feedback(model: Any) -> bool:
     """Whether outputs are fed back through static functions, so that a simulation may take them from a record."""
     return bool(getattr(model, "feedback", ()))

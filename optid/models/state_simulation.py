@@ -216,8 +216,8 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
     return root, cost
 
 
-def allowed_range(data: Any) -> Any:
-    """Return (low, high), each (l,): `FAR` times the range of every output about its middle, over all experiments.
+def allowed_range(data: Any, times: float = FAR) -> Any:
+    """Return (low, high), each (l,): so many times the range of every output about its middle, over all experiments.
 
     None where the outputs are not known; no bound for an output without two different values.
     """
@@ -227,7 +227,7 @@ def allowed_range(data: Any) -> Any:
     low = np.fmin.reduce([np.fmin.reduce(y, axis=0) for y in outputs])
     high = np.fmax.reduce([np.fmax.reduce(y, axis=0) for y in outputs])
     width = np.where(high > low, high - low, np.maximum(np.abs(low), np.abs(high)))
-    reach = np.where(width > 0, FAR * width, np.finfo(float).max)
+    reach = np.where(width > 0, times * width, np.finfo(float).max)
     middle = np.where(np.isfinite(low), (low + high) / 2, 0.0)
     reach = np.where(np.isfinite(low), reach, np.finfo(float).max)
     return middle - reach, middle + reach

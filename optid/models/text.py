@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.models.functions import static_functions
+from optid.models.functions import latent_names, static_functions
 
 READABLE = 4
 """Most states whose equations are written out."""
@@ -39,17 +39,20 @@ def state_equations(model: Any, digits: int = 4) -> str:
 def matrix_entries(model: Any) -> list[tuple[str, float]]:
     """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
     functions, fed = _names(model)
+    words, signals = latent_names(model)
     states = [f"x{i + 1}" for i in range(model.nx)]
     columns = {
         "A": (states, states), "B": (states, functions), "C": (model.outputs, states), "D": (model.outputs, functions),
         "E": (states, fed), "L": (states, model.outputs), "K": (states, model.outputs),
+        **dict(zip(("Ez", "Fz", "Cz", "Dz"), ((states, words), (model.outputs, words), (signals, states),
+                                              (signals, model.inputs)))),
     }
     found = []
     for name, (rows, names) in columns.items():
         matrix = getattr(model, name)
         if name in "ABC" or np.any(matrix):
             found += [(f"{name}[{rows[i]},{names[j]}]", float(value)) for (i, j), value in np.ndenumerate(matrix)]
-    for name, rows in (("offset_x", states), ("offset_y", model.outputs)):
+    for name, rows in (("offset_x", states), ("offset_y", model.outputs), ("offset_z", signals)):
         if np.any(getattr(model, name)):
             found += [(f"{name}[{row}]", float(value)) for row, value in zip(rows, getattr(model, name))]
     return found
@@ -73,18 +76,22 @@ def _equations(model: Any, digits: int) -> str:
     states = [(1.0, f"x{i + 1}(k)") for i in range(model.nx)]
     measured = [(1.0, f"{name}(k)") for name in model.outputs]
     errors = [(1.0, f"e_{name}(k)" if model.l > 1 else "e(k)") for name in model.outputs]
-    one = [(1.0, "")]
+    one, (inner, signals) = [(1.0, "")], latent_names(model)
+    latent, inputs = [(1.0, f"{h}({z}(k))") for h, z in zip(inner, signals)], [(1.0, f"{u}(k)") for u in model.inputs]
     lines = []
     for i in range(model.nx):
         rows = [
             (model.A[i], states), (model.B[i], functions), (model.E[i], fed), (model.L[i], measured),
-            (model.offset_x[[i]], one), (model.K[i], errors),
+            (model.Ez[i], latent), (model.offset_x[[i]], one), (model.K[i], errors),
         ]
         lines.append(f"x{i + 1}(k+1) = {_sum(rows, digits)}")
     for o, name in enumerate(model.outputs):
-        rows = [(model.C[o], states), (model.D[o], functions), (model.offset_y[[o]], one)]
+        rows = [(model.C[o], states), (model.D[o], functions), (model.Fz[o], latent), (model.offset_y[[o]], one)]
         tail = f" + {errors[o][1]}" if np.any(model.K) else ""
         lines.append(f"{name}(k) = {_sum(rows, digits)}{tail}")
+    for i, name in enumerate(signals):
+        rows = [(model.Cz[i], states), (model.Dz[i], inputs), (model.offset_z[[i]], one)]
+        lines.append(f"{name}(k) = {_sum(rows, digits)}")
     return "\n".join(lines)
 
 
@@ -99,11 +106,16 @@ def _summary(model: Any) -> str:
     state = f"x(k+1) = A x(k) + B f({arguments})"
     if model.feedback:
         state += f" + E g({', '.join(dict.fromkeys(model.outputs[o] for o in model.output_of))})"
-    for name, term in (("L", "L y(k)"), ("offset_x", "offset_x"), ("K", "K e(k)")):
+    for name, term in (("L", "L y(k)"), ("Ez", "Ez h(z)"), ("offset_x", "offset_x"), ("K", "K e(k)")):
         state += f" + {term}" if np.any(getattr(model, name)) else ""
     output = "y(k) = C x(k)" + (f" + D f({arguments})" if np.any(model.D) else "")
+    output += " + Fz h(z)" if np.any(model.Fz) else ""
     output += (" + offset_y" if np.any(model.offset_y) else "") + (" + e(k)" if np.any(model.K) else "")
     sizes = f"{model.nx} states, {len(model.nonlinearities)} functions of the inputs"
     sizes += f", {len(model.feedback)} of the outputs" if model.feedback else ""
     names = "A, B, C, D, E" if model.feedback else "A, B, C, D"
+    if model.latent:
+        output += "\nz(k) = Cz x(k) + Dz u(k) + offset_z"
+        sizes += f", {len(model.latent)} of latent signals"
+        names += ", Ez, Fz, Cz, Dz"
     return f"{state}\n{output}\n{sizes}; the matrices are {names} of the model"

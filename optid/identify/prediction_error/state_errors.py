@@ -25,6 +25,9 @@ from optid.statistics.state_sensitivities import linearise_states, residuals, sq
 from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
+WILD = 10.0
+"""Times the range of the record that the run of an iterate must not leave."""
+
 FLOOR = 1e-7
 """Smallest standard deviation of an error that weights may rest on, as a share of that of its output."""
 
@@ -77,7 +80,7 @@ class StateErrors(Criterion):
         unknowns = self.unknowns
         if unknowns.innovations or not (unknowns.expansion.feedback or unknowns.latent):
             return None
-        return tuple(allowed_range([e.y]) for e in self.data.experiments)
+        return tuple(allowed_range([e.y], WILD) for e in self.data.experiments)
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""

@@ -9,12 +9,14 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.certificate.hankel import simulation_bound
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
-from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_errors import WILD, StateErrors
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.roots import spectral_radius
+from optid.models.state_simulation import allowed_range
 from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
@@ -152,7 +154,27 @@ def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
                                  "starts are compared")
         reason = bound.reason if evidence.status is Status.LOCAL else reason
     figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
+    if unknowns.expansion.feedback and unknowns.criterion != "simulation" and (wild := _runs_away(model, errors.data)):
+        figures["free run"] = wild
+        reason = f"{reason}; its free run {wild}"
     return replace(evidence, model=model, bound=bound, reason=reason, figures=figures)
+
+
+def _runs_away(model: HammersteinSS, data: Data) -> str:
+    """Say where the free run of a model leaves the range of the record, "" where it stays; no criterion sees it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            found = model.simulate(data, x0="fit")
+    except DataError:
+        found = None
+    runs = found if isinstance(found, tuple) else (found,)
+    for y, e in zip(runs, data.experiments):
+        low, high = allowed_range([e.y], WILD)
+        if y is None or not np.all((low <= y) & (y <= high)):
+            return (f"leaves {WILD:g} times the range of the record: use the model where outputs are measured, or "
+                    "criterion='simulation', which minimises the error of the free run")
+    return ""
 
 
 def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
