@@ -15,7 +15,7 @@ from optid.arrays import Array
 
 LONGEST = 3  # wild readings in a row that still count as isolated
 WINDOW = 15  # samples of the running median, the course that wild readings leave; more than half of them must be sound
-CHUNK = 10_000  # windows sorted at once
+SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
 MOST = 0.12  # share of wild readings up to which they are looked for
 LEAST_SAMPLES = 50  # samples of a channel below which nothing can be said
 FAR = 6.0  # robust standard deviations of the departures from the course that a wild reading is off at least
@@ -109,9 +109,13 @@ def _departures(x: Array) -> Array:
 def _running_median(x: Array) -> Array:
     """Return the median of `WINDOW` samples about every sample that has as many before and behind; else the sample."""
     half, course = WINDOW // 2, x.copy()
-    for start in range(half, x.size - half, CHUNK):
-        windows = np.lib.stride_tricks.sliding_window_view(x[start - half : start + CHUNK + half], WINDOW)
-        course[start : start + len(windows)] = np.partition(windows, half, axis=1)[:, half]
+    if x.size <= SHORT:
+        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
+        course[half:-half] = np.partition(windows, half, axis=1)[:, half]
+    else:
+        from scipy.ndimage import median_filter
+
+        course[half:-half] = median_filter(x, WINDOW)[half:-half]
     return course
 
 
