@@ -87,10 +87,14 @@ def block(rng: np.random.Generator, front: bool, back: bool) -> Callable[[np.nda
 
 
 def two_by_two(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """Four states, two latent signals of which one acts on the states and one on an output, too."""
-    a = np.diag([0.85, 0.7, 0.6, 0.4]) + 0.05 * rng.normal(size=(4, 4))
+    """Four states and two latent signals that act on the states; stable near rest and far from it."""
     b, c = rng.normal(size=(4, 2)), rng.normal(size=(2, 4))
-    rows, effect = rng.normal(size=(2, 4)) / 4, 0.5 * rng.normal(size=(4, 2))
+    while True:
+        a = np.diag([0.85, 0.7, 0.6, 0.4]) + 0.05 * rng.normal(size=(4, 4))
+        rows, effect = rng.normal(size=(2, 4)) / 4, 0.5 * rng.normal(size=(4, 2))
+        far = a - np.outer(effect[:, 0], rows[0])  # tanh(z) - z far from zero
+        if max(np.abs(np.linalg.eigvals(matrix)).max() for matrix in (a, far)) < 0.95:
+            break
 
     def run(u: np.ndarray) -> np.ndarray:
         x, y = np.zeros(4), np.zeros((len(u), 2))
