@@ -32,6 +32,8 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the error of a model with functions of latent signals.
 
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+
     Args:
         data: the record.
         nx: number of states, or "auto".

@@ -30,6 +30,8 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
               constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Wiener model.
 
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``.
+
     Args:
         data: the record.
         nx: number of states, or "auto".
@@ -56,6 +58,8 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
                           initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
                           constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Hammerstein-Wiener model whose inputs act on the outputs a sample later.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``offset``, ``x0``.
 
     Args:
         data: the record.

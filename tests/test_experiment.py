@@ -238,7 +238,7 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
     (lambda: design(PENDULUM, amplitude=(2, 1)), StructureError, "low must be below high"),
     (lambda: design(PENDULUM, candidates=0), StructureError, "candidates must be"),
     (lambda: design(PENDULUM, rows=2.5), StructureError, "rows must.*got 2.5"),
-    (lambda: design(PENDULUM, n=0), StructureError, "n = 0"),
+    (lambda: design(PENDULUM, n=0), StructureError, "n must be a positive integer; got 0"),
     (lambda: design(PENDULUM, n=8), DataError, "samples"),
     (lambda: design(PENDULUM, basis="polynom:4"), LookupFailed, "polynomial"),
     (lambda: design(PENDULUM, feedback_basis=[QUARTIC]), StructureError, "1 feedback bases for 2 outputs"),

@@ -39,8 +39,7 @@ def table(lengths: tuple[int, ...], runs: int) -> dict[str, float]:
             start = time.process_time()
             at = (moments := hankel_statistics([record], 2 * ROWS, expansion, centre="mean")).at
             z = np.r_[0, at(expansion.eta), at(expansion.zeta, past), at(expansion.y, past)]
-            phi = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])]
-            y = at(expansion.y, future)
+            phi, y = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])], at(expansion.y, future)
             fast, middle = rq(moments, z, phi, y).singular_values, time.process_time()
             windows = windows_of(expansion(record) - moments.centre, 2 * ROWS).reshape(n - 2 * ROWS + 1, -1)
             slow = explicit(np.insert(windows, 0, 1.0, axis=1).T, z, phi, y)

@@ -64,10 +64,7 @@ class Fit:
     def _completed(self) -> tuple[Any, dict[str, Any]]:
         evidence = self.outcome.evidence
         model, figures = evidence.extended() if evidence else (self.outcome.model, {})
-        transform = getattr(self.data, "transform", None)
-        if model is not None and transform is not None and not transform.is_identity:
-            model = model.with_transform(transform)
-        return model, {**self.outcome.figures, **figures}
+        return _in_raw_units(model, self.data), {**self.outcome.figures, **figures}
 
     @property
     def model(self) -> Any:
@@ -216,6 +213,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
+    _in_raw_units(outcome.model, data)  # what raw units cannot express is refused here, not at the first use
     findings = findings + _disobeyed(outcome.model, arguments.get("constraints", ()))
     compressed, figures = outcome.program.compressed, dict(outcome.figures)
     if compressed is not None:
@@ -225,6 +223,11 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started)
+
+
+def _in_raw_units(model: Any, data: Data | Stream) -> Any:
+    transform = getattr(data, "transform", None)
+    return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

@@ -21,7 +21,7 @@ STEPS = 50
 FIRM = 0.01
 """Damping at least, relative to the diagonal of the information, where a step gained little of what it promised."""
 
-ARRIVED = 1e-4
+ARRIVED = 2e-5
 """Gain of the log-likelihood of no account; half a unit is one standard error of a parameter."""
 
 

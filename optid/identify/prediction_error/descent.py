@@ -25,15 +25,15 @@ COMPARED = 1e-6
 DAMPED = 1e-7
 """Damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has."""
 
-LOWER, LOWER_AGAIN = 0.1, 0.5
-"""Factors of the damping after a good step: the first one, and where a larger step was refused just before."""
-
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
 
 EXPLAINED = 0.1
 """Share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
 where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best."""
+
+ROUNDING = 1e-9
+"""Relative difference of two sums of squares that were added up in different ways."""
 
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as stable:0.999")
@@ -158,12 +158,13 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         moved = criterion.normalised(np.concatenate([x[:p] + step, x[p:] + at.follow(step)]))
         expected = at.reach - float(np.sum((at.root @ step + at.pull) ** 2))
         allowed = criterion.admissible(moved)
-        ratio = (at.value - criterion.value(moved)) / max(expected, 1e-300) if allowed else -1.0
-        if ratio > 1e-3:
-            lower = LOWER if rejected == 0 else LOWER_AGAIN
-            x, rejected, blocked = moved, 0, False
-            at = criterion.linearise(x, "gram" if damping > DAMPED else "auto")
-            damping = lower * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
+        new = None
+        if allowed and criterion.value(moved) < (1 + ROUNDING) * at.value:  # most steps that fail are told by the value
+            new = criterion.linearise(moved, "gram" if damping > DAMPED else "auto")
+        ratio = (at.value - new.value) / max(expected, 1e-300) if new is not None else -1.0
+        if new is not None and ratio > 1e-3 and np.isfinite(new.value):
+            x, at, rejected, blocked = moved, new, 0, False
+            damping = 0.1 * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
             damping = damping if damping > 1e-14 else 0.0
             continue
         rejected, blocked = rejected + 1, blocked or not allowed
