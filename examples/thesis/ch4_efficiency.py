@@ -22,8 +22,7 @@ def explicit(rows: np.ndarray, z: np.ndarray, phi: np.ndarray, y: np.ndarray) ->
     """Singular values of Y / Z with the projected regressors removed, by projectors of the size of the record."""
     onto = rows[z].T @ np.linalg.pinv(rows[z] @ rows[z].T) @ rows[z]  # j x j
     projected = rows[phi] @ onto
-    beside = np.eye(rows.shape[1]) - projected.T @ np.linalg.pinv(projected @ projected.T) @ projected
-    return np.linalg.svd(rows[y] @ onto @ beside, compute_uv=False)
+    return np.linalg.svd(rows[y] @ (onto - onto @ np.linalg.pinv(projected) @ projected), compute_uv=False)
 
 
 def table(lengths: tuple[int, ...], runs: int) -> dict[str, float]:
@@ -38,8 +37,8 @@ def table(lengths: tuple[int, ...], runs: int) -> dict[str, float]:
             expansion, record = expand(data, "polynomial:4", "polynomial:4"), np.hstack([data.u, data.y])
             start = time.process_time()
             at = (moments := hankel_statistics([record], 2 * ROWS, expansion, centre="mean")).at
-            z = np.r_[0, at(expansion.eta), at(expansion.zeta, past), at(expansion.y, past)]
-            phi, y = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])], at(expansion.y, future)
+            z, y = np.r_[0, at(expansion.eta), at(expansion.zeta, past), at(expansion.y, past)], at(expansion.y, future)
+            phi = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])]
             fast, middle = rq(moments, z, phi, y).singular_values, time.process_time()
             windows = windows_of(expansion(record) - moments.centre, 2 * ROWS).reshape(n - 2 * ROWS + 1, -1)
             slow = explicit(np.insert(windows, 0, 1.0, axis=1).T, z, phi, y)
@@ -52,7 +51,7 @@ def table(lengths: tuple[int, ...], runs: int) -> dict[str, float]:
 
 
 def main() -> dict[str, float]:
-    """Return ratio and disagreement for two short records, or all of the table."""
+    """Return ratio and disagreement at two short lengths, or at all of the table."""
     return table((500, 1000, 2000, 4000, 6000), 20) if sys.argv[1:] == ["full"] else table((500, 1000), 2)
 
 
