@@ -55,8 +55,8 @@ def quantities(model: Any) -> dict[str, np.ndarray]:
     if scaled is not None:
         step = np.cumsum(scaled.impulse_response(30)[:, 0, 0])[[2, 5, 10, 20]]
         curves = scaled.frequency_response(FREQUENCIES).ravel()
-        found |= {"f": scaled.nonlinearities[0](LEVELS[LEVELS != 0]) - scaled.nonlinearities[0](0.0), "step response": step,
-                  "log magnitude": np.log(np.abs(curves))}
+        f = scaled.nonlinearities[0](LEVELS[LEVELS != 0]) - scaled.nonlinearities[0](0.0)
+        found |= {"f": f, "step response": step, "log magnitude": np.log(np.abs(curves))}
     elif response.size:
         found["log magnitude of G f'(0)"] = np.log(np.abs(
             response * np.array([f.slope(0.0) for f in model.nonlinearities]))).ravel()
