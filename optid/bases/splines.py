@@ -20,7 +20,6 @@ class _Splines(Basis):
     p: int
     degree: Any
     shape_exact = True
-    _points: Any  # where the functions sit, one point each
 
     @property
     def full_size(self) -> int:
@@ -31,6 +30,11 @@ class _Splines(Basis):
     def knots(self) -> Array:
         """(p + 2 degree + 1,) ends of the cells, those of the interval repeated."""
         return np.pad(np.linspace(*span(self), self.p + 1), self.degree, mode="edge")
+
+    @property
+    def _points(self) -> Array:
+        """Where the functions sit, one point each: the Greville abscissae of the control points."""
+        return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
     @property
     def dropped(self) -> int:
@@ -120,8 +124,6 @@ class Triangular(_Splines):
         """(p + 1,) nodes, in units of the input."""
         return np.linspace(*span(self), self.p + 1)
 
-    _points = nodes
-
 
 @dataclass(frozen=True)
 class PiecewiseConstant(_Splines):
@@ -170,11 +172,6 @@ class BSpline(_Splines):
     def shape_exact(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """True up to degree 2."""
         return self.degree <= 2
-
-    @property
-    def _points(self) -> Array:
-        """Greville abscissae of the control points."""
-        return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
 
 def _not_vanishing(x: Array, cell: NDArray[np.int32], knots: Array, degree: int) -> Array:
