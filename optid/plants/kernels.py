@@ -66,16 +66,9 @@ def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def with_feedback(a: Array, drive: Array, direct: Array, c: Array, e: Array, v: Array, x0: Array) -> Array:
-    """Return the states (N, n) of x+ = A x + drive + E g(y), y = C x + direct + v, with the two feedbacks of Example 1.
+    """Return the states (N, n) of a `FeedbackSystem`: x+ = A x + drive + E g(y), y = C x + direct + v, from x0 (n,).
 
-    Args:
-        a: (n, n).
-        drive: (N, n) what input and process noise add to the state.
-        direct: (N, 2) what the input adds to the output.
-        c: (2, n).
-        e: (n, 2).
-        v: (N, 2) measurement noise, inside the loop.
-        x0: (n,).
+    drive (N, n) and direct (N, 2) are what the input and the process noise add to the state and to the output.
     """
     n = a.shape[0]
     states = np.empty((drive.shape[0], n))
