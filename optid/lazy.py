@@ -8,12 +8,9 @@ from typing import Any
 def on_first_use(
     package: str, home: Mapping[str, str], modules: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package (PEP 562).
+    """Return `__getattr__` and `__dir__` (PEP 562) of a package of this name.
 
-    Args:
-        package: its name.
-        home: public names and the modules below the package that hold them.
-        modules: names of public modules and where they are below the package.
+    home has public names and the modules below the package that hold them, modules public modules and where they are.
     """
 
     def load(name: str) -> Any:

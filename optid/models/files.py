@@ -52,12 +52,7 @@ def complete(path: Path) -> Iterator[Path]:
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
-    """Return what `build` makes of the content of a file that `write` wrote in this form and version.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ModelFileError: the file is truncated, damaged, of another version, or of another form.
-    """
+    """Return what `build` makes of the content of a file that `write` wrote in this form; errors as of `load`."""
     path, what = Path(path), form.removeprefix("optid ")
     remedy = f"Use a file written by {what}.save(...)."
     try:

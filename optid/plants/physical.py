@@ -131,16 +131,8 @@ def pendulum_input(kind: str, n: int, seed: int = 0, *, dt: float = 0.02) -> Arr
     """Return one of the four excitations (N,) of the pendulum experiments.
 
     "sinusoid": 3 sin(2 pi 1.2 t); "chirp": 0.1 to 4 Hz, four sweeps, amplitude 4; "noise": white noise below 4 Hz
-    (fourth-order Butterworth, clipped at 8); "levels": uniform within 8, held five samples.
-
-    Args:
-        kind: one of the four words.
-        n: samples; for the chirp the sweeps are a quarter of them each.
-        seed: of the random ones.
-        dt: sampling time, s.
-
-    Raises:
-        StructureError: an unknown word or a length that is not positive.
+    (fourth-order Butterworth, clipped at 8); "levels": uniform within 8, held five samples. Another word or a length n
+    that is not positive raises a `StructureError`.
     """
     makers = {
         "sinusoid": lambda: signals.sinusoid(n, -3.0, 3.0, frequency=1.2, dt=dt),
