@@ -60,12 +60,10 @@ _OPTIONS: dict[str, Callable[[str], Any]] = {
 
 
 def parse(text: str) -> Basis:
-    """Read a basis as the command line writes it.
+    """Read a basis as the command line writes it: the class name in lower case and its size, then options.
 
-    Args:
-        text: the class name in lower case and its size, then options: "triangular:10", "legendre:4",
-            "bspline:8:degree=2", "trigonometric:5:half_range=1.25:outside=extrapolate", "triangular:8:interval=-1..1",
-            "linear".
+    For instance "triangular:10", "legendre:4", "bspline:8:degree=2", "triangular:8:interval=-1..1", "linear",
+    "trigonometric:5:half_range=1.25:outside=extrapolate".
 
     Raises:
         LookupFailed: no basis has this name.
@@ -94,9 +92,7 @@ def parse(text: str) -> Basis:
 def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:
     """Build the basis that `Basis.to_dict` described.
 
-    Args:
-        description: {"type": name, ...}.
-        functions: the functions of a UserFunctions basis by name, each a callable or (callable, slope).
+    The functions of a UserFunctions basis are given by name, each a callable or (callable, slope).
 
     Raises:
         LookupFailed: unknown type.
