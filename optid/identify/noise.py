@@ -24,14 +24,7 @@ from optid.errors import DataError, StructureError
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import (
-    covariance_of,
-    information,
-    innovations_covariance,
-    log_determinant,
-    refined,
-    whitened,
-)
+from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.state_space import StateSpace
 from optid.statistics.hankel import complete_runs, hankel_statistics
@@ -169,9 +162,9 @@ def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Arra
     if part is not rest:
         found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
         found.sort(key=lambda pair: log_determinant(pair[1]))
-        same, total = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part)), sum(map(len, rest))
+        same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
         optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
-        found = [refined(A, C, gain, rest, total * information(A, C, gain, part)) for gain in optima]
+        found = [refined(A, C, gain, rest, part) for gain in optima]
     else:
         found = [refined(A, C, gain, rest) for gain in starts]
     return min(found, key=lambda pair: log_determinant(pair[1]))

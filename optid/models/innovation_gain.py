@@ -32,7 +32,7 @@ NUMBERS = 200_000
 NO_FUNCTIONS = tabulated(())
 
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array | None = None,
+def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequence[Array] | None = None,
             arrived: float = ARRIVED) -> tuple[Array, Array]:
     """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
 
@@ -43,7 +43,7 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
         C: (l, n).
         gain: (n, l) start.
         rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
-        known: (n l, n l) the information about the gain (row by row) to be used at every step, near an optimum.
+        part: of rest, whose mean information about the gain serves at every step, near an optimum.
         arrived: gain of the log-likelihood still to be expected at which the search ends.
 
     Returns:
@@ -52,11 +52,14 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
     errors = whitened(A, C, gain, rest)
     best, damping, before = covariance_of(errors), 1e-4, 0.0
     half = sum(np.count_nonzero(~np.isnan(r)) for r in rest) / (2 * len(C))
+    if part is not None:
+        normal, _ = _equations(A, C, gain, part, innovations_covariance(A, C, gain, part))
+        normal *= sum(map(len, rest)) / sum(map(len, part))
     for _ in range(STEPS):
-        if known is None:
+        if part is None:
             normal, right = _equations(A, C, gain, rest, best)
         else:
-            normal, right = known, _slope(A, C, gain, errors)
+            right = _slope(A, C, gain, errors)
         promised, gained = np.inf, 0.0
         while not gained > 0 and promised > arrived:
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
@@ -77,12 +80,6 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
             break
         before = promised
     return gain, best
-
-
-def information(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
-    """Mean information (n l, n l) of a sample about the gain (row by row), initial states unknown."""
-    normal, _ = _equations(A, C, gain, rest, innovations_covariance(A, C, gain, rest))
-    return normal / sum(map(len, rest))
 
 
 def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
