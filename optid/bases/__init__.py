@@ -14,22 +14,8 @@ if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.data.streams import Stream
 
-__all__ = [
-    "BSpline",
-    "Bases",
-    "Basis",
-    "FeedbackBases",
-    "Linear",
-    "PiecewiseConstant",
-    "Polynomial",
-    "Triangular",
-    "Trigonometric",
-    "UserFunctions",
-    "feedback_bases",
-    "fitted_bases",
-    "from_dict",
-    "parse",
-]
+__all__ = ["BSpline", "Bases", "Basis", "FeedbackBases", "Linear", "PiecewiseConstant", "Polynomial", "Triangular",
+           "Trigonometric", "UserFunctions", "feedback_bases", "fitted_bases", "from_dict", "parse"]
 
 Bases = Basis | str | Sequence[Basis | str]
 """One basis, or its name as for `parse`, for all inputs, or one per input."""
