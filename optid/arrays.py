@@ -68,15 +68,10 @@ def is_scalar_list(values: Any) -> bool:
 
 
 def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> None:
-    """Refuse infinite and absurdly large samples; NaN passes, it means missing.
-
-    Args:
-        samples: (N, channels) float64.
-        labels: one text per channel for the message.
-        first: index of the first sample in the whole record, for chunked sources.
+    """Refuse infinite and absurdly large samples (N, channels); NaN passes, it means missing.
 
     Raises:
-        DataError: names the channel and the sample.
+        DataError: with the label of the channel and the sample, counted from `first` where a source comes in chunks.
     """
     # One fused pass decides the usual case; NaN makes both comparisons false and is accepted.
     if not (np.fmax.reduce(samples, axis=None) > LARGEST or np.fmin.reduce(samples, axis=None) < -LARGEST):
@@ -88,15 +83,7 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
 
 def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
                   error: type[OptidError] = StructureError) -> int:
-    """Return an integer argument as an int.
-
-    Args:
-        value: of the argument.
-        name: of the argument, for the message.
-        low: least value.
-        high: largest value; None for any.
-        error: what is raised: no integer, or one outside the bounds.
-    """
+    """Return an integer argument as an int; raise `error` for anything else and outside low to high (None: any)."""
     top = value if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
         kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")

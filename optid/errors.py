@@ -65,12 +65,7 @@ class DataWarning(UserWarning):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a sentence that names the nearest known word, or all of them.
-
-    Args:
-        name: what the user wrote.
-        known: the words that exist.
-    """
+    """Return a sentence that names the known word nearest to the one written, or all known words."""
     words = sorted(known)
     close = get_close_matches(name, words, n=1, cutoff=0.5)
     return f"Did you mean {close[0]!r}?" if close else "Known: " + ", ".join(words) + "."

@@ -1,29 +1,25 @@
 """Public names that are loaded on first use, so that importing a package stays fast."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 
-def on_first_use(
-    package: str, home: Mapping[str, str], modules: Mapping[str, str] | None = None
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package (PEP 562).
+def on_first_use(package: str, home: Mapping[str, Sequence[str]], modules: Mapping[str, str] | None = None
+                 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` (PEP 562) of a package of this name.
 
-    Args:
-        package: its name.
-        home: public names and the modules below the package that hold them.
-        modules: names of public modules and where they are below the package.
+    home has the modules below the package and their public names, modules the names of public modules and where they
+    are below it.
     """
+    places = {name: module for module, names in home.items() for name in names}
+    public = {} if modules is None else modules
 
     def load(name: str) -> Any:
-        if name in home:
-            return getattr(import_module(f"{package}.{home[name]}"), name)
-        if modules and name in modules:
-            return import_module(f"{package}.{modules[name]}")
+        if name in places:
+            return getattr(import_module(f"{package}.{places[name]}"), name)
+        if name in public:
+            return import_module(f"{package}.{public[name]}")
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
-    def names() -> list[str]:
-        return sorted([*home, *(modules or ())])
-
-    return load, names
+    return load, lambda: sorted([*places, *public])

@@ -94,9 +94,7 @@ def prbs(n: int, low: float = -1.0, high: float = 1.0, *, hold: int = 1, bits: i
 
     _check(n, low, high)
     draws = -(-n // check_integer(hold, "hold"))
-    bits = max(2, int(draws).bit_length()) if bits is None else bits
-    if not 2 <= bits <= 32:
-        raise StructureError(f"bits = {bits}: a register has 2 to 32 bits.")
+    bits = max(2, int(draws).bit_length()) if bits is None else check_integer(bits, "bits", 2, 32)
     state = np.random.default_rng(seed).integers(0, 2, bits)
     state[0] |= not state.any()  # the zero state never leaves itself
     sequence = max_len_seq(bits, state=state, length=draws)[0]
@@ -213,9 +211,7 @@ def _filled(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def _spaced(low: float, high: float, levels: int) -> np.ndarray:
-    if levels < 2:
-        raise StructureError(f"levels = {levels}: at least 2 are needed.")
-    return np.linspace(low, high, levels)
+    return np.linspace(low, high, check_integer(levels, "levels", 2))
 
 
 def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band: tuple[float, float] | None

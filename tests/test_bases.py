@@ -243,7 +243,7 @@ def test_error_outside_names_sample_and_value(basis):
         basis.values([0.0, 5.0])
     with pytest.raises(DataError, match="Sample 1"):
         basis.slopes([0.0, 5.0])
-    assert basis.n_outside([0.0, 5.0, -2.0, np.nan, 1.3]) == 2
+    assert basis.is_outside([0.0, 5.0, -2.0, np.nan, 1.3]).sum() == 2
 
 
 @every

@@ -229,10 +229,6 @@ def test_words():
     assert "v(k) = e(k) + 0.2 e(k-1) + 0.3 v(k-2)" in bj.equation()
     assert bj.coefficients()[-2:] == [("d1", 0.0), ("d2", -0.3)] and bj.orders["nd"] == 2
     assert "poles of the noise" in str(bj) and "poles of the noise" not in str(armax)
-    w = np.array([0.0, 1.0])
-    response = lfilter([1.0, *bj.c], [1.0, *bj.d], np.eye(1, 300)[0])
-    direct = [(response * np.exp(-1j * f * np.arange(300))).sum() for f in w]
-    assert bj.noise_frequency_response(w) == pytest.approx(direct, abs=1e-12)
 
 
 def test_refusals():
@@ -259,12 +255,12 @@ def test_refusals():
 
 def test_reflection_keeps_the_spectrum():
     c = np.real(np.poly([1.6, -0.5, 1.2 + 0.5j, 1.2 - 0.5j]))[1:]
-    inside = roots.reflected(c)
+    inside = roots.contained(c)
     assert roots.radius(inside) < 1
     z = np.exp(1j * np.linspace(0, 3, 7))
     ratio = np.abs(np.polyval(np.r_[1, c], z)) / np.abs(np.polyval(np.r_[1, inside], z))
     assert ratio == pytest.approx(np.full(7, ratio[0]), rel=1e-10)
-    assert roots.reflected(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
+    assert roots.contained(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
 
 
 def test_unstable_armax_predicts():

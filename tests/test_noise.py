@@ -20,13 +20,14 @@ from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     _equations,
     _initial,
+    _parts,
     _slope,
     covariance_of,
+    innovations,
     innovations_covariance,
     log_determinant,
     refined,
 )
-from optid.models.innovation_kernels import innovate
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
@@ -121,17 +122,17 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
     rest, gain = residuals(bare(model), data), 0.5 * model.K
     covariance = innovations_covariance(A, C, gain, rest)
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
-    starts = _initial(A - gain @ C, C, gain, rest)
+    starts = _initial(_parts(A, C, gain), rest)
 
     def errors(flat):
         e = []
         for r, x in zip(rest, flat[6:].reshape(2, 3)):
             for row in r:
                 e.append(np.where(np.isnan(row), 0.0, row - C @ x))
-                x = A @ x + flat[:6].reshape(2, 3).T @ e[-1]
+                x = A @ x + flat[:6].reshape(3, 2) @ e[-1]
         return (np.array(e) @ weight.T).ravel()
 
-    start = np.concatenate([gain.T.ravel(), *starts])
+    start = np.concatenate([gain.ravel(), *starts])
     jacobian = np.column_stack([(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(12)])
     step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0][:6]
     assert np.linalg.solve(*_equations(A, C, gain, rest, covariance)) == pytest.approx(step, rel=1e-4, abs=1e-7)
@@ -235,15 +236,14 @@ def test_missing_inputs_cut_the_record():
 def test_the_slope_of_the_likelihood_by_finite_differences(missing):
     model = truth(7)
     rest, gain = residuals(bare(model), record(model, (3000, 1500), missing=missing)), 0.5 * model.K
-    states = _initial(A - gain @ C, C, gain, rest)
+    states = _initial(_parts(A, C, gain), rest)
     count = np.mean(np.sum(~np.isnan(np.vstack(rest)), axis=0))
 
     def errors(flat):  # the initial states stand still
-        K = flat.reshape(2, 3).T
-        return [innovate(A - K @ C, C, K, r, x0) for r, x0 in zip(rest, states)]
+        return innovations(_parts(A, C, flat.reshape(3, 2)), rest, states)
 
-    slope = approx_fprime(gain.T.ravel(), lambda flat: count / 2 * log_determinant(covariance_of(errors(flat))), 1e-7)
-    assert _slope(A, C, gain, errors(gain.T.ravel())) == pytest.approx(-slope, rel=1e-4, abs=1e-2)
+    slope = approx_fprime(gain.ravel(), lambda flat: count / 2 * log_determinant(covariance_of(errors(flat))), 1e-7)
+    assert _slope(A, C, gain, errors(gain.ravel())) == pytest.approx(-slope, rel=1e-4, abs=1e-2)
 
 
 @pytest.mark.sampled(2)

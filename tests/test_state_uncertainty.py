@@ -39,7 +39,7 @@ def test_they_are_those_of_the_transfer_function():
                      + np.log(np.abs(m.nonlinearities[0].slope(0.2))), lambda m: np.sum(m.poles).real):
         one, other = ours.of(quantity), theirs.of(quantity)
         assert one.value == pytest.approx(other.value, rel=1e-5)
-        assert one.error == pytest.approx(other.error, rel=0.12)  # the one estimates the colour of the noise
+        assert one.error == pytest.approx(other.error, rel=0.2)  # the one estimates the colour of the noise
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e4])

@@ -14,22 +14,8 @@ if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.data.streams import Stream
 
-__all__ = [
-    "BSpline",
-    "Bases",
-    "Basis",
-    "FeedbackBases",
-    "Linear",
-    "PiecewiseConstant",
-    "Polynomial",
-    "Triangular",
-    "Trigonometric",
-    "UserFunctions",
-    "feedback_bases",
-    "fitted_bases",
-    "from_dict",
-    "parse",
-]
+__all__ = ["BSpline", "Bases", "Basis", "FeedbackBases", "Linear", "PiecewiseConstant", "Polynomial", "Triangular",
+           "Trigonometric", "UserFunctions", "feedback_bases", "fitted_bases", "from_dict", "parse"]
 
 Bases = Basis | str | Sequence[Basis | str]
 """One basis, or its name as for `parse`, for all inputs, or one per input."""
@@ -60,12 +46,10 @@ _OPTIONS: dict[str, Callable[[str], Any]] = {
 
 
 def parse(text: str) -> Basis:
-    """Read a basis as the command line writes it.
+    """Read a basis as the command line writes it: the class name in lower case and its size, then options.
 
-    Args:
-        text: the class name in lower case and its size, then options: "triangular:10", "legendre:4",
-            "bspline:8:degree=2", "trigonometric:5:half_range=1.25:outside=extrapolate", "triangular:8:interval=-1..1",
-            "linear".
+    For instance "triangular:10", "legendre:4", "bspline:8:degree=2", "triangular:8:interval=-1..1", "linear",
+    "trigonometric:5:half_range=1.25:outside=extrapolate".
 
     Raises:
         LookupFailed: no basis has this name.
@@ -94,9 +78,7 @@ def parse(text: str) -> Basis:
 def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = None) -> Basis:
     """Build the basis that `Basis.to_dict` described.
 
-    Args:
-        description: {"type": name, ...}.
-        functions: the functions of a UserFunctions basis by name, each a callable or (callable, slope).
+    The functions of a UserFunctions basis are given by name, each a callable or (callable, slope).
 
     Raises:
         LookupFailed: unknown type.
@@ -128,60 +110,39 @@ def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = No
 def fitted_bases(data: "Data | Stream", basis: Bases) -> tuple[Basis, ...]:
     """Return one basis per input; a basis without an interval takes the range of its input.
 
-    Args:
-        data: the record.
-        basis: of the inputs.
-
     Raises:
         StructureError: a wrong number of bases, or an entry that is not a basis.
         DataError: an input that is constant or without any sample.
     """
-    fitted = []
-    for channel, family, lo, hi in zip(data.inputs, _one_each(basis, data.inputs, "input"), *data.ranges()):
-        if lo != lo:
-            raise DataError(f"input {channel!r} has no sample at all; choose another column or drop the input")
-        if lo == hi:
-            raise DataError(f"input {channel!r} is constant ({lo:g}): nothing can be identified from it; "
-                            "excite the input or drop the channel")
-        fitted.append(family.fitted(float(lo), float(hi)))
-    return tuple(fitted)
+    return tuple(_one_each(basis, data.inputs, "input", data.ranges()))
 
 
 def feedback_bases(data: "Data", given: FeedbackBases) -> list[Basis | None]:
-    """Return one basis with an interval, or None, per output; a basis without one takes the range of its output.
-
-    Args:
-        data: the record.
-        given: of the outputs.
-
-    Raises:
-        StructureError: a wrong number of bases, or an entry that is not a basis.
-        DataError: a constant output.
-    """
-    found: list[Basis | None] = []
-    for o, family in enumerate(_one_each(given, data.outputs, "output", "feedback ")):
-        if family is not None:
-            y = np.concatenate([e.y[:, o] for e in data.experiments])
-            family = family.fitted(float(np.nanmin(y)), float(np.nanmax(y)))
-        found.append(family)
-    return found
+    """Return one basis with an interval, or None, per output, as `fitted_bases` does for the inputs."""
+    y = np.concatenate([e.y for e in data.experiments])
+    return _one_each(given, data.outputs, "output", (np.fmin.reduce(y), np.fmax.reduce(y)), "feedback ")
 
 
-def _one_each(given: Any, channels: Sequence[str], channel_kind: str, feedback: str = "") -> list[Any]:
-    """Return one basis per channel; with `feedback`, the word for messages, also None."""
+def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[Any], feedback: str = "") -> list[Any]:
+    """Return one basis per channel on its range (low, high); with `feedback`, the word for messages, also None."""
     several = list(given) if isinstance(given, list | tuple) else [given] * len(channels)
     if len(several) != len(channels):
-        raise StructureError(f"{len(several)} {feedback}bases for {len(channels)} {channel_kind}s "
+        raise StructureError(f"{len(several)} {feedback}bases for {len(channels)} {kind}s "
                              f"({', '.join(channels)}): give one each"
                              + (", None for an output that is not fed back" if feedback else ""))
     found: list[Basis | None] = []
-    for channel, one in zip(channels, several):
+    for channel, one, low, high in zip(channels, several, *ranges):
         if feedback and (one is None or one == "none"):
             found.append(None)
             continue
         family = parse(one) if isinstance(one, str) else one
         if not isinstance(family, Basis):
-            raise StructureError(f"the {feedback}basis of {channel_kind} {channel!r} is {one!r}: give one such as "
+            raise StructureError(f"the {feedback}basis of {kind} {channel!r} is {one!r}: give one such as "
                                  "Triangular(10) or its name, 'triangular:10'")
-        found.append(family)
+        if low != low:
+            raise DataError(f"{kind} {channel!r} has no sample at all; choose another column or drop the {kind}")
+        if low == high:
+            raise DataError(f"{kind} {channel!r} is constant ({low:g}): nothing can be identified from it; "
+                            "excite the input or drop the channel")
+        found.append(family.fitted(float(low), float(high)))
     return found

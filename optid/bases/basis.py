@@ -184,10 +184,6 @@ class Basis:
         u = samples(u)
         return (u < lo - slack) | (u > hi + slack)
 
-    def n_outside(self, u: ArrayLike) -> int:
-        """Count the samples of u (N,) that lie outside the interval (none when there is no interval)."""
-        return int(self.is_outside(u).sum())
-
     def to_dict(self) -> dict[str, Any]:
         """Describe the basis in JSON types; `optid.bases.from_dict` is the inverse."""
         given = ((field.name, getattr(self, field.name)) for field in fields(cast(Any, self)))

@@ -20,7 +20,6 @@ class _Splines(Basis):
     p: int
     degree: Any
     shape_exact = True
-    _points: Any  # where the functions sit, one point each
 
     @property
     def full_size(self) -> int:
@@ -31,6 +30,11 @@ class _Splines(Basis):
     def knots(self) -> Array:
         """(p + 2 degree + 1,) ends of the cells, those of the interval repeated."""
         return np.pad(np.linspace(*span(self), self.p + 1), self.degree, mode="edge")
+
+    @property
+    def _points(self) -> Array:
+        """Where the functions sit, one point each: the Greville abscissae of the control points."""
+        return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
     @property
     def dropped(self) -> int:
@@ -72,9 +76,11 @@ class _Splines(Basis):
         return np.linspace(*span(self), self.p + 1), self.degree
 
     def _evaluate(self, x: Array) -> tuple[NDArray[np.int32], Array]:
+        if self.degree > 1:
+            return _not_vanishing(x, self.knots, self.degree)
         cell, position = self._split(x)
-        if self.degree != 1:
-            return cell, _not_vanishing(x, cell, self.knots, self.degree)
+        if self.degree == 0:
+            return cell, np.ones((x.size, 1))
         weights = np.empty((x.size, 2))
         np.subtract(position, cell, out=weights[:, 1])
         np.subtract(1.0, weights[:, 1], out=weights[:, 0])
@@ -83,11 +89,11 @@ class _Splines(Basis):
     def _derivative(self, x: Array, order: int) -> Array:
         if order > self.degree:
             return np.zeros((x.size, self.size))
-        cell, control, degree = self._split(x)[0], self._control_points(order), self.degree - order
+        control, degree = self._control_points(order), self.degree - order
         if degree == 0:
-            return control[cell]
-        weights = _not_vanishing(x, cell, self.knots[order : len(self.knots) - order], degree)
-        return sum((weights[:, [i]] * control[cell + i] for i in range(degree + 1)), np.zeros((x.size, self.size)))
+            return control[self._split(x)[0]]
+        first, weights = _not_vanishing(x, self.knots[order : len(self.knots) - order], degree)
+        return sum((weights[:, [i]] * control[first + i] for i in range(degree + 1)), np.zeros((x.size, self.size)))
 
     def _control_points(self, order: int) -> Array:
         """Control points of the derivative of an order as rows that act on mu."""
@@ -119,8 +125,6 @@ class Triangular(_Splines):
     def nodes(self) -> Array:
         """(p + 1,) nodes, in units of the input."""
         return np.linspace(*span(self), self.p + 1)
-
-    _points = nodes
 
 
 @dataclass(frozen=True)
@@ -171,23 +175,11 @@ class BSpline(_Splines):
         """True up to degree 2."""
         return self.degree <= 2
 
-    @property
-    def _points(self) -> Array:
-        """Greville abscissae of the control points."""
-        return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
+def _not_vanishing(x: Array, knots: Array, degree: int) -> tuple[NDArray[np.int32], Array]:
+    """Return the first B-spline that does not vanish at each sample (N,), and the values from it on (N, degree + 1)."""
+    from scipy.interpolate import BSpline as Pieces
 
-def _not_vanishing(x: Array, cell: NDArray[np.int32], knots: Array, degree: int) -> Array:
-    """Evaluate the degree + 1 B-splines of the cell of each sample by the Cox-de Boor recursion, (N, degree + 1)."""
-    values = np.ones((degree + 1, x.size))
-    at = cell + degree
-    left = [x - knots[at - i] for i in range(degree)]
-    right = [knots[at + 1 + i] - x for i in range(degree)]
-    for d in range(1, degree + 1):
-        saved = np.zeros(x.size)
-        for r in range(d):
-            part = values[r] / (right[r] + left[d - 1 - r])
-            values[r] = saved + right[r] * part
-            saved = left[d - 1 - r] * part
-        values[d] = saved
-    return np.ascontiguousarray(values.T)
+    matrix = Pieces.design_matrix(x, knots, degree, extrapolate=True)
+    values = np.asarray(matrix.data, dtype=float).reshape(-1, degree + 1)
+    return matrix.indices[:: degree + 1].astype(np.int32), values

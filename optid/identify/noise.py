@@ -24,15 +24,9 @@ from optid.errors import DataError, StructureError
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import (
-    covariance_of,
-    information,
-    innovations_covariance,
-    log_determinant,
-    refined,
-    whitened,
-)
+from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
 from optid.models.kalman import NoiseCovariances, kalman_gain
+from optid.models.state_space import StateSpace
 from optid.statistics.hankel import complete_runs, hankel_statistics
 
 ROUNDING = 1e-10
@@ -65,10 +59,8 @@ which two gains are not the same optimum of it."""
 def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
     """Return the model with the gain K, A - K C stable, and the noise covariances that a record shows.
 
-    Args:
-        model: the model; its K and noise do not matter.
-        data: the record, in the units of the model (a transform is not undone: a formulation calls this before the
-            model returns to raw units). Samples may be missing.
+    The record is in the units of the model: a transform is not undone, since formulations call this before the model
+    returns to raw units. Samples may be missing. K and the noise of the model given do not matter.
 
     Raises:
         DataError: other channels than the model's, or no stretch long enough without a missing input.
@@ -84,12 +76,7 @@ def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
 
 
 def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, str]]:
-    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model.
-
-    Args:
-        model: a model in the units of the data.
-        data: the record it was identified on.
-    """
+    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model."""
     outputs = [e.y for e in data.experiments]
     try:
         regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
@@ -114,32 +101,20 @@ def residuals(model: HammersteinSS, data: Data) -> list[Array]:
 def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
     """Return the spectral density of the noise at the outputs, H Re H* with H = I + C (zI - A)^-1 K.
 
-    Args:
-        model: a model with noise covariances.
-        w: (F,) frequencies in radians per unit of time, up to pi / dt.
-
-    Returns:
-        (F, l, l) complex, Hermitian; its mean over (-pi/dt, pi/dt) is the covariance of the noise at the outputs.
+    It is complex and Hermitian, (F, l, l), at the frequencies w (F,) in radians per unit of time, up to pi / dt. Its
+    mean over (-pi/dt, pi/dt) is the covariance of the noise at the outputs.
 
     Raises:
         StructureError: the model has no noise covariances.
     """
-    z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * model.dt)
-    states = np.linalg.solve(z[:, None, None] * np.eye(model.nx) - model.A, model.K.astype(complex))
-    shaped = np.eye(model.l) + model.C @ states
+    shaped = StateSpace(model.A, model.K, model.C, np.eye(model.l), dt=model.dt).frequency_response(w)
     return np.asarray(shaped @ _innovations(model) @ np.conj(np.swapaxes(shaped, 1, 2)))
 
 
 def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
     """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
 
-    Args:
-        model: the model.
-        data: the record, in raw units or with the transform to them.
-        lags: largest lag.
-
-    Returns:
-        {output: test}; one that fails says that the noise of that output is coloured.
+    Returns {output: test up to so many lags}; one that fails says that the noise of that output is coloured.
     """
     raw = data.raw()
     rest = residuals(replace(model, K=_observer(model), noise=None), raw)
@@ -150,7 +125,7 @@ def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correl
 def output_noise(model: HammersteinSS) -> Array:
     """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
 
-    It is the mean of the spectrum; infinite where a pole on or outside the unit circle is driven by the noise.
+    It is infinite where a pole on or outside the unit circle is driven by the noise.
 
     Raises:
         StructureError: the model has no noise covariances.
@@ -187,9 +162,9 @@ def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Arra
     if part is not rest:
         found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
         found.sort(key=lambda pair: log_determinant(pair[1]))
-        same, total = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part)), sum(map(len, rest))
+        same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
         optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
-        found = [refined(A, C, gain, rest, total * information(A, C, gain, part)) for gain in optima]
+        found = [refined(A, C, gain, rest, part) for gain in optima]
     else:
         found = [refined(A, C, gain, rest) for gain in starts]
     return min(found, key=lambda pair: log_determinant(pair[1]))
@@ -232,13 +207,7 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     """Return the gain (n, l), A - K C stable, with the spectrum of a long autoregression of an observer's errors.
 
     With F = A - L C the errors of the gain L obey r = e + C (qI - F)^-1 (K - L) e. The autoregression shows this
-    response (Hannan and Rissanen 1982), which is linear in K.
-
-    Args:
-        A: (n, n).
-        C: (l, n).
-        gain: (n, l) gain L of the observer.
-        errors: (N, l) its prediction errors, one array per experiment; NaN = missing.
+    response, which is linear in K. The errors are (N, l), one array per experiment, NaN = missing.
 
     Raises:
         StructureError: errors that determine no gain: too few, zero, or on the stability limit.

@@ -47,7 +47,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         if (lags := _lags(arguments, c)) is not None:
             check = check_lines(name, records, basis, lags)
             found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
-        found += list_outside("input", name, basis.n_outside(u) / u.size, basis)
+        found += list_outside("input", name, float(np.mean(basis.is_outside(u))), basis)
         found += _outliers("input", name, records, arguments)
     for o, name in enumerate(data.outputs):
         records = [e.y[:, o] for e in data.experiments]

@@ -32,14 +32,11 @@ def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
     The data are Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
     """
     if isinstance(data, Data):
-        raw, many = in_units_of(model, data), data.n_experiments > 1
-        return [(e.u, e.y, f"Experiment {i}: " * many) for i, e in enumerate(raw.experiments, start=1)], False
-    arrays = [data] if is_scalar_list(data) else list(data)
-    flat = all(np.ndim(u) == 1 for u in arrays)
-    many = len(arrays) > 1
-    return [
-        (samples_of(u, "u", len(model.inputs)), None, f"Experiment {i}: " * many) for i, u in enumerate(arrays, start=1)
-    ], flat
+        flat, pairs = False, [(e.u, e.y) for e in in_units_of(model, data).experiments]
+    else:
+        arrays = [data] if is_scalar_list(data) else list(data)
+        flat, pairs = all(np.ndim(u) == 1 for u in arrays), [(samples_of(u, "u", model.m), None) for u in arrays]
+    return [(u, y, f"Experiment {i}: " * (len(pairs) > 1)) for i, (u, y) in enumerate(pairs, start=1)], flat
 
 
 def samples_of(values: ArrayLike, what: str, count: int) -> Array:

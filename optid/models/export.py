@@ -15,15 +15,7 @@ def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
     """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
 
     The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
-    state-space system.
-
-    Args:
-        model: the model.
-        output: name or index of the output.
-        input: name or index of the input.
-
-    Raises:
-        StructureError: unknown channel.
+    state-space system. An unknown channel, a name or an index, raises a `StructureError`.
     """
     from scipy.signal import dlti
 

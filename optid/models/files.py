@@ -52,12 +52,7 @@ def complete(path: Path) -> Iterator[Path]:
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
-    """Return what `build` makes of the content of a file that `write` wrote in this form and version.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ModelFileError: the file is truncated, damaged, of another version, or of another form.
-    """
+    """Return what `build` makes of the content of a file that `write` wrote in this form; errors as of `load`."""
     path, what = Path(path), form.removeprefix("optid ")
     remedy = f"Use a file written by {what}.save(...)."
     try:
@@ -121,14 +116,3 @@ def read_state(
     if head.get("version") != version:
         raise ModelFileError(f"{path} has version {head.get('version')!r}; this optid reads version {version}.")
     return head, arrays
-
-
-def set_arrays(state: Any, arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Give a fresh state the arrays of a file; refuse other types and shapes than its own (`ModelFileError`)."""
-    for name, array in arrays.items():
-        wanted = getattr(state, name)
-        if array.dtype != wanted.dtype or array.shape != wanted.shape:
-            raise ModelFileError(
-                f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} is needed."
-            )
-        setattr(state, name, np.ascontiguousarray(array))

@@ -1,6 +1,5 @@
 """The static functions and the responses of a model, as tables and figures name them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,13 +48,18 @@ class StaticFunction:
 def static_functions(model: Any) -> list[StaticFunction]:
     """Return the functions of the inputs, then those of the outputs that are fed back.
 
-    With one input and one function of it the word is "f"; several functions of one input are numbered.
+    With one input and one function of it the word is "f"; several functions of a channel are numbered: f1_valve.
     """
     shown = model.f if isinstance(model.f, tuple) else (model.f,)  # with its offset, where the model knows it
-    places = tuple(getattr(model, "input_of", range(model.m)))
-    found = _named("f", shown, places, model.inputs, model.input_units)
+    groups = [("f", shown, getattr(model, "input_of", range(model.m)), model.inputs, model.input_units)]
     if has_feedback(model):
-        found += _named("g", model.feedback, tuple(model.output_of), model.outputs, model.output_units)
+        groups.append(("g", model.feedback, model.output_of, model.outputs, model.output_units))
+    found = []
+    for letter, functions, places, names, units in groups:
+        for j, (f, c) in enumerate(zip(functions, places)):
+            number = str(list(places[: j + 1]).count(c)) if list(places).count(c) > 1 else ""
+            word = letter + number + ("" if len(names) == 1 else f"_{names[c]}")
+            found.append(StaticFunction(word, f, c, names[c], units[c], j, fed_back=letter == "g"))
     return found
 
 
@@ -69,18 +73,6 @@ def latent_names(model: Any) -> tuple[list[str], list[str]]:
 def has_feedback(model: Any) -> bool:
     """Whether outputs are fed back through static functions, so that a simulation may take them from a record."""
     return bool(getattr(model, "feedback", ()))
-
-
-def _named(
-    letter: str, functions: Sequence[Nonlinearity], places: tuple[int, ...], names: Sequence[str], units: Sequence[str]
-) -> list[StaticFunction]:
-    """Words by channel, numbered behind the letter where a channel has several functions: f1_valve, f2_valve."""
-    found = []
-    for j, (f, c) in enumerate(zip(functions, places)):
-        number = str(places[: j + 1].count(c)) if places.count(c) > 1 else ""
-        word = letter + number + ("" if len(names) == 1 else f"_{names[c]}")
-        found.append(StaticFunction(word, f, c, names[c], units[c], j, fed_back=letter == "g"))
-    return found
 
 
 def step_length(model: Model) -> int:

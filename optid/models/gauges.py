@@ -9,13 +9,7 @@ GAUGES = ("norm", "gain", "b0", "none")
 
 
 def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
-    """Return the factor by which B must be divided, and f multiplied, to satisfy a gauge.
-
-    Args:
-        gauge: "norm", "gain" or "b0".
-        a: coefficients of A.
-        b: (nb,) or (nb, l) coefficients of B.
-        channel: name of the input, for the message.
+    """Return the factor by which B (nb,) or (nb, l) is divided, and f multiplied, for "norm", "gain" or "b0".
 
     Raises:
         StructureError: the quantity that the gauge sets to one is zero.

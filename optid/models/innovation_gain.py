@@ -12,8 +12,10 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.models.feedback_tables import tabulated
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
+from optid.models.state_signals import Parts, Places, Signals, Stretch
 
 STEPS = 50
 """Steps at most."""
@@ -24,8 +26,13 @@ FIRM = 0.01
 ARRIVED = 2e-5
 """Gain of the log-likelihood of no account; half a unit is one standard error of a parameter."""
 
+NUMBERS = 200_000
+"""Entries of the sensitivities formed at a time."""
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array | None = None,
+NO_FUNCTIONS = tabulated(())
+
+
+def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequence[Array] | None = None,
             arrived: float = ARRIVED) -> tuple[Array, Array]:
     """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
 
@@ -36,7 +43,7 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
         C: (l, n).
         gain: (n, l) start.
         rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
-        known: (n l, n l) the information about the gain (column by column) to be used at every step, near an optimum.
+        part: of rest, whose mean information about the gain serves at every step, near an optimum.
         arrived: gain of the log-likelihood still to be expected at which the search ends.
 
     Returns:
@@ -45,16 +52,19 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
     errors = whitened(A, C, gain, rest)
     best, damping, before = covariance_of(errors), 1e-4, 0.0
     half = sum(np.count_nonzero(~np.isnan(r)) for r in rest) / (2 * len(C))
+    if part is not None:
+        normal, _ = _equations(A, C, gain, part, innovations_covariance(A, C, gain, part))
+        normal *= sum(map(len, rest)) / sum(map(len, part))
     for _ in range(STEPS):
-        if known is None:
+        if part is None:
             normal, right = _equations(A, C, gain, rest, best)
         else:
-            normal, right = known, _slope(A, C, gain, errors)
+            right = _slope(A, C, gain, errors)
         promised, gained = np.inf, 0.0
         while not gained > 0 and promised > arrived:
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
             promised = 0.5 * float(right @ step)
-            trial = _stable(A, C, gain + step.reshape(gain.shape[::-1]).T, best)
+            trial = _stable(A, C, gain + step.reshape(gain.shape), best)
             errors = whitened(A, C, trial, rest, best)
             covariance = covariance_of(errors)
             gained = half * (log_determinant(best) - log_determinant(covariance))
@@ -72,12 +82,6 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], known: Array
     return gain, best
 
 
-def information(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
-    """Mean information (n l, n l) of a sample about the gain (column by column), initial states unknown."""
-    normal, _ = _equations(A, C, gain, rest, innovations_covariance(A, C, gain, rest))
-    return normal / sum(map(len, rest))
-
-
 def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
     """Covariance (l, l) of the innovations under a gain."""
     return covariance_of(whitened(A, C, gain, rest))
@@ -85,11 +89,13 @@ def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array
 
 def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
     """Innovations (N, l) of every experiment under a gain, with the initial state that fits best, see `_initial`."""
-    from optid.models.innovation_kernels import innovate
+    parts = _parts(A, C, gain)
+    return innovations(parts, rest, _initial(parts, rest, covariance))
 
-    F, C, gain = _predictor(A, C, gain)
-    rest = [np.ascontiguousarray(r) for r in rest]
-    return [innovate(F, C, gain, r, x0) for r, x0 in zip(rest, _initial(F, C, gain, rest, covariance))]
+
+def innovations(parts: Parts, rest: Sequence[Array], starts: Sequence[Array]) -> list[Array]:
+    """Innovations (N, l) of every experiment under a gain from initial states (n,)."""
+    return [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(rest, starts)]
 
 
 def covariance_of(signals: Sequence[Array]) -> Array:
@@ -140,72 +146,104 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
         return np.zeros_like(gain)
 
 
-def _initial(F: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
+def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> Parts:
+    """A model x+ = A x + L y + K e, y = C x + e as the compiled recursions read it."""
+    n, l = gain.shape  # noqa: E741
+    injected = np.zeros((n, l)) if injection is None else injection
+    none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
+    matrices = A, none[0], C, none[1], none[2], injected, gain, *none[3:]
+    return Parts._make([*map(np.ascontiguousarray, matrices), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+
+
+def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
+    """Outputs (T, l) while y (T, l) are measured from a state x, which moves on; infinite once they leave all numbers.
+
+    The states (T, n) before every sample are written, unless (0, n) is given.
+    """
+    from optid.models.state_kernels import march
+
+    (count, l), n = y.shape, x.size  # noqa: E741
+    idle, outputs = np.zeros((count, 0)), np.empty((count, l))
+    stretch = Stretch(np.zeros((count, n)), np.zeros((count, l)), idle, np.ascontiguousarray(y), idle,
+                      np.full(l, -np.inf), np.full(l, np.inf))
+    outputs[march(parts, stretch, x, outputs, states)[1] :] = np.inf
+    return outputs
+
+
+def _initial(parts: Parts, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
     """Initial states (n,) that minimise the squared innovations, which are affine in them.
 
     The innovations are in units of a covariance (l, l); without one every output counts by the size of its residuals.
     """
-    from optid.models.innovation_kernels import innovation_moments
-
     if covariance is None:
         covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
-    weight = _whitening(covariance)
-    settled, found = _settling(F), []
-    for r in rest:
-        part = np.ascontiguousarray(r[:settled])
-        normal, right = innovation_moments(F, C, gain, part, np.zeros(len(F)), weight)
-        found.append(_solved(normal[gain.size :, gain.size :], right[gain.size :]))
-    return found
-
-
-def _predictor(A: Array, C: Array, gain: Array) -> tuple[Array, Array, Array]:
-    """Return A - K C, C and K as the kernels read them."""
-    return np.ascontiguousarray(A - gain @ C), np.ascontiguousarray(C), np.ascontiguousarray(gain)
+    n, radius, root = len(parts.A), spectral_radius(parts.A - parts.K @ parts.C), _whitening(covariance)
+    settled = None if radius >= 1 else n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
+    found = [_moments(parts, r[:settled], np.zeros(n), root, 0) for r in rest]
+    return [-_solved(moments[:n, :n], moments[:n, n]) for moments in found]
 
 
 def _whitening(covariance: Array) -> Array:
     """Matrix (l, l) that turns innovations of a covariance into white ones."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.ascontiguousarray((vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T)
-
-
-def _settling(F: Array) -> int | None:
-    """Samples after which the initial state is forgotten; None for never."""
-    radius = spectral_radius(F)
-    return None if radius >= 1 else len(F) + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
+    return (vectors / np.sqrt(np.maximum(values, 1e-14 * values[-1]))).T
 
 
 def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
-    """Slope (n l,) of the log-likelihood by the gain (column by column) at its innovations."""
-    from optid.models.innovation_kernels import innovation_slope
+    """Slope (n l,) of the log-likelihood by the gain (row by row) at its innovations.
 
+    The adjoint runs back in time; where an innovation is missing K corrected nothing, and A takes the place of A - K C.
+    """
     sums, pairs = _products(errors)
-    root, (F, C, gain) = _whitening(sums / np.maximum(pairs, 1.0)), _predictor(A, C, gain)
+    root = _whitening(sums / np.maximum(pairs, 1.0))
     weight = root.T @ root * np.mean(np.diag(pairs)) / np.maximum(pairs, 1.0)
-    return np.sum([innovation_slope(F, C, gain, e, weight) for e in errors], axis=0).T.ravel()
+    adjoint, slope = _parts((A - gain @ C).T, gain.T, np.zeros_like(gain), C.T), np.zeros_like(gain)
+    for e in errors:
+        backwards, states = np.ascontiguousarray(e[::-1]), np.empty((len(e), len(A)))
+        missing = np.isnan(backwards)
+        present = np.where(missing, 0.0, backwards)
+        _run(adjoint, np.where(missing, np.nan, present @ weight), np.zeros(len(A)), states)
+        slope += states.T @ present
+    return slope.ravel()
 
 
 def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
-    """Normal equations of a step in the gain (column by column), the innovations in units of their covariance.
+    """Normal equations of a step in the gain (row by row), the innovations in units of their covariance.
 
     The initial states are eliminated.
     """
-    from optid.models.innovation_kernels import innovation_moments
+    parts, root, n = _parts(A, C, gain), _whitening(covariance), len(A)
+    total = np.zeros((gain.size + 1, gain.size + 1))
+    for r, x0 in zip(rest, _initial(parts, rest)):
+        moments = _moments(parts, r, x0, root, gain.size)
+        total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
+    return total[:-1, :-1], -total[:-1, -1]
 
-    weight, (F, C, gain), size = _whitening(covariance), _predictor(A, C, gain), gain.size
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    for r, x0 in zip(rest, _initial(F, C, gain, rest)):
-        information, pull = innovation_moments(F, C, gain, np.ascontiguousarray(r), x0, weight)
-        cross = information[size:, :size]
-        both = _solved(information[size:, size:], np.column_stack([cross, pull[size:]]))
-        normal += information[:size, :size] - cross.T @ both[:, :-1]
-        right += pull[:size] - cross.T @ both[:, -1]
-    return normal, right
+
+def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array:
+    """Gram matrix of [d e / d x0 | d e / d K | e], e predicted less measured outputs times a root (l, l).
+
+    K counts row by row, or, with size 0 in place of n l, not at all.
+    """
+    from optid.models.state_kernels import sensitivities
+
+    (n, l), x, none = parts.K.shape, x0.copy(), np.zeros((0, 0))  # noqa: E741
+    places, turn = Places.none(parts)._replace(K=n if size else -1), np.eye(n, n + size)
+    total, length = np.zeros((n + size + 1, n + size + 1)), max(64, NUMBERS // ((n + size + 1) * l))
+    for first in range(0, len(r), length):
+        y = r[first : first + length]
+        missing, states, block = np.isnan(y), np.empty((len(y), n)), np.empty((len(y), l, n + size + 1))
+        error = np.where(missing, 0.0, _run(parts, y, x, states) - y)
+        returned = np.where(missing[:, None], 0.0, -parts.K)
+        signals = Signals(states, -error, returned, none, none, none, none, none, none, none, none)
+        sensitivities(parts, places, signals, turn, block)
+        block[missing], block[:, :, -1] = 0.0, error
+        rows = (root @ block).reshape(-1, n + size + 1)
+        total += rows.T @ rows
+    return total
 
 
 def _solved(matrix: Array, right: Array) -> Array:
     """Solve a symmetric system; directions without information stay at zero."""
     scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    inverse = np.where(values > 1e-12 * max(values[-1], 1e-300), 1 / np.where(values == 0, 1.0, values), 0.0)
-    return (vectors * inverse) @ (vectors.T @ (right.T / scale).T) / (scale if right.ndim == 1 else scale[:, None])
+    return (np.linalg.lstsq(matrix / np.outer(scale, scale), (right.T / scale).T, rcond=1e-12)[0].T / scale).T

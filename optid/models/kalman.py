@@ -96,14 +96,8 @@ class Kalman(NamedTuple):
 def kalman_gain(A: Array, C: Array, Q: Array, R: Array, S: Array | None = None) -> Kalman:
     """Solve the Riccati equation of the one-step predictor.
 
-    P = A P A^T + Q - (A P C^T + S) (C P C^T + R)^-1 (A P C^T + S)^T, K = (A P C^T + S) (C P C^T + R)^-1.
-
-    Args:
-        A: (n, n).
-        C: (l, n).
-        Q: (n, n) covariance of the process noise.
-        R: (l, l) covariance of the measurement noise, positive definite.
-        S: (n, l) cross-covariance, zero by default.
+    P = A P A^T + Q - (A P C^T + S) (C P C^T + R)^-1 (A P C^T + S)^T, K = (A P C^T + S) (C P C^T + R)^-1, with the
+    covariances of `NoiseCovariances`; S is zero by default.
 
     Raises:
         StructureError: shapes that do not agree, R not positive definite, or no stabilising solution: a mode on or

@@ -121,13 +121,9 @@ class Model(Ports):
         return replace(functions[0], offset=self.c0) if len(functions) == 1 else functions
 
     def static_gain(self, u0: ArrayLike) -> Any:
-        """Return the slope of the steady-state characteristic at u0, feedback included.
+        """Return the slope of the steady-state characteristic at u0, a number or (m,), feedback included.
 
-        Args:
-            u0: operating point, a number or (m,).
-
-        Returns:
-            A number for one input and output, otherwise (l, m).
+        It is a number for one input and output, otherwise (l, m).
 
         Raises:
             StructureError: u0 of the wrong size, an integrator (a pole at 1), or no equilibrium found.
@@ -233,10 +229,7 @@ class Model(Ports):
     def initial_state(self, data: Data, simulator: str = "free") -> Any:
         """Estimate the state at the first sample by least squares; a tuple for several experiments.
 
-        Args:
-            data: the record.
-            simulator: the one whose errors are minimised: "free", "predict" or, with nonlinear feedback,
-                "measured_feedback".
+        The simulator whose errors are minimised is "free", "predict" or, with nonlinear feedback, "measured_feedback".
 
         Raises:
             DataError: as `simulate`.
@@ -324,12 +317,7 @@ class Model(Ports):
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
-        """Build the model that `to_dict` described; the errors are those of the parts.
-
-        Args:
-            content: what `to_dict` returned.
-            functions: those of a basis of UserFunctions, by name.
-        """
+        """Build what `to_dict` described, with the functions of UserFunctions by name; errors as of the parts."""
         given = {one.name: content[one.name] for one in fields(cls)}
         for name in given.keys() & {"nonlinearities", "feedback", "latent"}:
             given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])

@@ -39,14 +39,10 @@ class Filtered(NamedTuple):
 
 
 def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 0) -> Filtered:
-    """Run the noise filter over one record from rest.
+    """Run the noise filter over one record s (N,) from rest; c and d are the coefficients after the leading ones.
 
-    Args:
-        s: (N,) samples, NaN = missing.
-        drive: (N,) what is known besides, NaN = missing; None for zero.
-        c: (nc,) coefficients of C after the leading one.
-        d: (nd,) coefficients of D after the leading one.
-        start: number of first samples whose innovation counts as zero and that are not predicted.
+    drive (N,) is what is known besides, None for zero; NaN is a missing sample of either. The innovations of the first
+    `start` samples count as zero, and these samples are not predicted.
     """
     known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
     samples, c, d = np.ascontiguousarray(s, dtype=float), np.asarray(c), np.asarray(d)

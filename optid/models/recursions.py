@@ -23,15 +23,9 @@ def late_njit(function: Callable[..., Any]) -> Any:
 
 
 def lfilter(b: ArrayLike, a: ArrayLike, x: ArrayLike) -> Array:
-    """Filter the columns of x from rest: a(q) y = b(q) x.
+    """Filter the columns of x, (N,) or (N, m), from rest: a(q) y = b(q) x, with leading one in a.
 
-    Args:
-        b: (nb,) numerator, the coefficient of the present sample first.
-        a: (na + 1,) denominator with leading one.
-        x: (N,) or (N, m) samples.
-
-    Returns:
-        As x; not finite where the recursion leaves the range of numbers.
+    y is not finite where the recursion leaves the range of numbers.
     """
     x, a = np.asarray(x, dtype=float), np.asarray(a, dtype=float)
     if x.size > SHORT:
@@ -49,14 +43,9 @@ def lfilter(b: ArrayLike, a: ArrayLike, x: ArrayLike) -> Array:
 
 
 def autoregression(a: Array, right: Array) -> Array:
-    """Solve y(k) + sum_i A_i y(k-i) = right(k) from rest.
+    """Solve y(k) + sum_i A_i y(k-i) = right(k), (N, l), from rest, with the matrices A_i in a (na, l, l).
 
-    Args:
-        a: (na, l, l) matrices A_i.
-        right: (N, l) right-hand side.
-
-    Returns:
-        (N, l); not finite where the recursion leaves the range of numbers.
+    y is not finite where the recursion leaves the range of numbers.
     """
     if not len(a):
         return right

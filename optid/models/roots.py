@@ -39,22 +39,17 @@ def with_roots(roots: Any, size: int) -> Array:
     return found
 
 
-def reflected(coefficients: Array) -> Array:
-    """Return the coefficients with every root outside the unit circle reflected into it.
-
-    The spectrum of C e keeps its shape (spectral factorisation).
-    """
-    return contained(coefficients, np.inf)
-
-
 def pulled(coefficients: Array, limit: float) -> Array:
     """Return the coefficients with every root outside the circle of radius ``limit`` pulled back onto it."""
     roots = roots_of(coefficients)
     return with_roots(roots * (limit / np.maximum(np.abs(roots), max(limit, 1e-300))), len(coefficients))
 
 
-def contained(coefficients: Array, limit: float) -> Array:
-    """Return the coefficients with roots outside the unit circle reflected, and none outside a radius ``limit``."""
+def contained(coefficients: Array, limit: float = np.inf) -> Array:
+    """Return the coefficients with roots outside the unit circle reflected, and none outside a radius ``limit``.
+
+    Where the limit moves none, the spectrum of C e keeps its shape (spectral factorisation).
+    """
     roots = roots_of(coefficients)
     roots = roots / np.maximum(np.abs(roots), 1.0) ** 2
     return with_roots(roots * np.minimum(limit / np.maximum(np.abs(roots), 1e-300), 1.0), len(coefficients))

@@ -1,15 +1,22 @@
 """Sums, polynomials and state-space models as text: equations for few states, a summary beyond."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.models.functions import latent_names, static_functions
+from optid.models.state_space import MATRICES
 
 READABLE = 4
 """Most states whose equations are written out."""
+
+TERMS = {
+    "x": {"A": "x", "B": "f", "E": "g", "L": "y", "Ez": "h", "offset_x": "", "K": "e"},
+    "y": {"C": "x", "D": "f", "Fz": "h", "offset_y": ""},
+    "z": {"Cz": "x", "Dz": "u", "offset_z": ""},
+}
+"""The matrices of every equation in the order in which they are written, and what they multiply."""
 
 
 def signed_terms(terms: Iterable[tuple[float, str]], digits: int = 4) -> str:
@@ -40,21 +47,14 @@ def matrix_entries(model: Any) -> list[tuple[str, float]]:
     """Return (name, value) of the entries of all matrices, as tables show them; zero matrices are left out."""
     functions, fed = _names(model)
     words, signals = latent_names(model)
-    states = [f"x{i + 1}" for i in range(model.nx)]
-    columns = {
-        "A": (states, states), "B": (states, functions), "C": (model.outputs, states), "D": (model.outputs, functions),
-        "E": (states, fed), "L": (states, model.outputs), "K": (states, model.outputs),
-        **dict(zip(("Ez", "Fz", "Cz", "Dz"), ((states, words), (model.outputs, words), (signals, states),
-                                              (signals, model.inputs)))),
-    }
-    found = []
-    for name, (rows, names) in columns.items():
-        matrix = getattr(model, name)
-        if name in "ABC" or np.any(matrix):
-            found += [(f"{name}[{rows[i]},{names[j]}]", float(value)) for (i, j), value in np.ndenumerate(matrix)]
-    for name, rows in (("offset_x", states), ("offset_y", model.outputs), ("offset_z", signals)):
-        if np.any(getattr(model, name)):
-            found += [(f"{name}[{row}]", float(value)) for row, value in zip(rows, getattr(model, name))]
+    columns = {"n": [f"x{i + 1}" for i in range(model.nx)], "r": functions, "s": fed, "l": model.outputs, "k": words,
+               "m": model.inputs}
+    rows, found = {**columns, "k": signals}, []
+    for name, (row, *column) in sorted(MATRICES.items(), key=lambda item: -len(item[1])):  # the constants come last
+        if name in "ABC" or np.any(getattr(model, name)):
+            axes = [rows[row], *(columns[letter] for letter in column)]
+            found += [(f"{name}[{','.join(axis[i] for axis, i in zip(axes, at))}]", float(value))
+                      for at, value in np.ndenumerate(getattr(model, name))]
     return found
 
 
@@ -67,55 +67,44 @@ def _names(model: Any) -> tuple[list[str], list[str]]:
 
 
 def _equations(model: Any, digits: int) -> str:
-    functions, (names, words) = [], _names(model)
+    functions, (names, words), (inner, latent) = [], _names(model), latent_names(model)
     for f, c, name in zip(model.nonlinearities, model.input_of, names):
         sample = f"{model.inputs[c]}(k)"
         linear = name == model.inputs[c]
         functions.append((float(f.mu[0]), sample) if linear else (1.0, f"{name}({sample})"))
-    fed = [(1.0, f"{name}({model.outputs[o]}(k))") for name, o in zip(words, model.output_of)]
-    states = [(1.0, f"x{i + 1}(k)") for i in range(model.nx)]
-    measured = [(1.0, f"{name}(k)") for name in model.outputs]
-    errors = [(1.0, f"e_{name}(k)" if model.l > 1 else "e(k)") for name in model.outputs]
-    one, (inner, signals) = [(1.0, "")], latent_names(model)
-    latent, inputs = [(1.0, f"{h}({z}(k))") for h, z in zip(inner, signals)], [(1.0, f"{u}(k)") for u in model.inputs]
+    errors = [f"e_{name}(k)" if model.l > 1 else "e(k)" for name in model.outputs]
+    samples = {
+        "x": [f"x{i + 1}(k)" for i in range(model.nx)], "y": [f"{name}(k)" for name in model.outputs], "e": errors,
+        "g": [f"{name}({model.outputs[o]}(k))" for name, o in zip(words, model.output_of)], "": [""],
+        "h": [f"{h}({z}(k))" for h, z in zip(inner, latent)], "u": [f"{name}(k)" for name in model.inputs],
+    }
+    signals = {signal: [(1.0, name) for name in names] for signal, names in samples.items()} | {"f": functions}
     lines = []
-    for i in range(model.nx):
-        rows = [
-            (model.A[i], states), (model.B[i], functions), (model.E[i], fed), (model.L[i], measured),
-            (model.Ez[i], latent), (model.offset_x[[i]], one), (model.K[i], errors),
-        ]
-        lines.append(f"x{i + 1}(k+1) = {_sum(rows, digits)}")
-    for o, name in enumerate(model.outputs):
-        rows = [(model.C[o], states), (model.D[o], functions), (model.Fz[o], latent), (model.offset_y[[o]], one)]
-        tail = f" + {errors[o][1]}" if np.any(model.K) else ""
-        lines.append(f"{name}(k) = {_sum(rows, digits)}{tail}")
-    for i, name in enumerate(signals):
-        rows = [(model.Cz[i], states), (model.Dz[i], inputs), (model.offset_z[[i]], one)]
-        lines.append(f"{name}(k) = {_sum(rows, digits)}")
+    for kind, left in (("x", [f"x{i + 1}(k+1)" for i in range(model.nx)]), ("y", samples["y"]),
+                       ("z", [f"{name}(k)" for name in latent])):
+        for i, name in enumerate(left):
+            terms = [(float(value) * scale, word) for matrix, signal in TERMS[kind].items()
+                     for value, (scale, word) in zip(np.atleast_1d(getattr(model, matrix)[i]), signals[signal])]
+            tail = f" + {errors[i]}" if kind == "y" and np.any(model.K) else ""
+            lines.append(f"{name} = {signed_sum(terms, digits)}{tail}")
     return "\n".join(lines)
 
 
-def _sum(rows: Sequence[tuple[Array, Sequence[tuple[float, str]]]], digits: int) -> str:
-    """Write the sum of rows of coefficients times (scale, name) of what they multiply."""
-    terms = [(float(v) * scale, name) for values, words in rows for v, (scale, name) in zip(values, words)]
-    return signed_sum(terms, digits)
-
-
 def _summary(model: Any) -> str:
-    arguments = ", ".join(model.inputs)
-    state = f"x(k+1) = A x(k) + B f({arguments})"
-    if model.feedback:
-        state += f" + E g({', '.join(dict.fromkeys(model.outputs[o] for o in model.output_of))})"
-    for name, term in (("L", "L y(k)"), ("Ez", "Ez h(z)"), ("offset_x", "offset_x"), ("K", "K e(k)")):
-        state += f" + {term}" if np.any(getattr(model, name)) else ""
-    output = "y(k) = C x(k)" + (f" + D f({arguments})" if np.any(model.D) else "")
-    output += " + Fz h(z)" if np.any(model.Fz) else ""
-    output += (" + offset_y" if np.any(model.offset_y) else "") + (" + e(k)" if np.any(model.K) else "")
+    fed = ", ".join(dict.fromkeys(model.outputs[o] for o in model.output_of))
+    words = {"x": " x(k)", "f": f" f({', '.join(model.inputs)})", "g": f" g({fed})", "y": " y(k)", "h": " h(z)",
+             "u": " u(k)", "e": " e(k)", "": ""}
+    always = {"A", "B", "C", "Cz", "Dz", "offset_z"} | ({"E"} if model.feedback else set())
+    state, output, latent = (
+        " + ".join(matrix + words[signal] for matrix, signal in terms.items()
+                   if matrix in always or np.any(getattr(model, matrix))) for terms in TERMS.values()
+    )
+    text = f"x(k+1) = {state}\ny(k) = {output}{' + e(k)' * bool(np.any(model.K))}\n"
     sizes = f"{model.nx} states, {len(model.nonlinearities)} functions of the inputs"
     sizes += f", {len(model.feedback)} of the outputs" if model.feedback else ""
     names = "A, B, C, D, E" if model.feedback else "A, B, C, D"
     if model.latent:
-        output += "\nz(k) = Cz x(k) + Dz u(k) + offset_z"
+        text += f"z(k) = {latent}\n"
         sizes += f", {len(model.latent)} of latent signals"
         names += ", Ez, Fz, Cz, Dz"
-    return f"{state}\n{output}\n{sizes}; the matrices are {names} of the model"
+    return f"{text}{sizes}; the matrices are {names} of the model"

@@ -113,7 +113,7 @@ class TransferFunction(Model):
         if largest >= 1:
             raise StructureError(
                 f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
-                "(optid.models.roots.reflected): the spectrum of the noise stays what it is."
+                "(optid.models.roots.contained): the spectrum of the noise stays what it is."
             )
 
     # -- sizes ---------------------------------------------------------------------------------------------------
@@ -187,14 +187,6 @@ class TransferFunction(Model):
             "oe": "e is added to the output: C = D = 1",
         }[self.structure]
 
-    def noise_frequency_response(self, w: ArrayLike) -> Any:
-        """Return C/D at the frequencies w (radians per unit of time), complex (len(w),), or (len(w), l, l)."""
-        shift = self._shift(w)
-        if self.l > 1:
-            return np.linalg.inv(self._denominator(shift))
-        above, below = (np.polyval([*reversed(p), 1.0], shift) for p in (self.c, self.noise_denominator))
-        return above / below
-
     # -- plant ---------------------------------------------------------------------------------------------------
 
     @property
@@ -257,20 +249,13 @@ class TransferFunction(Model):
 
     def frequency_response(self, w: ArrayLike) -> Array:
         """Return A^-1 B_c at the frequencies w (radians per unit of time, up to pi / dt), complex (len(w), l, m)."""
-        shift = self._shift(w)
+        shift = np.exp(-1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)  # q^-1
+        denominator = np.eye(self.l) + np.tensordot(shift[:, None] ** np.arange(1, self.na + 1), self.matrices, 1)
         numerator = np.zeros((shift.size, self.l, self.m), dtype=complex)
         for c in range(self.m):
             for lag, row in self.terms(c):
                 numerator[:, :, c] += (shift**lag)[:, None] * row
-        return np.asarray(np.linalg.solve(self._denominator(shift), numerator))
-
-    def _shift(self, w: ArrayLike) -> Any:
-        """The shift operator q^-1 at the frequencies w."""
-        return np.exp(-1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
-
-    def _denominator(self, shift: Any) -> Any:
-        """A(q), (len(shift), l, l)."""
-        return np.eye(self.l) + np.tensordot(shift[:, None] ** np.arange(1, self.na + 1), self.matrices, 1)
+        return np.asarray(np.linalg.solve(denominator, numerator))
 
     # -- gauge and units -----------------------------------------------------------------------------------------
 

@@ -1,6 +1,18 @@
 """Simulated plants: the systems on which the methods for closed loop, states and order are tried out.
 
-Each takes an input, a seed and the sizes of its noises, and returns a record (`optid.Data`).
+Each takes an input and returns a record (`optid.Data`). They share these arguments, as far as they have them:
+
+    u: (N,) or (N, m) input.
+    seed: of the noises.
+    process: standard deviation of the white process noise.
+    measurement: standard deviation of the measurement noise.
+    colour: pole of the first-order autoregression that the measurement noise is; 0 is white.
+    dt: sampling time, s.
+    substeps: Runge-Kutta steps per sample.
+    x0: state at the first sample.
+
+A missing input, a wrong shape and a run that leaves all bounds raise a `DataError`, a parameter out of its range a
+`StructureError`.
 """
 
 from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem, two_mode_plant

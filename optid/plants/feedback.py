@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.plants.sampling import as_input, as_state, check_bounded, check_nonnegative, check_positive, gaussian
+from optid.plants.sampling import as_input, as_state, check_bounded, check_parameters, gaussian
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
@@ -50,20 +50,7 @@ class FeedbackSystem:
 
     def record(self, u: ArrayLike, seed: int | np.random.Generator = 0, *, process: float = 0.0,
                measurement: float = 0.0, colour: float = 0.0, x0: ArrayLike | None = None) -> Data:
-        """Simulate a record.
-
-        Args:
-            u: (N, 2) inputs.
-            seed: of the noises.
-            process: standard deviation of w, white.
-            measurement: standard deviation of v.
-            colour: pole of the first-order autoregression v; 0 is white.
-            x0: state at the first sample; zero when not given.
-
-        Raises:
-            DataError: a missing input, a wrong shape, or a run that leaves all bounds.
-            StructureError: a noise size or colour out of its range.
-        """
+        """Simulate a record under inputs u (N, 2); the arguments are those of `optid.plants`, x0 zero by default."""
         from optid.plants.kernels import with_feedback
 
         u = as_input(u, 2)
@@ -137,8 +124,8 @@ def two_mode_plant(coupled: bool = False, process: float = 0.0, measurement: flo
     from optid.models.hammerstein_ss import HammersteinSS
     from optid.models.kalman import NoiseCovariances, kalman_gain
 
-    check_nonnegative(process=process)
-    check_positive(measurement=measurement)
+    check_parameters(positive=False, process=process)
+    check_parameters(measurement=measurement)
     nothing = np.zeros((2, 2))
     a = np.block([[rotation(0.9, 0.5), nothing], [nothing, rotation(0.8, 1.3)]])
     if coupled:

@@ -25,18 +25,11 @@ def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -
 @njit(cache=True, nogil=True, error_model="numpy")
 def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, dt: float, substeps: int,
               stages: int) -> Array:
-    """Return the states (N, n) at the sampling instants by the classical Runge-Kutta method, or by Euler's.
+    """Return the states (N, n) of `PENDULUM` or `VAN_DER_POL` at the sampling instants, from x0 (n,).
 
-    Args:
-        plant: `PENDULUM` or `VAN_DER_POL`.
-        drive: (N,) held between samples.
-        v: (N,) measurement noise that is fed back, held between samples.
-        w: (N, n) process noise, added at the end of each sample.
-        x0: (n,).
-        p: parameters, see `_rates`.
-        dt: sampling time.
-        substeps: steps per sample.
-        stages: 4, or 1 for Euler's method.
+    The classical Runge-Kutta method has 4 stages, Euler's 1. The drive (N,) and the measurement noise v (N,), which is
+    fed back, are held over a sample; the process noise w (N, n) is added at its end. The parameters p are those of
+    `_rates`.
     """
     n, h = x0.size, dt / substeps
     states = np.empty((drive.size, n))
@@ -66,16 +59,9 @@ def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def with_feedback(a: Array, drive: Array, direct: Array, c: Array, e: Array, v: Array, x0: Array) -> Array:
-    """Return the states (N, n) of x+ = A x + drive + E g(y), y = C x + direct + v, with the two feedbacks of Example 1.
+    """Return the states (N, n) of a `FeedbackSystem`: x+ = A x + drive + E g(y), y = C x + direct + v, from x0 (n,).
 
-    Args:
-        a: (n, n).
-        drive: (N, n) what input and process noise add to the state.
-        direct: (N, 2) what the input adds to the output.
-        c: (2, n).
-        e: (n, 2).
-        v: (N, 2) measurement noise, inside the loop.
-        x0: (n,).
+    drive (N, n) and direct (N, 2) are what the input and the process noise add to the state and to the output.
     """
     n = a.shape[0]
     states = np.empty((drive.shape[0], n))

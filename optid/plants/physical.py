@@ -1,4 +1,7 @@
-"""The reaction wheel pendulum and the Van der Pol oscillator: plants of known physics with known imperfections."""
+"""The reaction wheel pendulum and the Van der Pol oscillator: plants of known physics with known imperfections.
+
+The arguments that they share are those of `optid.plants`.
+"""
 
 from dataclasses import dataclass
 
@@ -9,7 +12,7 @@ from optid import signals
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import StructureError, nearest
-from optid.plants.sampling import as_input, as_state, check_bounded, check_nonnegative, check_positive, gaussian
+from optid.plants.sampling import as_input, as_state, check_bounded, check_parameters, gaussian
 
 STAGES = {"euler": 1, "rk4": 4}
 """Stages of the methods of integration."""
@@ -59,8 +62,8 @@ class ReactionWheelPendulum:
     def __post_init__(self) -> None:
         values = vars(self)
         strict = ("pendulum_mass", "wheel_inertia", "pendulum_length", "gravity", "saturation", "threshold")
-        check_positive(**{name: values[name] for name in strict})
-        check_nonnegative(**{name: value for name, value in values.items() if name != "torque_gain"})
+        check_parameters(**{name: values[name] for name in strict})
+        check_parameters(positive=False, **{name: value for name, value in values.items() if name != "torque_gain"})
 
     @property
     def inertia(self) -> float:
@@ -91,21 +94,10 @@ class ReactionWheelPendulum:
         return self.torque_gain * np.sign(u) * np.maximum(np.abs(u) - self.dead_zone, 0.0)
 
     def states(self, u: ArrayLike, *, dt: float = 0.02, substeps: int = 4, x0: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-        """Return angle (rad), rate (rad/s) and wheel speed (rad/s), (N, 3), under commands (N,) held between samples.
-
-        Args:
-            u: (N,) commands.
-            dt: sampling time, s.
-            substeps: steps of the classical Runge-Kutta method per sample.
-            x0: state at the first sample.
-
-        Raises:
-            DataError: a missing command, a wrong shape, or a run that leaves all bounds.
-            StructureError: dt or substeps not positive.
-        """
+        """Return angle (rad), rate (rad/s) and wheel speed (rad/s), (N, 3), under commands (N,) held over a sample."""
         from optid.plants.kernels import PENDULUM, integrate
 
-        check_positive(dt=dt, substeps=substeps)
+        check_parameters(dt=dt, substeps=substeps)
         torque = self.torque(as_input(u, 1)[:, 0])
         quiet = np.zeros((len(torque), 3))
         states = integrate(PENDULUM, torque, quiet[:, 0], quiet, as_state(x0, 3), self.coefficients, float(dt),
@@ -119,22 +111,15 @@ def pendulum(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: 
              x0: ArrayLike = (0.0, 0.0, 0.0), plant: ReactionWheelPendulum | None = None) -> Data:
     """Simulate the reaction wheel pendulum: command to angle (rad, from an encoder) and wheel speed (rad/s).
 
-    Args:
+    Further arguments:
         u: (N,) commands, useful up to 10 either way.
-        seed: of the noise on the speed.
-        measurement: its standard deviation, rad/s.
+        measurement: standard deviation of the noise on the speed, rad/s.
         quantum: resolution of the encoder, rad; 0 for none.
-        dt: sampling time, s.
-        substeps: Runge-Kutta steps per sample.
         x0: angle, rate and wheel speed at the first sample.
         plant: the parameters; those of the class when not given.
-
-    Raises:
-        DataError: a missing command, a wrong shape, or a run that leaves all bounds.
-        StructureError: a parameter out of its range.
     """
     u = as_input(u, 1)
-    check_nonnegative(quantum=quantum)
+    check_parameters(positive=False, quantum=quantum)
     states = (plant or ReactionWheelPendulum()).states(u, dt=dt, substeps=substeps, x0=x0)
     angle = np.round(states[:, 0] / quantum) * quantum if quantum else states[:, 0]
     speed = states[:, 2] + gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
@@ -146,16 +131,8 @@ def pendulum_input(kind: str, n: int, seed: int = 0, *, dt: float = 0.02) -> Arr
     """Return one of the four excitations (N,) of the pendulum experiments.
 
     "sinusoid": 3 sin(2 pi 1.2 t); "chirp": 0.1 to 4 Hz, four sweeps, amplitude 4; "noise": white noise below 4 Hz
-    (fourth-order Butterworth, clipped at 8); "levels": uniform within 8, held five samples.
-
-    Args:
-        kind: one of the four words.
-        n: samples; for the chirp the sweeps are a quarter of them each.
-        seed: of the random ones.
-        dt: sampling time, s.
-
-    Raises:
-        StructureError: an unknown word or a length that is not positive.
+    (fourth-order Butterworth, clipped at 8); "levels": uniform within 8, held five samples. Another word or a length n
+    that is not positive raises a `StructureError`.
     """
     makers = {
         "sinusoid": lambda: signals.sinusoid(n, -3.0, 3.0, frequency=1.2, dt=dt),
@@ -182,26 +159,17 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
     the feedback (method "euler", the plant within the model class). Method "rk4" integrates the differential equation
     instead, which no difference equation of order two describes exactly.
 
-    Args:
+    Further arguments:
         u: (N,) input, of the order of 2.
-        seed: of the noises.
         process: standard deviation of w1 and w2.
         measurement: standard deviation of v, which the feedback sees.
-        colour: pole of the first-order autoregression v; 0 is white.
         eps: strength of the nonlinear damping.
-        dt: sampling time.
         method: "euler" or "rk4".
-        substeps: Runge-Kutta steps per sample.
-        x0: state at the first sample.
-
-    Raises:
-        DataError: a missing input, a wrong shape, or a run that leaves all bounds.
-        StructureError: a parameter out of its range.
     """
     from optid.plants.kernels import VAN_DER_POL, integrate
 
     u = as_input(u, 1)
-    check_positive(dt=dt, substeps=substeps)
+    check_parameters(dt=dt, substeps=substeps)
     if method not in STAGES:
         raise StructureError(f"method = {method!r}. {nearest(method, STAGES)}")
     rng = np.random.default_rng(seed)

@@ -31,7 +31,7 @@ def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colou
     Raises:
         StructureError: a negative size, or a pole that is not inside the unit circle.
     """
-    check_nonnegative(**{what: size})
+    check_parameters(positive=False, **{what: size})
     if not abs(colour) < 1:
         raise StructureError(f"colour = {colour}: the pole of the noise must lie strictly between -1 and 1.")
     # Drawn even when the size is zero, so that a seed gives the same numbers to the other noises.
@@ -60,15 +60,9 @@ def as_state(x0: ArrayLike, order: int) -> Array:
     return state
 
 
-def check_positive(**values: float) -> None:
-    """Refuse parameters that are not positive and finite, by name."""
+def check_parameters(*, positive: bool = True, **values: float) -> None:
+    """Refuse parameters that are not finite and positive, or not negative, by name (`StructureError`)."""
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
-            raise StructureError(f"{name} = {value}: it must be positive.")
-
-
-def check_nonnegative(**values: float) -> None:
-    """Refuse parameters that are negative or not finite, by name."""
-    for name, value in values.items():
-        if not (np.isfinite(value) and value >= 0):
-            raise StructureError(f"{name} = {value}: it must be finite and not negative.")
+        if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
+            wanted = "positive" if positive else "finite and not negative"
+            raise StructureError(f"{name} = {value}: it must be {wanted}.")

@@ -22,6 +22,9 @@ from optid.program.units import energy_unit
 from optid.statistics.coloured import long_autoregression, response_of, scattered
 from optid.statistics.hankel import complete_runs
 
+LEAST = 8
+"""Order of the noise, at least, for which the autoregression has lags."""
+
 NO_EFFECT = 1e-9
 """Size of an effect on the errors, relative to the largest, that is rounding."""
 
@@ -84,13 +87,15 @@ class CompressedStates(CompressedErrors):
         dof = degrees_of_freedom(self.statistics.rows / outputs, known / outputs)
         errors = criterion.residuals(x)
         complete = np.vstack([e[~np.isnan(e).any(axis=1)] for e in errors])
-        noise = complete.T @ complete / len(complete) * (self.statistics.rows / outputs / dof)
+        noise = complete.T @ complete / len(complete)
         response, root = self._noise_filter(errors, noise)
         meat = np.zeros((unknowns.size, unknowns.size))
         for i in range(unknowns.experiments):
             columns = np.r_[unknowns.shared + i * unknowns.n + np.arange(unknowns.n), np.arange(unknowns.shared)]
             meat[np.ix_(columns, columns)] += scattered(criterion.blocks(x)(i), response, root)
-        return Spread(moves.T @ meat @ moves, energy_unit(self.outward) * noise, dof)
+        covariance = moves.T @ meat @ moves
+        taken = 1 + float(np.trace(covariance)) / self.at.value  # what the fit has taken out of the errors
+        return Spread(taken * covariance, taken * energy_unit(self.outward) * noise, dof)
 
     def _noise_filter(self, errors: list[Array], noise: Array) -> tuple[Array, Array]:
         """Response of the weighted errors to white ones, and a triangular root of the covariance of these."""
@@ -101,7 +106,7 @@ class CompressedStates(CompressedErrors):
             return white
         try:
             lags = regression_lags([len(run) for e in errors for run in complete_runs(e, 1)],
-                                   self.criterion.unknowns.n, outputs)
+                                   max(self.criterion.unknowns.n, LEAST), outputs)
         except StructureError:  # too few to tell a colour
             return white
         autoregression, root = long_autoregression([e @ weigh.T for e in errors], lags)

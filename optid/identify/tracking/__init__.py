@@ -3,22 +3,12 @@
 from optid.lazy import on_first_use
 
 _HOME = {
-    "SubspaceTracker": "tracker",
-    "principal_angles": "geometry",
-    "projection_loss": "geometry",
-    "loss_gradient": "geometry",
-    "loss_hessian": "geometry",
-    "stationary_point": "geometry",
-    "stationary_points": "geometry",
-    "fantope_certificate": "reconstruction",
-    "FantopeCertificate": "reconstruction",
-    "Reconstruction": "reconstruction",
-    "optimal_reconstruction": "reconstruction",
-    "suboptimal_reconstruction": "reconstruction",
-    "constrained_reconstruction": "reconstruction",
-    "surviving": "reconstruction",
-    "oblique_projector": "reconstruction",
-    "filled": "reconstruction",
+    "tracker": ["SubspaceTracker"],
+    "geometry": ["principal_angles", "projection_loss", "loss_gradient", "loss_hessian", "stationary_point",
+                 "stationary_points"],
+    "reconstruction": ["fantope_certificate", "FantopeCertificate", "Reconstruction", "optimal_reconstruction",
+                       "suboptimal_reconstruction", "constrained_reconstruction", "surviving", "oblique_projector",
+                       "filled"],
 }
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME)

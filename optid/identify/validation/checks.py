@@ -179,7 +179,7 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
             shares[function.name] = 0.0
             continue
         name, basis, samples = function.name, function.nonlinearity.basis, function.samples(data)
-        shares[name] = basis.n_outside(samples) / max(int(np.sum(~np.isnan(samples))), 1)
+        shares[name] = np.count_nonzero(basis.is_outside(samples)) / max(int(np.sum(~np.isnan(samples))), 1)
         found = list_outside("output" if function.fed_back else "input", name, shares[name], basis)
         notes.extend(note for note in found if note not in notes)
     return shares
