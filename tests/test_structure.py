@@ -150,6 +150,27 @@ def test_records_without_noise():
     assert structure_test(Data(u, np.ones(1200) + 0 * u[:, 0])).p_value == 1
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0.0, 1e3, 1e6])
+def test_the_last_digits_of_records_without_noise(seed, level):
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-2, 2, (600, 1500)[seed % 2])
+    scale_u, scale_y = 10.0 ** rng.uniform(-6, 6), 10.0 ** rng.uniform(-9, 9)
+
+    def found(y):
+        return structure_test(Data(scale_u * u, scale_y * (y + level)))
+
+    f = u + 0.3 * u**2 - 0.2 * u**3
+    finite = lfilter([1, 0.5, 0.2], [1], f)
+    assert found(finite).p_value == 1  # the residuals are rounding
+    slow = lfilter([1, 0.5, 0.2], np.real(np.poly([0.9, 0.5 + 0.3j, 0.5 - 0.3j])), f)
+    assert found(slow).passed  # the residuals are what the filters cut off, 1e-5 of the output
+    second = found(finite + 1e-3 * np.r_[0, u[:-1] ** 2])
+    assert not second.passed and second.rank["y"] < 1e-20
+    product = found(finite + 1e-8 * max(1, level) * np.r_[0, u[1:] * u[:-1]])
+    assert not product.passed and product.products["y"] < 1e-20
+
+
 def test_missing_samples_and_experiments():
     for wiener in (False, True):
         data = hammerstein(3000, 5, wiener)

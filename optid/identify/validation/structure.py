@@ -10,13 +10,14 @@ mark of a Wiener system, save nothing; (2) the matrix of coefficients, lags time
 
 Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals makes the noise
 white, and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of
-any colour. All columns exist chunk by chunk only.
+any colour. What is regressed on them are the residuals of the best Hammerstein model rather than y: the statistics are
+the same, and keep their digits where hardly any noise is left. All columns exist chunk by chunk only.
 Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher-order correlations as structure tests
 (Billings and Voon 1986); rank one (Bai 1998).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc
@@ -24,8 +25,8 @@ from scipy.special import fdtrc
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.validation.structure_design import Design
-from optid.statistics.factors import dependent_column, root_of_gram
+from optid.identify.validation.structure_design import EXPLAINED, Design
+from optid.statistics.factors import conditioning, dependent_column, root_of_gram
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
@@ -39,8 +40,6 @@ NOISE_ORDER, KEPT = 12, 0.4
 DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
-
-DIGITS = 1e-6  # a residual below this share of the standard deviation of the output is rounding in Gram matrices
 
 
 @dataclass(frozen=True)
@@ -135,16 +134,19 @@ def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
     responses = _responses(design, leading, _linear_coefficients(additive, design.blocks))
     bs = [np.asarray(b, dtype=float) for b in hypothesis.bs]
     lines = [design.filters @ b for b in bs]
-    residuals, mean, spread = _residuals(design, o, np.asarray(hypothesis.lift(), dtype=float), responses)
-    y = np.concatenate([e.y[:, o] for e in design.data.experiments])
-    if np.nanstd(np.concatenate(residuals)) <= DIGITS * np.nanstd(y):
+    theta = np.asarray(hypothesis.lift(), dtype=float)
+    residuals, mean, spread, size = _residuals(design, o, theta, responses)
+    # in units of eps: one for every term of the sum, and the condition number for theta, found from a Gram matrix
+    rounding = np.finfo(float).eps * (theta.size + conditioning(problem.root)) * size
+    if np.nanstd(np.concatenate(residuals)) <= rounding:
         return FTest(), FTest(), [0.0] * design.data.m
     noise = _autoregression(residuals)
     past = noise.size - 1
     gram, sizes, rows = np.zeros((1, 1)), [0], 0
     for u, output, valid in design.stretches(o, past):
         carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
-        blocks = [design.additive(u), design.finer(u, lines), _alternatives(carriers), output[:, None]]
+        additive = design.additive(u)
+        blocks = [additive, design.finer(u, lines), _alternatives(carriers), (output - additive @ theta)[:, None]]
         sizes, columns = [block.shape[1] for block in blocks], np.hstack(blocks)
         complete = np.convolve(~valid, np.ones(past + 1))[past : valid.size] < 0.5
         white = np.sum([a * columns[past - i : len(columns) - i] for i, a in enumerate(noise)], axis=0)[complete]
@@ -155,7 +157,7 @@ def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
         raise RankError(f"{rows} complete rows for {edges[-1]} columns of the structure test: use a longer record.")
     keep = np.r_[: edges[2], edges[-1] - 1]
     return (_products_test(gram, int(edges[2]), rows),
-            *_rank_test(gram[np.ix_(keep, keep)], bs, design.blocks, rows))
+            *_rank_test(gram[np.ix_(keep, keep)], theta, bs, design.blocks, rows))
 
 
 def _additive_gram(design: Design, o: int) -> Array:
@@ -199,20 +201,26 @@ def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
     return np.stack(responses, axis=1)
 
 
-def _residuals(design: Design, o: int, additive: Array, responses: Array) -> tuple[list[Array], Array, Array]:
-    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs."""
+def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[list[Array], Array, Array, float]:
+    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs.
+
+    The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
+    """
     residuals: list[Array] = []
-    sums, count = np.zeros((2, responses.shape[1])), 0
+    sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
     for i in range(len(design.u)):
         parts = [np.zeros(0)]
         for u, output, valid in design.stretches(o, among=[i]):
-            parts.append(np.where(valid, output - design.additive(u) @ additive, np.nan))
+            columns = design.additive(u)
+            parts.append(np.where(valid, output - columns @ theta, np.nan))
+            moduli += float(np.sum((np.abs(columns) @ np.abs(theta)) ** 2))
             carriers = design.filtered(u, responses)
             sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
             count += len(carriers)
         residuals.append(np.concatenate(parts))
     mean = sums[0] / count
-    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300))
+    return (residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300)),
+            float(np.sqrt(moduli / count)))
 
 
 def _alternatives(carriers: Array) -> Array:
@@ -268,7 +276,8 @@ def _products_test(gram: Array, n: int, rows: int) -> FTest:
     distinct = _distinct((left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)], DISTINCT)
     more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
     extra = distinct.shape[1]
-    return FTest.of(more, extra, float(left[-1, -1]) - more, rows - sound.shape[1] - extra)
+    rest = max(float(left[-1, -1]) - more, EXPLAINED)
+    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra)
 
 
 def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
@@ -281,9 +290,9 @@ def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> 
     return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
 
 
-def _rank_test(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
+def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
                ) -> tuple[FTest, list[float]]:
-    """Test rank one of every block of the Gram matrix [1 | blocks | fine | y]; also second over first singular values.
+    """Test rank one of every block of [1 | blocks | fine | residual]; also second over first singular values.
 
     The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
     for a second nonlinearity.
@@ -294,10 +303,12 @@ def _rank_test(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, i
     unit = np.eye(len(gram))
     change = np.hstack([unit[:, :1], finer, unit[:, 1:size], unit[:, -1:]])
     problem = _rank_one(change.T @ gram @ change, blocks, linear)
+    output = problem.target + problem.root @ np.concatenate([theta[:1], np.zeros(linear - 1), theta[1:]])
+    problem = replace(problem, target=output, scale=float("nan"))
     free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
     singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
-    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), problem.remainder
+    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
     more = minimise(problem, count=3).value - rest if extra else 0.0
     return FTest.of(more, extra, rest, rows - len(problem.target)), ratios
 

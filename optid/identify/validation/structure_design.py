@@ -17,13 +17,17 @@ from optid.data.stretches import interpolated
 from optid.errors import RankError
 from optid.identify.order.ranks import rank_test
 from optid.models.recursions import lfilter
+from optid.statistics.factors import ROUNDING
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
+EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1  # poles more than the order that the data show: what is too weak for that may still matter to a sharp test
+SPARE = 1
+"""Poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test."""
+
 FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
@@ -112,7 +116,8 @@ def delay_of(data: Data) -> int:
     gram = statistics.gram
     inverse = np.linalg.pinv(gram[np.ix_(past, past)], hermitian=True)
     theta = inverse @ gram[np.ix_(past, now)]
-    rest = np.maximum(np.diag(gram[np.ix_(now, now)] - theta.T @ gram[np.ix_(past, now)]), 1e-300)
+    whole = np.diag(gram)[now]
+    rest = np.maximum(whole - np.einsum("ij,ij->j", theta, gram[np.ix_(past, now)]), EXPLAINED * whole + 1e-300)
     for lag in range(lags):
         block = slice(1 + lag * p, 1 + (lag + 1) * p)
         weight = np.linalg.pinv(inverse[block, block], hermitian=True)
@@ -147,10 +152,12 @@ def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
     z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
     phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
     y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
-    order = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=(alpha - 1) * outs).order
-    if order == 0:
+    largest = (alpha - 1) * outs
+    ranks = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=largest)
+    if ranks.order == 0:
         return np.zeros(0, dtype=complex)
-    observability = rq(statistics, z, phi, y).decomposition[0][:, : min(order + SPARE, (alpha - 1) * outs)]
+    order = ranks.order if ranks.exact else min(ranks.order + SPARE, largest)
+    observability = rq(statistics, z, phi, y).decomposition[0][:, :order]
     a = np.linalg.lstsq(observability[:-outs], observability[outs:])[0]
     poles = np.asarray(np.linalg.eigvals(a), dtype=complex)
     radius = min(RADIUS, 1 - SLOWEST / data.n_samples)
