@@ -35,17 +35,13 @@ class Check:
 
     Attributes:
         rule: "levels", "lines", "feedback", "excitation" or "instruments".
-        subject: the channel, or "" for the record.
         number: what was measured.
-        limit: what it is held against.
         severity: "fine", "warning" or "error".
         sentence: the finding with its remedy.
     """
 
     rule: str
-    subject: str
     number: float
-    limit: float
     severity: Severity
     sentence: str
 
@@ -64,8 +60,7 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
         basis: the fitted basis.
         few: number of values below which the curve between them counts as interpolation.
     """
-    needed = basis.size + 1
-    limit, severity, sentence = needed, "fine", f"input {name!r} takes many levels"
+    severity, sentence = "fine", f"input {name!r} takes many levels"
     levels = count_levels(u[:4096])
     if basis.size > 1 and levels <= 4 * FEW_LEVELS:
         levels = count_levels(u)
@@ -74,15 +69,15 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
             severity = "error"
             sentence = (f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
                         "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
-        elif levels < needed:
+        elif levels <= basis.size:
             severity = "error"
             sentence += (f", which determine at most {levels - 1} functions besides the constant; the basis has "
                          f"{basis.size}. Use a smaller basis or excite more levels")
         elif levels < few:
-            limit, severity = few, "warning"
+            severity = "warning"
             sentence = (f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis "
                         "functions; the nonlinearity between them is interpolation")
-    return Check("levels", name, float(levels), limit, severity, sentence)
+    return Check("levels", float(levels), severity, sentence)
 
 
 def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) -> Check:
@@ -102,11 +97,11 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     """
     needed = lags * basis.size
     most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
-    fine = Check("lines", name, float("inf"), needed, "fine",
-                 f"the functions of input {name!r} have more than {most} spectral lines")
+    fine = Check("lines", float("inf"), "fine", f"the functions of input {name!r} have more than {most} spectral lines")
     lines, remaining, single = 0, 0.0, True
     for record in records:
-        u = longest_run(np.asarray(record, dtype=float)[:, None])[:, 0]
+        column = np.asarray(record, dtype=float)[:, None]
+        u = max(complete_runs(column, 1), key=len, default=column[:0])[:LONGEST, 0]
         if needed <= 3 or u.size < 4 * needed or np.ptp(u) == 0 or many_lines(u, most, DOMINANT):
             return fine
         shares = remaining_shares(basis.values(u), most, HIDDEN)
@@ -123,7 +118,7 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
         f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
         "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions")
-    return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
+    return Check("lines", excited, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
 def check_feedback(name: str, share: float) -> Check:
@@ -136,14 +131,15 @@ def check_feedback(name: str, share: float) -> Check:
         name: of the output.
         share: spread outside 1 and y over the spread of the functions (`optid.statistics.expansion.Feedback.share`).
     """
-    sentence = f"{100 * share:.2g} % of the spread of the functions of output {name!r} is not linear in the outputs"
-    if share >= NEARLY_LINEAR:
-        return Check("feedback", name, share, NEARLY_LINEAR, "fine", sentence)
-    if share >= LINEAR:
-        sentence += ": little beside the noise. Excite larger amplitudes, or leave the feedback basis out"
-        return Check("feedback", name, share, NEARLY_LINEAR, "warning", sentence)
-    sentence += ": no feedback can be told from the dynamics. Leave the feedback basis out, or excite larger amplitudes"
-    return Check("feedback", name, share, LINEAR, "error", sentence)
+    severity, remedy = "fine", ""
+    if share < LINEAR:
+        severity, remedy = "error", (": no feedback can be told from the dynamics. Leave the feedback basis out, or "
+                                     "excite larger amplitudes")
+    elif share < NEARLY_LINEAR:
+        severity, remedy = "warning", (": little beside the noise. Excite larger amplitudes, or leave the feedback "
+                                       "basis out")
+    return Check("feedback", share, severity, f"{100 * share:.2g} % of the spread of the functions of output {name!r} "
+                                              f"is not linear in the outputs{remedy}")
 
 
 def check_condition(number: float) -> Check:
@@ -170,12 +166,7 @@ def check_instruments(number: float) -> Check:
 
 def _conditioning(rule: str, number: float, fine: str, poor: str) -> Check:
     severity, sentence = ("warning", poor) if number > WORST_CONDITION else ("fine", fine)
-    return Check(rule, "", number, WORST_CONDITION, severity, sentence)
-
-
-def longest_run(signals: Array) -> Array:
-    """Return the longest stretch of rows (N, s) without NaN, at most `LONGEST` rows of it."""
-    return max(complete_runs(signals, 1), key=len, default=signals[:0])[:LONGEST]
+    return Check(rule, number, severity, sentence)
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:
