@@ -285,6 +285,5 @@ def expanded_condition(data: Data, expansion: Expansion, rows: int) -> float:
         RankError: no complete window.
     """
     count = expansion.p + expansion.q
-    records = [np.hstack([e.u, e.y]) for e in data.experiments]
-    return hankel_statistics(records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
+    return hankel_statistics(data.records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
                              centre="mean").condition

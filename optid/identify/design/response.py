@@ -70,8 +70,7 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     window = np.hanning(size + 1)[:-1]
     m, l = data.m, data.l  # noqa: E741 - the field's letter
     sums, count = np.zeros((size // 2 + 1, m + l, m + l), dtype=complex), 0
-    for e in data.experiments:
-        samples = np.hstack([e.u, e.y])
+    for samples in data.records:
         samples = samples - np.nanmean(samples, axis=0)
         for start in range(0, len(samples) - size + 1, max(1, size // 2)):
             part = samples[start : start + size]

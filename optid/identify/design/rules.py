@@ -148,9 +148,10 @@ def check_condition(number: float) -> Check:
     Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input. The number
     is inf where they are singular.
     """
-    return _conditioning("excitation", number, f"condition number of the expanded regressor: {number:.2g}",
-                         f"the expanded regressor is poorly excited: condition number {number:.1e}; "
-                         "use fewer functions or lags, or a richer input")
+    if number > WORST_CONDITION:
+        return Check("excitation", number, "warning", f"the expanded regressor is poorly excited: condition number "
+                     f"{number:.1e}; use fewer functions or lags, or a richer input")
+    return Check("excitation", number, "fine", f"condition number of the expanded regressor: {number:.2g}")
 
 
 def check_instruments(number: float) -> Check:
@@ -158,15 +159,11 @@ def check_instruments(number: float) -> Check:
 
     With instruments that do not reach the regressors it grows with the root of the number of samples.
     """
-    return _conditioning("instruments", number, f"cond(R11) = {number:.2g}",
-                         f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented "
-                         "instruments (hammerstein_ss.asivid), fewer block rows or functions, or an input with more "
-                         "lines and levels")
-
-
-def _conditioning(rule: str, number: float, fine: str, poor: str) -> Check:
-    severity, sentence = ("warning", poor) if number > WORST_CONDITION else ("fine", fine)
-    return Check(rule, number, severity, sentence)
+    if number > WORST_CONDITION:
+        return Check("instruments", number, "warning", f"the instruments hardly reach the regressors: cond(R11) = "
+                     f"{number:.1e}. Use augmented instruments (hammerstein_ss.asivid), fewer block rows or functions, "
+                     "or an input with more lines and levels")
+    return Check("instruments", number, "fine", f"cond(R11) = {number:.2g}")
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:

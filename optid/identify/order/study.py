@@ -94,7 +94,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     if nx is not None:
         check_integer(nx, "nx")
     data = data.raw()
-    records = _records(data)
+    records = data.records
     check_channels(records, data.inputs, data.outputs)
     expansion = expand(data, Linear() if basis is None else basis, feedback_basis)
     alpha = block_rows_for(records, expansion, block_rows, nx)
@@ -104,7 +104,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
     whole = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names, centre="mean")
-    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
+    parts = [hankel_statistics(part.records, 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
              for part in (train, test) if part is not None]
     states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
     lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
@@ -166,17 +166,13 @@ def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha
     return extended, expansion.with_simulated()
 
 
-def _records(data: Data) -> list[Array]:
-    return [np.hstack([e.u, e.y]) for e in data.experiments]
-
-
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
     if not holdout:
         return None, None
     try:
         train, test = data.split(1 - holdout)
         for part in (train, test):
-            hankel_statistics(_records(part), 2 * alpha, method="gram").check(1.2)
+            hankel_statistics(part.records, 2 * alpha, method="gram").check(1.2)
     except (DataError, RankError) as error:
         notes.append(f"Nothing is held out: the record is too short for it. {error}")
         return None, None
