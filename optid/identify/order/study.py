@@ -33,9 +33,8 @@ class OrderStudy:
         block_rows: future block rows.
         ranks: test of the singular values.
         states: criteria by number of states, on prediction errors.
-        lags: scan of na, nb, nk, or None when `notes` says why.
+        lags: scan of na, nb, nk, the best of which is recommended; None when `notes` says why.
         nx: recommended number of states.
-        na, nb, nk: recommended lags, nb and nk by input; None without a scan.
         reasons: why.
         notes: what weakens the result; each was also given as a DataWarning.
     """
@@ -46,9 +45,6 @@ class OrderStudy:
     states: StateCriteria
     lags: LagScan | None
     nx: int
-    na: int | None
-    nb: tuple[int, ...] | None
-    nk: tuple[int, ...] | None
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -113,10 +109,8 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
                      "inputs if the plant is not linear.")
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
-    best = lags.best("bic") if lags is not None else None
-    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], *(
-        (best.na, best.nb, best.nk) if best is not None else (None, None, None)),
-        _reasons(ranks, states, lags), tuple(notes))
+    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], _reasons(ranks, states, lags),
+                      tuple(notes))
 
 
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
