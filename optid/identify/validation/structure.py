@@ -76,25 +76,17 @@ class Structure:
         return "does not look Hammerstein: different lags see different nonlinearities"
 
 
-@dataclass(frozen=True)
-class FTest:
-    """An F test.
+def f_test(more: float, extra: int, rest: float, spare: int) -> tuple[float, float]:
+    """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
 
-    Attributes:
-        p_value: of the hypothesis; 1 when nothing is to be tested.
-        saving: share of the residual variance saved by giving it up, degrees of freedom discounted.
+    Returns:
+        p value of the hypothesis that they are zero, 1 when nothing is to be tested, and the share of the residual
+        variance that they save, degrees of freedom discounted.
     """
-
-    p_value: float = 1.0
-    saving: float = 0.0
-
-    @classmethod
-    def of(cls, more: float, extra: int, rest: float, spare: int) -> "FTest":
-        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom."""
-        if extra <= 0 or rest <= 0:
-            return cls()
-        free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
-        return cls(float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted))
+    if extra <= 0 or rest <= 0:
+        return 1.0, 0.0
+    free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
+    return float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted)
 
 
 def structure_test(data: Data) -> Structure:
@@ -116,15 +108,15 @@ def structure_test(data: Data) -> Structure:
     found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
     tests = [test for products, rank, _ in found.values() for test in (products, rank)]
     # what is significant but too small to notice must not hide what is both
-    telling = min(tests, key=lambda test: (test.p_value if test.saving > NOTICEABLE else 1.0, test.p_value))
+    p_value, saving = min(tests, key=lambda test: (test[0] if test[1] > NOTICEABLE else 1.0, test[0]))
     ratios = np.max([each for _, _, each in found.values()], axis=0)
-    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * telling.p_value), telling.saving,
-                     {name: products.p_value for name, (products, _, _) in found.items()},
-                     {name: rank.p_value for name, (_, rank, _) in found.items()})
+    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * p_value), saving,
+                     {name: products[0] for name, (products, _, _) in found.items()},
+                     {name: rank[0] for name, (_, rank, _) in found.items()})
 
 
-def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
-    """Test products and rank on one output; also second over first singular value by input."""
+def _test_output(design: Design, o: int) -> tuple[tuple[float, float], tuple[float, float], list[float]]:
+    """Return the F tests of products and rank on one output, and the second over first singular value by input."""
     additive = _additive_gram(design, o)
     problem = _rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
@@ -139,11 +131,11 @@ def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
     # in units of eps: one for every term of the sum, and the condition number for theta, found from a Gram matrix
     rounding = np.finfo(float).eps * (theta.size + conditioning(problem.root)) * size
     if np.nanstd(np.concatenate(residuals)) <= rounding:
-        return FTest(), FTest(), [0.0] * design.data.m
+        return (1.0, 0.0), (1.0, 0.0), [0.0] * design.data.m
     noise = _autoregression(residuals)
     past = noise.size - 1
     gram, sizes, rows = np.zeros((1, 1)), [0], 0
-    for u, output, valid in design.stretches(o, past):
+    for _, u, output, valid in design.stretches(o, past):
         carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
         additive = design.additive(u)
         blocks = [additive, design.finer(u, lines), _alternatives(carriers), (output - additive @ theta)[:, None]]
@@ -164,7 +156,7 @@ def _additive_gram(design: Design, o: int) -> Array:
     """Gram matrix [1 | filters of functions by input | y] of the additive regression."""
     size = 2 + sum(p * j for p, j in design.blocks)
     gram, rows = np.zeros((size, size)), 0
-    for u, output, valid in design.stretches(o):
+    for _, u, output, valid in design.stretches(o):
         used = np.column_stack([design.additive(u), output])[valid]
         gram += used.T @ used
         rows += len(used)
@@ -206,21 +198,17 @@ def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[
 
     The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
     """
-    residuals: list[Array] = []
+    residuals = [np.zeros(0)] * len(design.u)
     sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
-    for i in range(len(design.u)):
-        parts = [np.zeros(0)]
-        for u, output, valid in design.stretches(o, among=[i]):
-            columns = design.additive(u)
-            parts.append(np.where(valid, output - columns @ theta, np.nan))
-            moduli += float(np.sum((np.abs(columns) @ np.abs(theta)) ** 2))
-            carriers = design.filtered(u, responses)
-            sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
-            count += len(carriers)
-        residuals.append(np.concatenate(parts))
+    for i, u, output, valid in design.stretches(o):
+        columns = design.additive(u)
+        residuals[i] = np.append(residuals[i], np.where(valid, output - columns @ theta, np.nan))
+        moduli += float(np.sum((np.abs(columns) @ np.abs(theta)) ** 2))
+        carriers = design.filtered(u, responses)
+        sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
+        count += len(carriers)
     mean = sums[0] / count
-    return (residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300)),
-            float(np.sqrt(moduli / count)))
+    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300)), float(np.sqrt(moduli / count))
 
 
 def _alternatives(carriers: Array) -> Array:
@@ -264,7 +252,7 @@ def _distinct(gram: Array, least: float) -> Array:
     return vectors[:, values > least] / np.sqrt(values[values > least])
 
 
-def _products_test(gram: Array, n: int, rows: int) -> FTest:
+def _products_test(gram: Array, n: int, rows: int) -> tuple[float, float]:
     """Test whether columns n ... of the Gram matrix [additive | alternatives | y] save anything."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram / np.outer(scale, scale)
@@ -277,7 +265,7 @@ def _products_test(gram: Array, n: int, rows: int) -> FTest:
     more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
     extra = distinct.shape[1]
     rest = max(float(left[-1, -1]) - more, EXPLAINED)
-    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra)
+    return f_test(more, extra, rest, rows - sound.shape[1] - extra)
 
 
 def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
@@ -291,7 +279,7 @@ def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> 
 
 
 def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
-               ) -> tuple[FTest, list[float]]:
+               ) -> tuple[tuple[float, float], list[float]]:
     """Test rank one of every block of [1 | blocks | fine | residual]; also second over first singular values.
 
     The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
@@ -310,7 +298,7 @@ def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tupl
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
     extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
     more = minimise(problem, count=3).value - rest if extra else 0.0
-    return FTest.of(more, extra, rest, rows - len(problem.target)), ratios
+    return f_test(more, extra, rest, rows - len(problem.target)), ratios
 
 
 def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:

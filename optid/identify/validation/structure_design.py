@@ -247,23 +247,18 @@ class Design:
         """Functions and filters by input."""
         return tuple((family.size, self.filters.shape[1]) for family in self.families)
 
-    def stretches(self, o: int, before: int = 0, among: Sequence[int] | None = None
-                  ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
-        """Yield inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
+    def stretches(self, o: int, before: int = 0) -> Iterator[tuple[int, Array, Array, NDArray[np.bool_]]]:
+        """Yield experiment, inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
 
-        Args:
-            o: the output.
-            before: rows repeated from the stretch before.
-            among: experiments; all when not given.
+        The first `before` rows of every stretch are those before it, once more.
         """
         reach = len(self.filters) - 1
-        for i in range(len(self.u)) if among is None else among:
-            e, u = self.data.experiments[i], self.u[i]
+        for i, (e, u) in enumerate(zip(self.data.experiments, self.u)):
             lost = np.isnan(e.u).any(axis=1).astype(float)
             valid = (np.convolve(lost, np.ones(self.heavy))[: len(u)] < 0.5) & ~np.isnan(e.y[:, o])
             for start in range(reach + before, len(u), CHUNK):
                 rows = slice(start - before, min(start + CHUNK, len(u)))
-                yield u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
+                yield i, u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
 
     def additive(self, u: Array) -> Array:
         """Return [1, filters of functions], (T, 1 + sum P_c J); per input, filters outermost."""
