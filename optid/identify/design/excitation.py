@@ -199,7 +199,8 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
     top = float(measured.frequency[-1])
     if band is None:
         f = measured.frequency
-        gain = np.max([measured.gain(f, c) / np.max(measured.gain(f, c)) for c in range(len(measured.inputs))], axis=0)
+        gains = np.stack([measured.gain(f, c) for c in range(measured.response.shape[2])])
+        gain = np.max(gains / gains.max(axis=1, keepdims=True), axis=0)
         heard = (gain > FAINT) & (measured.coherence.max(axis=1) > TRUSTED)
         if not heard.any():
             raise DataError("no frequency at which the inputs explain half of the power of an output: the record shows "

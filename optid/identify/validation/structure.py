@@ -18,8 +18,10 @@ Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from optid.arrays import Array
@@ -198,7 +200,7 @@ def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[
 
     The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
     """
-    residuals = [np.zeros(0)] * len(design.u)
+    residuals: list[Array] = [np.zeros(0)] * len(design.u)
     sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
     for i, u, output, valid in design.stretches(o):
         columns = design.additive(u)
@@ -214,12 +216,9 @@ def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[
 def _alternatives(carriers: Array) -> Array:
     """Products of two of all and of three of the first three carriers, and further functions of the first two."""
     first, second = np.triu_indices(carriers.shape[1])
-    leading = carriers[:, :3]
-    n = leading.shape[1]
-    triples = [(i, j, k) for i in range(n) for j in range(i, n) for k in range(j, n)]
-    cubes = np.column_stack([leading[:, i] * leading[:, j] * leading[:, k] for i, j, k in triples])
-    x = leading[:, 0]
-    return np.column_stack([carriers[:, first] * carriers[:, second], cubes, x**4, x**5, np.abs(leading[:, :2])])
+    cubes = [a * b * c for a, b, c in combinations_with_replacement(carriers.T[:3], 3)]
+    x = carriers[:, 0]
+    return np.column_stack([carriers[:, first] * carriers[:, second], *cubes, x**4, x**5, np.abs(carriers[:, :2])])
 
 
 def _autoregression(residuals: list[Array]) -> Array:
@@ -303,14 +302,9 @@ def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tupl
 
 def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:
     """Combinations (columns of `gram`) of the fine functions that the blocks' functions, so filtered, do not give."""
-    size = 1 + sum(p * j for p, j in blocks)
-    fine = np.eye(len(gram))[:, size:-1]
-    coarse, start = [np.eye(len(gram))[:, :1]], 1
-    for (p, j), coefficients in zip(blocks, leading):
-        coarse.append(np.zeros((len(gram), p)))
-        coarse[-1][start : start + p * j] = np.kron(coefficients[:, None], np.eye(p))
-        start += p * j
-    coarse = np.hstack(coarse)
+    filtered = np.asarray(block_diag(1.0, *(np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, leading))))
+    size = len(filtered)
+    coarse, fine = np.pad(filtered, ((0, len(gram) - size), (0, 0))), np.eye(len(gram))[:, size:-1]
     fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
     inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
     fine = fine - coarse @ (inner @ (coarse.T @ gram @ fine))
