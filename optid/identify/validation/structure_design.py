@@ -5,6 +5,7 @@ The functions follow any static nonlinearity, and the filters are found whatever
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,12 @@ from optid.data.stretches import interpolated
 from optid.errors import RankError
 from optid.identify.order.ranks import rank_test
 from optid.models.recursions import lfilter
+from optid.statistics.expansion import Expansion
 from optid.statistics.factors import ROUNDING
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
-BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
+FEWEST = 3  # future and past block rows at least
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
@@ -101,18 +103,17 @@ def delay_of(data: Data) -> int:
     coefficients look significant. A delay too short costs a few filters, one too long is wrong: hence the generous
     level. Zero where the record is too short to tell.
     """
-    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
-    p = sum(family.size for family in families)
-    shortest = min(e.n_samples for e in data.experiments)
+    records, signals = _signals(data, 0)
+    p, shortest = signals.p, min(e.n_samples for e in data.experiments)
     lags = min(LATEST + 10, data.n_samples // (6 * p), shortest // 3)
     if lags < 3:
         return 0
-    statistics = _statistics(data, families, lags, 0)
-    past = np.concatenate([[0], *(statistics.at(range(p), [lags - 1 - lag]) for lag in range(lags))])
+    statistics = _statistics(records, signals, lags)
+    past = np.concatenate([[0], *(statistics.at(signals.eta, [lags - 1 - lag]) for lag in range(lags))])
     spare = statistics.windows - past.size
     if spare < past.size:
         return 0
-    now = statistics.at(range(p, p + data.l), [lags - 1])
+    now = statistics.at(signals.y, [lags - 1])
     gram = statistics.gram
     inverse = np.linalg.pinv(gram[np.ix_(past, past)], hermitian=True)
     theta = inverse @ gram[np.ix_(past, now)]
@@ -143,22 +144,16 @@ def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
     Raises:
         RankError: the record is too short or does not excite the functions.
     """
-    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
-    p, outs = sum(family.size for family in families), data.l
-    alpha = BLOCK_ROWS
-    while alpha > FEWEST and 6 * alpha * (p + outs) > data.n_samples:
-        alpha -= 1
-    statistics = _statistics(data, families, 3 * alpha, delay)
-    z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
-    phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
-    y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
-    largest = (alpha - 1) * outs
+    records, signals = _signals(data, delay)
+    alpha = signals.block_rows(records, None, spans=3, least=FEWEST)
+    statistics, largest = _statistics(records, signals, 3 * alpha), (alpha - 1) * data.l
+    z, phi, y = signals.positions(statistics.at, "inputs", alpha)
     ranks = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=largest)
     if ranks.order == 0:
         return np.zeros(0, dtype=complex)
     order = ranks.order if ranks.exact else min(ranks.order + SPARE, largest)
     observability = rq(statistics, z, phi, y).decomposition[0][:, :order]
-    a = np.linalg.lstsq(observability[:-outs], observability[outs:])[0]
+    a = np.linalg.lstsq(observability[: -data.l], observability[data.l :])[0]
     poles = np.asarray(np.linalg.eigvals(a), dtype=complex)
     radius = min(RADIUS, 1 - SLOWEST / data.n_samples)
     return poles * np.minimum(1.0, radius / np.maximum(np.abs(poles), 1e-300))
@@ -196,15 +191,17 @@ def convolved(values: Array, filters: Array) -> Array:
     return found
 
 
-def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:
-    m = data.m
-
-    def expand(raw: Array) -> Array:
-        return np.hstack([*(family.values(raw[:, c]) for c, family in enumerate(families)), raw[:, m:]])
-
+def _signals(data: Data, delay: int) -> tuple[Sequence[Array], Expansion]:
+    """Raw channels [u | y], the outputs that many samples earlier, and their expansion in a few functions."""
     # windows without a gap would be few; interpolation adds noise and a zero, but leaves the poles where they are
     records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
-    return hankel_statistics([r for r in records if len(r) >= rows] or records, rows, expand, centre="mean")
+    families: Any = tuple(Family.of(data, c, FEW, 0) for c in range(data.m))
+    return records, Expansion(families, (), data.inputs, data.outputs)
+
+
+def _statistics(records: Sequence[Array], signals: Expansion, rows: int) -> HankelStatistics:
+    long = [record for record in records if len(record) >= rows]
+    return hankel_statistics(long or records, rows, signals, names=signals.names, centre="mean")
 
 
 @dataclass(frozen=True, eq=False)
