@@ -27,6 +27,7 @@ from scipy.special import fdtrc
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
+from optid.identify.validation.correlations import lagged_products
 from optid.identify.validation.structure_design import EXPLAINED, Design
 from optid.statistics.factors import conditioning, dependent_column, root_of_gram
 from optid.structures.bilinear import minimise
@@ -230,10 +231,8 @@ def _autoregression(residuals: list[Array]) -> Array:
     most = min(NOISE_ORDER, total // 50, max(len(r) for r in residuals) - 1)
     while most > 1 and complete ** (most + 1) < KEPT:  # a row is lost with any of its samples
         most -= 1
-    covariance = np.zeros(most + 1)
-    for lag in range(most + 1):
-        products = np.concatenate([r[lag:] * r[: max(len(r) - lag, 0)] for r in residuals])
-        covariance[lag] = np.nanmean(products) * (1 - lag / total) if not np.isnan(products).all() else 0.0
+    covariance = np.nan_to_num(lagged_products(residuals, residuals, range(most + 1))[0])
+    covariance *= 1 - np.arange(most + 1) / total
     best, least = np.ones(1), total * np.log(covariance[0])
     for order in range(1, most + 1):
         a = np.concatenate([[1.0], -solve_toeplitz(covariance[:order], covariance[1 : order + 1])])
@@ -252,7 +251,7 @@ def _distinct(gram: Array, least: float) -> Array:
 
 
 def _products_test(gram: Array, n: int, rows: int) -> tuple[float, float]:
-    """Test whether columns n ... of the Gram matrix [additive | alternatives | y] save anything."""
+    """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] save anything."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram / np.outer(scale, scale)
     sound = _distinct(scaled[:n, :n], 1e-10)
