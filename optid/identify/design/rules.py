@@ -182,7 +182,7 @@ def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     """Return the share of variance that 0, 1, 2, ... common sinusoids leave, greedily chosen and fitted jointly.
 
     Each step adds the frequency that explains most of what is left of all signals together (orthogonal matching
-    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993) and refines all frequencies between the bins.
+    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993) and refines the first few between the bins.
 
     Args:
         signals: (N, s) without missing samples; every one counts alike.
@@ -199,19 +199,11 @@ def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     if not x.shape[1]:
         return np.zeros(1)
     n, total = len(x), float(x.shape[1])
-    window, frequencies = np.hanning(n)[:, None], np.zeros(0)
-    basis, residual = np.full((n, 1), n**-0.5), x
+    window, frequencies, residual = np.hanning(n)[:, None], np.zeros(0), x
     while len(shares) <= most and shares[-1] > enough and 2 * len(shares) + 1 < n:
         frequencies = np.append(frequencies, _strongest(residual * window))
-        if frequencies.size <= JOINT:
-            for _ in range(STEPS):
-                frequencies, basis, residual = _refined(x, frequencies)
-        else:
-            pair = _waves(n, frequencies[-1:])
-            for _ in range(2):  # twice: once leaves what rounding left of the earlier lines
-                pair -= basis @ (basis.T @ pair)
-            new = np.linalg.qr(pair)[0]
-            basis, residual = np.column_stack([basis, new]), residual - new @ (new.T @ residual)
+        for _ in range(STEPS if frequencies.size <= JOINT else 1):
+            frequencies, residual = _refined(x, frequencies)
         shares.append(min(float(np.sum(residual**2)) / total, shares[-1]))
     return np.array(shares)
 
@@ -227,30 +219,24 @@ def _strongest(x: Array) -> float:
     return (peak + (0.5 * (left - right) / bend if bend < 0 else 0.0)) / n
 
 
-def _waves(n: int, frequencies: Array) -> Array:
-    """Return cosines, then sines, (n, 2 L), about the middle, where frequency and phase are nearly independent."""
-    angles = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None] * frequencies
-    return np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-def _refined(x: Array, frequencies: Array) -> tuple[Array, Array, Array]:
-    """Return frequencies (L,) after a Gauss-Newton step, and what the old ones span and leave of x (N, s).
+def _refined(x: Array, frequencies: Array) -> tuple[Array, Array]:
+    """Return frequencies (L,) after a Gauss-Newton step, and what the old ones leave of x (N, s).
 
     The amplitudes are projected out: variable projection, Golub and Pereyra 1973, without the second-order term.
     """
     n, count = len(x), frequencies.size
-    waves = _waves(n, frequencies)
+    times = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None]  # about the middle: frequency and phase nearly independent
+    waves = np.column_stack([np.cos(times * frequencies), np.sin(times * frequencies)])
     basis, triangle = np.linalg.qr(np.column_stack([np.ones(n), waves]))
     projections = basis.T @ x
     residual = x - basis @ projections
     scale = np.abs(np.diag(triangle))
-    if scale.min() < 1e-6 * scale.max():  # two of them have met
-        return frequencies, basis, residual
-    amplitudes = np.linalg.solve(triangle, projections)[1:]
-    times, slopes = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None], []
+    if count > JOINT or scale.min() < 1e-6 * scale.max():  # too many to be moved, or two of them have met
+        return frequencies, residual
+    amplitudes, slopes = np.linalg.solve(triangle, projections)[1:], []
     for a, b in zip(amplitudes[:count].T, amplitudes[count:].T):  # signal by signal
         slope = times * (b * waves[:, :count] - a * waves[:, count:])
         slopes.append(slope - basis @ (basis.T @ slope))
     step = np.linalg.lstsq(np.vstack(slopes), residual.T.ravel(), rcond=1e-8)[0]
     moved = np.clip(frequencies + np.clip(step, -0.25 / n, 0.25 / n), 0.25 / n, 0.5)
-    return moved, basis, residual
+    return moved, residual
