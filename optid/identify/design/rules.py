@@ -225,7 +225,7 @@ def _refined(x: Array, frequencies: Array) -> tuple[Array, Array]:
     The amplitudes are projected out: variable projection, Golub and Pereyra 1973, without the second-order term.
     """
     n, count = len(x), frequencies.size
-    times = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None]  # about the middle: frequency and phase nearly independent
+    times = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None]  # about the middle: no phase for a frequency
     waves = np.column_stack([np.cos(times * frequencies), np.sin(times * frequencies)])
     basis, triangle = np.linalg.qr(np.column_stack([np.ones(n), waves]))
     projections = basis.T @ x
