@@ -23,7 +23,7 @@ from optid.statistics.factors import ROUNDING
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
-FEWEST = 3  # future and past block rows at least
+BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
@@ -145,7 +145,7 @@ def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
         RankError: the record is too short or does not excite the functions.
     """
     records, signals = _signals(data, delay)
-    alpha = signals.block_rows(records, None, spans=3, least=FEWEST)
+    alpha = int(np.clip(data.n_samples // (6 * len(signals.names)), FEWEST, BLOCK_ROWS))
     statistics, largest = _statistics(records, signals, 3 * alpha), (alpha - 1) * data.l
     z, phi, y = signals.positions(statistics.at, "inputs", alpha)
     ranks = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=largest)
