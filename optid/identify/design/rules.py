@@ -168,14 +168,9 @@ def check_instruments(number: float) -> Check:
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:
     """Whether x (N,) certainly needs more sinusoids to leave this share of its variance: a quick test by frequency."""
-    centred = x - x.mean()
-    energy = np.abs(np.fft.rfft(centred * np.hanning(x.size))) ** 2
-    total = energy.sum()
-    if total == 0:
-        return False
+    energy = np.sort(np.abs(np.fft.rfft((x - x.mean()) * np.hanning(x.size))) ** 2)[::-1]
     # No choice of `most` lobes holds more than as many of the largest bins.
-    largest = np.sort(energy)[::-1][: most * LOBE]
-    return bool(largest.sum() < (1 - tolerance) * total)
+    return bool(energy[: most * LOBE].sum() < (1 - tolerance) * energy.sum())
 
 
 def remaining_shares(signals: Array, most: int, enough: float) -> Array:
