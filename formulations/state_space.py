@@ -33,6 +33,7 @@ from optid.bases import Bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_uncertainty import CompressedStates
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.models import HammersteinSS
 from optid.program.expressions import tangent_product
@@ -121,6 +122,8 @@ class StateSpaceFit(TangentFit):
         variables, values = self.places.variables(), self.places.values(z0)
         r = cp.Variable(z0.size, name="residual")
         step = self.places.stacked(variables) - z0
+        compressed = CompressedStates(at, self.places, z0, np.array([self.criterion.energy]),
+                                      self.criterion.data.n_samples, self.criterion, self.units)
 
         matrix, errors = at.whole
         objective = cp.sum_squares(r) + at.remainder
@@ -136,7 +139,7 @@ class StateSpaceFit(TangentFit):
                     bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
                           {**values, "residual": errors}, self.recover, view, frozenset(structural),
-                          derived={"residual": residual}, scale=self.criterion.energy)
+                          derived={"residual": residual}, compressed=compressed, scale=self.criterion.energy)
         return program.subject_to(*self.constraints)
 
     def recover(self, values: Values) -> HammersteinSS:

@@ -90,9 +90,9 @@ class Fit:
 
         Otherwise over the samples of the record that the model can predict; NaN for a stream then.
         """
-        if self.program.compressed is not None:
-            return self.program.compressed.one_step_fit(self.solution.values)
-        return self._fit("one step")
+        compressed = self.program.compressed
+        found = None if compressed is None else compressed.one_step_fit(self.solution.values)
+        return self._fit("one step") if found is None else found
 
     @cached_property
     def simulation_fit(self) -> np.ndarray:

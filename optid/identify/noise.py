@@ -92,7 +92,7 @@ def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinS
     """
     outputs = [e.y for e in data.experiments]
     try:
-        _regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
+        regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
         found = with_noise(model, data)
     except (StructureError, DataError) as reason:
         return model, {"noise model": f"none: {reason}"}
@@ -244,7 +244,7 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
         StructureError: errors that determine no gain: too few, zero, or on the stability limit.
     """
     n, l = gain.shape  # noqa: E741
-    lags = _regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
+    lags = regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
     statistics, past = hankel_statistics([r for r in errors if len(r) > lags], lags + 1), lags * l
     root = statistics.triangle(statistics.at(range(l)))
     spread = np.linalg.norm(root[past:, past:], axis=0)
@@ -261,7 +261,7 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     return np.array(kalman_gain(A, C, K @ covariance @ K.T, covariance, K @ covariance).K)
 
 
-def _regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
+def regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
     """Return the lags of the autoregression of the errors of l outputs, in complete runs of some lengths, order n.
 
     Raises:

@@ -94,9 +94,7 @@ class Tangent:
 def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, seed: int) -> Tangent:
     """Linearise a fit.
 
-    Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
-    (sandwich form). The noise estimate comes from the minimum without the inequalities, so that active ones do not
-    bias it.
+    The noise estimate comes from the minimum without the inequalities, so that active ones do not bias it.
 
     Args:
         fit: a fit whose programme carries its compressed least-squares problem.
@@ -118,35 +116,22 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
 
     lift, lifted = _differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
     coefficients, regression = _differences(lambda x: compressed.regression(_unpacked(shapes, x)).ravel(), x)
-    problem, statistics = compressed.problem, compressed.statistics
-    free, triangle, basis = _whitened(problem.root @ lift, equalities, shapes)
+    problem = compressed.problem
+    free, triangle, basis = whitened(problem.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
     pull = basis.T @ (problem.root @ lifted - problem.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
 
-    n, l = compressed.regression(found).shape  # noqa: E741
-    root = statistics.root
-    sensitivity = np.einsum("ij,jok->oik", root[:n, :n], (coefficients @ directions).reshape(n, l, -1))
-    parameters = float(np.sum(sensitivity**2))
-    dof = statistics.rows - parameters / l
-    if not dof > 0:
-        raise RankError(f"{statistics.rows} rows for {parameters:.0f} parameters: none are left to estimate the noise")
-    theta = (regression + coefficients @ (directions @ centre)).reshape(n, l)
-    residual = root @ np.vstack([theta, -np.eye(l)])
-    noise = residual.T @ residual / dof
-
-    covariance = np.einsum("oij,op,pik->jk", sensitivity, noise, sensitivity)
-    penalised = parameters < len(centre) * (1 - 1e-9)
-    if penalised:
-        prior = np.eye(len(centre)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
-        covariance = covariance + float(np.trace(noise)) / l * prior
+    moves = coefficients @ directions
+    theta = (regression + moves @ centre).reshape(compressed.regression(found).shape)
+    spread = compressed.spread(theta, moves)
     # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
-    scatter = _square_root(covariance) @ basis.T
-    local = LocalEstimate(centre, scatter, dof, inequalities @ directions, slack, draws, seed)
-    meaning = "penalised" if penalised else "projected" if local.held else "gaussian"
+    scatter = _square_root(spread.covariance) @ basis.T
+    local = LocalEstimate(centre, scatter, spread.dof, inequalities @ directions, slack, draws, seed)
+    meaning = "penalised" if spread.penalised else "projected" if local.held else "gaussian"
     transform = getattr(fit.data, "transform", None)
-    scale = np.ones(l) if transform is None else np.array(transform.y_scale)
-    return Tangent(rebuild, shapes, x, directions, local, program.unit * noise * np.outer(scale, scale),
+    scale = np.ones(len(spread.noise)) if transform is None else np.array(transform.y_scale)
+    return Tangent(rebuild, shapes, x, directions, local, program.unit * spread.noise * np.outer(scale, scale),
                    MEANINGS[meaning])
 
 
@@ -185,8 +170,12 @@ def _differences(function: Any, x: Array) -> tuple[Array, Array]:
     return jacobian, base
 
 
-def _whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
-    """Return (free directions, R, Q) with effect @ free = Q R, after scaling every unknown by its effect."""
+def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
+    """Return (free directions, R, Q) with effect @ free = Q R, after scaling every unknown by its effect.
+
+    Raises:
+        RankError: what has no effect, by name.
+    """
     sizes = np.linalg.norm(effect, axis=0)
     for name, part in _unpacked(shapes, sizes).items():
         if np.any(part <= NO_EFFECT * np.max(sizes)):
@@ -201,8 +190,11 @@ def _whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...
     basis, triangle = np.linalg.qr(effect @ free)
     diagonal = np.abs(np.diag(triangle))
     if diagonal.size and np.min(diagonal) <= NO_EFFECT * np.max(diagonal):
-        raise RankError("a combination of the parameters has no effect on the predictions: its error is unbounded. "
-                        "Use fewer basis functions or lags, or fix it by a constraint")
+        still = vectors[rank:].T @ np.linalg.svd(triangle)[2][-1]
+        parts = {name: float(np.linalg.norm(part)) for name, part in _unpacked(shapes, still).items()}
+        most = [name for name, part in parts.items() if part > 0.1 * max(parts.values())]
+        raise RankError(f"a combination of the parameters ({', '.join(most)}) has no effect on the predictions: its "
+                        "error is unbounded. Use fewer basis functions or lags, or fix it by a constraint")
     return free, triangle, basis
 
 

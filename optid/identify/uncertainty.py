@@ -76,11 +76,13 @@ class Uncertainty:
         model: the fitted model.
         level: probability that an interval contains the truth.
         source: where they come from.
+        point: (m,) inputs at which `table` lists the static gain of a state-space model; None for zero.
     """
 
     model: Any = field(repr=False)
     level: float
     source: Tangent | Refits = field(repr=False)
+    point: Array | None = field(default=None, repr=False)
 
     @property
     def meaning(self) -> str:
@@ -102,7 +104,12 @@ class Uncertainty:
     @cached_property
     def mu(self) -> tuple[Interval, ...]:
         """Coefficients of the nonlinearities, one per input, in the gauge of the model."""
-        return tuple(self.of(lambda model, c=c: model.nonlinearities[c].mu) for c in range(self.model.m))
+        return tuple(self.coefficients(c) for c in range(self.model.m))
+
+    def coefficients(self, index: int, fed_back: bool = False) -> Interval:
+        """Return those of the coefficients of a function of the inputs, or of the outputs."""
+        functions = "feedback" if fed_back else "nonlinearities"
+        return self.of(lambda model: getattr(model, functions)[index].mu)
 
     @cached_property
     def offset(self) -> Interval:
@@ -116,20 +123,22 @@ class Uncertainty:
         """Band of every nonlinearity on the grid of its basis; see `band`."""
         return tuple(self.band(c) for c in range(self.model.m))
 
-    def band(self, channel: int = 0, at: ArrayLike | None = None, offset: bool = True) -> Interval:
+    def band(self, channel: int = 0, at: ArrayLike | None = None, offset: bool = True, *, fed_back: bool = False
+             ) -> Interval:
         """Return the pointwise band of a nonlinearity in the gauge of the model.
 
         Args:
-            channel: index of the input.
+            channel: index of the input, or of the function among those of the outputs.
             at: (k,) values of the input; the 201 points of ``basis.grid()`` when not given.
             offset: include the offset of f where the model knows it (``model.c0``); where it does not, or with False,
                 the band is that of f without constant, which has no width where the basis vanishes.
+            fed_back: of a function of the outputs.
         """
-        model = self.model
-        basis = model.nonlinearities[channel].basis
+        model, functions = self.model, "feedback" if fed_back else "nonlinearities"
+        basis = getattr(model, functions)[channel].basis
         points = basis.grid() if at is None else np.atleast_1d(np.asarray(at, dtype=float))
         with_offset = offset and not isinstance(basis, Linear) and model.c0 is not None
-        found = self.of(lambda model: model.nonlinearities[channel](points) + (model.c0 if with_offset else 0.0))
+        found = self.of(lambda model: getattr(model, functions)[channel](points) + (model.c0 if with_offset else 0.0))
         return replace(found, at=points)
 
     def frequency_response(self, w: ArrayLike | None = None) -> tuple[Interval, Interval]:
@@ -170,10 +179,38 @@ class Uncertainty:
                         value + upper.reshape(value.shape))
 
     def table(self) -> list[tuple[str, float, float, float, float]]:
-        """Return (name, estimate, standard error, lower, upper) of every coefficient that tables of the model show."""
-        found = self.of(lambda model: np.array([value for _, value in model.coefficients()]))
+        """Return (name, estimate, standard error, lower, upper) of what tables of the model show.
+
+        Those are the coefficients of a transfer function. Of a state-space model, whose matrices depend on the choice
+        of its states, they are the poles and the static gain.
+        """
+        names, quantity = self._state_quantities() if self.model.structure == "ss" else (
+            [name for name, _ in self.model.coefficients()],
+            lambda model: np.array([value for _, value in model.coefficients()]))
+        found = self.of(quantity)
         rows = np.column_stack([found.value, found.error, found.lower, found.upper]).tolist()
-        return [(name, *row) for (name, _), row in zip(self.model.coefficients(), rows)]
+        return [(name, *row) for name, row in zip(names, rows)]
+
+    def _state_quantities(self) -> tuple[list[str], Quantity]:
+        model, point = self.model, np.zeros(self.model.m) if self.point is None else self.point
+        poles = model.poles[model.poles.imag >= 0]
+        paired = [bool(pole.imag) for pole in poles]
+        names = [f"pole {i + 1}{part}" for i, pair in enumerate(paired)
+                 for part in ([", real", ", imaginary"] if pair else [""])]
+        try:
+            model.static_gain(point)
+            names += [f"static gain[{y},{u}]" for y in model.outputs for u in model.inputs]
+            gains = True
+        except StructureError:  # a pole at one, or no rest there
+            gains = False
+
+        def quantity(model: Any) -> Array:
+            nearest = [model.poles[np.argmin(np.abs(model.poles - pole))] for pole in poles]
+            parts = [part for pole, pair in zip(nearest, paired) for part in ([pole.real, pole.imag] if pair else
+                                                                              [pole.real])]
+            return np.append(parts, np.ravel(model.static_gain(point)) if gains else [])
+
+        return names, quantity
 
 
 def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
@@ -181,8 +218,9 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
 
     Args:
         fit: a least-squares fit (``arx``, ``hammerstein_arx.exact`` or ``.overparametrised``), or one of prediction
-            errors (``oe.exact``, ``hammerstein_oe.exact``), whose errors count as white; with ``ridge`` or
-            ``curvature`` the intervals are those of the posterior whose prior is the penalty.
+            errors: of transfer functions (``oe.exact``, ``hammerstein_oe.exact``), whose errors count as white, or of
+            state-space models (``hammerstein_ss.exact``, ``lfr.exact``), whose simulation errors may be coloured. With
+            ``ridge`` or ``curvature`` the intervals are those of the posterior whose prior is the penalty.
         level: probability that an interval contains the truth, in (0, 1).
         draws: random draws for intervals under inequality constraints, at least 100.
         seed: seed of the draws.
@@ -193,22 +231,32 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
         RankError: parameters without effect on the predictions.
     """
     check_level(level)
-    transform = getattr(fit.data, "transform", None)
+    transforms = [getattr(fit.program.compressed, "outward", None), getattr(fit.data, "transform", None)]
 
     def rebuild(values: dict[str, Array]) -> Any:
         model = fit.program.recover(values)
-        return aligned(model if transform is None else model.with_transform(transform), fit.model)
+        for transform in filter(None, transforms):
+            model = model.with_transform(transform)
+        return aligned(model, fit.model)
 
-    return Uncertainty(fit.model, float(level), linearise(fit, rebuild, draws, seed))
+    source = linearise(fit, rebuild, draws, seed)
+    if fit.model.structure != "ss":
+        return Uncertainty(fit.model, float(level), source)
+    inputs = np.vstack([e.u for e in fit.data.raw().experiments])
+    return Uncertainty(fit.model, float(level), source, np.nanmean(inputs, axis=0))
 
 
 def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
-    signs = [-1.0 if float(np.sum(b * other)) < 0 else 1.0 for b, other in zip(model.b, reference.b)]
-    if all(sign > 0 for sign in signs):
+    functions = [-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
+                 for f, other in zip(model.nonlinearities, reference.nonlinearities)]
+    signs = np.array(functions)
+    if np.all(signs > 0):
         return model
-    return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)),
-                   nonlinearities=tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities)))
+    turned = tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities))
+    if model.structure == "ss":
+        return replace(model, B=model.B * signs, D=model.D * signs, nonlinearities=turned)
+    return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)), nonlinearities=turned)
 
 
 def check_level(level: float) -> None:

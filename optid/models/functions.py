@@ -24,6 +24,7 @@ class StaticFunction:
         channel: index of its argument among the inputs, or the outputs for a feedback.
         name: name of that channel.
         unit: its unit, "" where unknown.
+        index: its place among the functions of the inputs, or of the outputs.
         fed_back: whether the argument is an output.
     """
 
@@ -32,6 +33,7 @@ class StaticFunction:
     channel: int
     name: str
     unit: str
+    index: int
     fed_back: bool = False
 
     @property
@@ -77,7 +79,7 @@ def _named(
     for j, (f, c) in enumerate(zip(functions, places)):
         number = str(places[: j + 1].count(c)) if places.count(c) > 1 else ""
         word = letter + number + ("" if len(names) == 1 else f"_{names[c]}")
-        found.append(StaticFunction(word, f, c, names[c], units[c], fed_back=letter == "g"))
+        found.append(StaticFunction(word, f, c, names[c], units[c], j, fed_back=letter == "g"))
     return found
 
 

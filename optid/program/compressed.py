@@ -1,11 +1,30 @@
 """What prices, fits and intervals ask of the compressed data behind a programme."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.errors import RankError
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far an estimate scatters.
+
+    Attributes:
+        covariance: (k, k) of its coordinates.
+        noise: (l, l) covariance of the errors, in units of the objective.
+        dof: degrees of freedom that are left to estimate it.
+        penalised: whether a penalty is part of the objective.
+    """
+
+    covariance: Array
+    noise: Array
+    dof: float
+    penalised: bool = False
 
 
 class Compressed(Protocol):
@@ -33,6 +52,50 @@ class Compressed(Protocol):
         """Return the coefficients (n_columns, l) of the columns of the factor."""
         ...
 
-    def one_step_fit(self, values: Mapping[str, np.ndarray]) -> Array:
-        """Return the one-step fit (l,) in %."""
+    def one_step_fit(self, values: Mapping[str, np.ndarray]) -> Array | None:
+        """Return the one-step fit (l,) in %; None where only a run of the model tells it."""
         ...
+
+    def spread(self, theta: Array, moves: Array) -> Spread:
+        """Return the scatter of an estimate in k coordinates in which its information is the identity.
+
+        Args:
+            theta: (n_columns, l) coefficients of the columns at the minimum.
+            moves: (n_columns l, k) their derivatives with respect to the coordinates.
+        """
+        ...
+
+
+def white_spread(statistics: Any, theta: Array, moves: Array) -> Spread:
+    """Return `Compressed.spread` for rows whose errors are white.
+
+    Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
+    (sandwich form).
+
+    Raises:
+        RankError: no rows are left to estimate the noise from.
+    """
+    n, l = theta.shape  # noqa: E741
+    root = statistics.root
+    sensitivity = np.einsum("ij,jok->oik", root[:n, :n], moves.reshape(n, l, -1))
+    parameters = float(np.sum(sensitivity**2))
+    dof = degrees_of_freedom(statistics.rows, parameters / l)
+    residual = root @ np.vstack([theta, -np.eye(l)])
+    noise = residual.T @ residual / dof
+    covariance = np.einsum("oij,op,pik->jk", sensitivity, noise, sensitivity)
+    penalised = parameters < len(covariance) * (1 - 1e-9)
+    if penalised:
+        prior = np.eye(len(covariance)) - np.einsum("oij,oik->jk", sensitivity, sensitivity)
+        covariance = covariance + float(np.trace(noise)) / l * prior
+    return Spread(covariance, noise, dof, penalised)
+
+
+def degrees_of_freedom(rows: float, parameters: float) -> float:
+    """Return what so many rows leave beside the parameters.
+
+    Raises:
+        RankError: nothing.
+    """
+    if not rows > parameters:
+        raise RankError(f"{rows:.0f} rows for {parameters:.0f} parameters: none are left to estimate the noise")
+    return rows - parameters

@@ -28,17 +28,23 @@ def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
         return None, str(error)
 
 
-def parameter_table(fit: "Fit") -> Table:
-    """Coefficients of A, B and the offset with standard errors and 95 % intervals where there are some."""
+def parameter_tables(fit: "Fit") -> list[Table]:
+    """What was estimated with standard errors and 95 % intervals where there are some, then matrices without."""
     known, reason = uncertainty(fit)
-    if known is None:
-        rows = [(name, number(value)) for name, value in fit.model.coefficients()]
-        note = f"No standard errors: {reason.rstrip('.')}."
-        if len(rows) <= MOST_ROWS:
-            return Table("Parameters", ("parameter", "estimate"), rows, note)
-        return Table("Parameters", ("parameter", "estimate") * ABREAST, _abreast(rows), note)
-    rows = [_interval_row(name, *row) for name, *row in known.table()]
-    return Table("Parameters", ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows)
+    found = []
+    if known is not None:
+        rows = [_interval_row(name, *row) for name, *row in known.table()]
+        state_space = fit.model.structure == "ss"
+        found.append(Table("Poles and static gain" if state_space else "Parameters",
+                           ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows))
+        if not state_space:
+            return found
+    rows = [(name, number(value)) for name, value in fit.model.coefficients()]
+    title, note = ("Parameters", f"No standard errors: {reason.rstrip('.')}.") if known is None else (
+        "Matrices", "They depend on the choice of the states, which no record determines.")
+    if len(rows) <= MOST_ROWS:
+        return [*found, Table(title, ("parameter", "estimate"), rows, note)]
+    return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]
 
 
 def nonlinearity_tables(fit: "Fit") -> list[Table]:
@@ -51,10 +57,10 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
         f = function.nonlinearity
         points = _points(f.basis)
         label = f"{function.name} ({function.unit})" if function.unit else function.name
-        if known is None or function.fed_back:
+        if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
         else:
-            band = known.band(function.channel, points)
+            band = known.band(function.index, points, fed_back=function.fed_back)
             numeric = zip(points, band.value, band.error, band.lower, band.upper)
             size = float(np.max(np.abs(band.value)))
             rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
@@ -75,10 +81,10 @@ def coefficient_table(fit: "Fit") -> Table | None:
         where = "" if function.word in "fg" else function.word if function.word[1] != "_" else function.name
         for j, value in enumerate(function.nonlinearity.mu):
             label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
-            if known is None or function.fed_back:
+            if known is None:
                 rows.append((label, number(value)))
             else:
-                interval = known.mu[function.channel]
+                interval = known.coefficients(function.index, function.fed_back)
                 rows.append(_interval_row(label, value, interval.error[j], interval.lower[j], interval.upper[j]))
     head = () if known is None else ("std. error", "95 % low", "95 % high")
     return Table("Coefficients of the basis", ("coefficient", "estimate", *head), rows) if rows else None

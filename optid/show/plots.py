@@ -17,7 +17,7 @@ from optid.errors import DataError, DataWarning
 from optid.identify.equation_error import EquationError
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.functions import has_feedback, response_pairs, static_functions, step_length
+from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
 from optid.show import panels, summary
 from optid.show.estimates import uncertainty
 from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
@@ -300,7 +300,7 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
             ax,
             function.nonlinearity,
             np.zeros(0) if record is None else function.samples(record),
-            None if function.fed_back else _f_band(fit, function.channel),
+            _f_band(fit, function),
             name=with_unit(function.name, function.unit),
             label=plain(function.word),
         )
@@ -344,11 +344,11 @@ def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
     panels.draw_response(response, w, curves, _response_bands(fit, w), names)
 
 
-def _f_band(fit: "Fit", channel: int) -> tuple[Array, Array, Array] | None:
+def _f_band(fit: "Fit", function: StaticFunction) -> tuple[Array, Array, Array] | None:
     known, _ = uncertainty(fit)
     if known is None:
         return None
-    band = known.band(channel)
+    band = known.band(function.index, fed_back=function.fed_back)
     return np.asarray(band.at), band.lower, band.upper
 
 

@@ -55,7 +55,7 @@ def describe(fit: "Fit") -> str:
     ]
     if evidence := summary.evidence_facts(fit):
         lines += [_rule("-"), *_facts(evidence)]
-    for table in (estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)):
+    for table in (*estimates.parameter_tables(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)):
         lines += [_rule("-"), *set_table(table)]
     if noise := summary.noise_table(fit):
         lines += [_rule("-"), *set_table(noise)]

@@ -102,7 +102,7 @@ def _compared(found: "Comparison", command: str) -> dict[str, Any]:
 def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
     tone, word, sentence = summary.verdict(fit)
     checked = _checked(fit, test)
-    tables = [estimates.parameter_table(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
+    tables = [*estimates.parameter_tables(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
     tables += [noise] if (noise := summary.noise_table(fit)) else []
     return {
         "version": __version__,

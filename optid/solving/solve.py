@@ -21,6 +21,7 @@ from optid.structures.least_squares import rank_one_of
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+UNUSABLE = (Status.FAILED, Status.LIMIT)
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
 CONFLICT = "the constraints contradict each other"
 NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
@@ -74,10 +75,10 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
         return solution
-    if solution.status is Status.FAILED:
+    if solution.status is Status.FAILED or (solution.status is Status.LIMIT and _violation(solution) > LIE):
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
-            if found.has_point and found.status is not Status.FAILED:
+            if found.status is Status.INFEASIBLE or (found.has_point and found.status not in UNUSABLE):
                 return replace(found, failed=back_end.name)
     if solution.status is Status.INACCURATE:  # a hundredth of the tolerance may satisfy our measurements
         sharper = replace(settings, accuracy=settings.accuracy / 100)

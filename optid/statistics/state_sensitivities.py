@@ -4,7 +4,7 @@ A stretch is run by the simulator of the criterion; the derivatives of the state
 (`optid.models.state_kernels`), and what leaves a chunk is a factor of [sensitivities | errors].
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,14 +47,23 @@ def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Ar
     Returns:
         The errors near x; of infinite value where a run leaves the range allowed.
     """
+    try:
+        return linearised(weighted_rows(data, unknowns, x, weight, model, limits, chunk), unknowns.experiments,
+                          unknowns.n, unknowns.shared, gauge, method)
+    except (FloatingPointError, DataError):
+        return _infinite(unknowns)
+
+
+def weighted_rows(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any, limits: Any = None,
+                  chunk: int = 0) -> Callable[[int], Iterator[tuple[Array, int]]]:
+    """Return what yields the weighted rows [x0 | shared | error] of an experiment, and their number, by its index.
+
+    Arguments as `linearise_states`. A missing output has a row of zeros.
+    """
     chunk = chunk or max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
     point = unknowns.unpack(x)
     found = model(point)
-    try:
-        return linearised(lambda i: _blocks(_job(data, unknowns, found, i, limits), unknowns, point, i, weight, chunk),
-                          unknowns.experiments, unknowns.n, unknowns.shared, gauge, method)
-    except (FloatingPointError, DataError):
-        return _infinite(unknowns)
+    return lambda i: _blocks(_job(data, unknowns, found, i, limits), unknowns, point, i, weight, chunk)
 
 
 def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any, limits: Any = None) -> list[Array]:

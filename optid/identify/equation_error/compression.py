@@ -22,6 +22,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
+from optid.program.compressed import Spread, white_spread
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.program.view import View
@@ -127,6 +128,10 @@ class EquationError:
         n, root = self.layout.n_columns, (self.unweighted or self.statistics).root
         rest = np.sum((root[:, :n] @ self.regression(values) - root[:, n:]) ** 2, axis=0)
         return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
+
+    def spread(self, theta: np.ndarray, moves: np.ndarray) -> Spread:
+        """Return the scatter under white equation errors."""
+        return white_spread(self.statistics, theta, moves)
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
               gauge: str, flip: bool = True) -> HammersteinTF:

@@ -185,12 +185,22 @@ def _ended(fit: TangentFit, here: _Iterate, reason: str, figures: Mapping[str, A
 def _judged(solution: Solution, gain: float, value: float, floor: float, share: float = CONFIRMED
             ) -> tuple[Status, str]:
     """What a back end's answer to the last programme makes of its reference: it must have been solved, and stay."""
-    if solution.status not in (Status.OPTIMAL, Status.LOCAL):
+    if solution.status not in (Status.OPTIMAL, Status.LOCAL) and not _near(solution):
         return solution.status, solution.reason
     if abs(gain) > share * value + floor:
         return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
                                    f"{abs(gain) / max(value, 1e-300):.0e} of its value")
     return Status.LOCAL, ""
+
+
+def _near(solution: Solution) -> bool:
+    """Whether an inaccurate solution is off by its complementarity alone, and by no more than counts as nothing.
+
+    Many nearly parallel rows share large multipliers: their products with the slacks then keep a rest.
+    """
+    found = solution.residuals
+    return found is not None and solution.status is Status.INACCURATE and (
+        max(found.violation, found.stationarity) <= INSIDE and found.complementarity <= STALLED)
 
 
 def _evidence(fit: TangentFit, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:

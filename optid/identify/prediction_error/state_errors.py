@@ -4,7 +4,7 @@ Unknowns live in the full matrices; the directions along which a change of state
 and b, are projected out at every iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
 from optid.models.state_simulation import allowed_range
 from optid.statistics.linearised import Linearised, Method
-from optid.statistics.state_sensitivities import linearise_states, residuals, squares
+from optid.statistics.state_sensitivities import linearise_states, residuals, squares, weighted_rows
 from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
@@ -86,6 +86,10 @@ class StateErrors(Criterion):
         """Return the errors near x."""
         return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x),
                                 limits=self.limits, method=method)
+
+    def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+        """Return what yields the weighted rows [sensitivities | errors] of an experiment."""
+        return weighted_rows(self.data, self.unknowns, x, self.weight, self.at, self.limits)
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""

@@ -12,6 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.identify.prediction_error.descent import Criterion
 from optid.models.gauges import leading_sign
+from optid.program.compressed import Spread, white_spread
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.statistics.linearised import Linearised
@@ -180,11 +181,16 @@ class CompressedErrors:
     @cached_property
     def statistics(self) -> ErrorRows:
         """The same as a factor of rows."""
-        size = len(self.reference)
+        size, (matrix, errors) = len(self.reference), self.at.whole
         root = np.zeros((size + 1, size + 1))
-        root[:size, :size], root[:size, size] = self.problem.root, self.problem.target
-        root[size, size] = np.sqrt(self.problem.remainder)
-        return ErrorRows(root, self.at.rows, self.candidates, self.at.condition, self.at.method)
+        root[:size, :size], root[:size, size] = matrix, matrix @ self.reference - errors
+        root[size, size] = np.sqrt(self.at.remainder)
+        return ErrorRows(root, self.at.rows, self.candidates, self.condition, self.at.method)
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled sensitivities."""
+        return self.at.condition
 
     def lifted(self, values: Mapping[str, Array]) -> Array:
         """Return z."""
@@ -198,3 +204,7 @@ class CompressedErrors:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
         value = self.at.after(self.lifted(values) - self.reference)
         return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
+
+    def spread(self, theta: Array, moves: Array) -> Spread:
+        """Return the scatter under white errors."""
+        return white_spread(self.statistics, theta, moves)

@@ -1,0 +1,109 @@
+"""The compressed errors of a state-space model near its optimum, and how far they let the estimate scatter.
+
+What the errors leave open, changes of the states and of the scale between mu and b, has weight in the factor and no
+part in the scatter: intervals hold for whatever does not depend on it. Errors of a free run are coloured where noise
+enters before the output; their long autoregression makes the sandwich form of the covariance (Ljung, System
+Identification, 1999, chapter 9).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.channels import Transform
+from optid.errors import StructureError
+from optid.identify.noise import regression_lags
+from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.tangent_fit import CompressedErrors, LeastSquares
+from optid.program.compressed import Spread, degrees_of_freedom
+from optid.program.units import energy_unit
+from optid.statistics.coloured import long_autoregression, response_of, scattered
+from optid.statistics.hankel import complete_runs
+
+NO_EFFECT = 1e-9
+"""Size of an effect on the errors, relative to the largest, that is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedStates(CompressedErrors):
+    """The compressed errors of a state-space model; see `CompressedErrors`.
+
+    Attributes:
+        criterion: the errors.
+        outward: from the units of the programme's models to those of the record.
+    """
+
+    criterion: StateErrors
+    outward: Transform
+
+    @cached_property
+    def _scaled(self) -> tuple[Array, Array, Array]:
+        """Column sizes, singular values and right vectors of the factor, its columns scaled to one."""
+        matrix = self.at.whole[0]
+        sizes = np.linalg.norm(matrix, axis=0)
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        return sizes, *np.linalg.svd(matrix / sizes)[1:]
+
+    @cached_property
+    def free(self) -> Array:
+        """Directions (k, n) in which functions of latent signals change into each other, as rows of weight.
+
+        Polynomials of z are polynomials of a z + b, too: two directions per signal change no output.
+        """
+        if not self.criterion.unknowns.latent:
+            return np.zeros((0, len(self.reference)))
+        sizes, values, vectors = self._scaled
+        count = min(int(np.sum(values < NO_EFFECT * values[0])), 2 * len(self.criterion.unknowns.latent))
+        return vectors[len(values) - count :] * sizes
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled sensitivities in the directions that are not free."""
+        if not self.criterion.unknowns.latent:
+            return self.at.condition
+        values = self._scaled[1][: len(self.reference) - len(self.free)]
+        return float(values[0] / max(values[-1], 1e-300))
+
+    @cached_property
+    def problem(self) -> LeastSquares:
+        """The sum of squares in z."""
+        matrix, errors = self.at.whole
+        root, errors = np.vstack([matrix, self.free]), np.append(errors, np.zeros(len(self.free)))
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder, float(self.energy[0]))
+
+    def one_step_fit(self, values: object) -> None:
+        """Return nothing: the errors are those of the criterion."""
+
+    def spread(self, theta: Array, moves: Array) -> Spread:
+        """Return the scatter under the noise that the errors at the iterate show."""
+        criterion, x = self.criterion, self.reference
+        unknowns, outputs = criterion.unknowns, criterion.unknowns.l
+        known = moves.shape[1] - len(criterion.gauge_rows(x)) - len(self.free)
+        dof = degrees_of_freedom(self.statistics.rows / outputs, known / outputs)
+        errors = criterion.residuals(x)
+        complete = np.vstack([e[~np.isnan(e).any(axis=1)] for e in errors])
+        noise = complete.T @ complete / len(complete) * (self.statistics.rows / outputs / dof)
+        response, root = self._noise_filter(errors, noise)
+        meat = np.zeros((unknowns.size, unknowns.size))
+        for i in range(unknowns.experiments):
+            columns = np.r_[unknowns.shared + i * unknowns.n + np.arange(unknowns.n), np.arange(unknowns.shared)]
+            meat[np.ix_(columns, columns)] += scattered(criterion.blocks(x)(i), response, root)
+        return Spread(moves.T @ meat @ moves, energy_unit(self.outward) * noise, dof)
+
+    def _noise_filter(self, errors: list[Array], noise: Array) -> tuple[Array, Array]:
+        """Response of the weighted errors to white ones, and a triangular root of the covariance of these."""
+        weigh = np.linalg.cholesky(self.criterion.weight).T
+        outputs = len(noise)
+        white = np.eye(outputs)[None], np.linalg.cholesky(weigh @ noise @ weigh.T + 1e-300 * np.eye(outputs)).T
+        if self.criterion.unknowns.innovations:
+            return white
+        try:
+            lags = regression_lags([len(run) for e in errors for run in complete_runs(e, 1)],
+                                   self.criterion.unknowns.n, outputs)
+        except StructureError:  # too few to tell a colour
+            return white
+        autoregression, root = long_autoregression([e @ weigh.T for e in errors], lags)
+        rows = sum(len(e) for e in errors)
+        return response_of(autoregression), root * np.sqrt(rows / max(rows - lags * outputs, 1))
