@@ -28,7 +28,7 @@ def one(case: str, n: int, seed: int, alpha: int = 8) -> RankTest:
     process, measurement, colour = CASES[case]
     u = np.random.default_rng(seed).normal(size=(n, 2))
     data = TWO_MODES.record(u, seed + 1000, process=process, measurement=measurement, colour=colour)
-    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    records = data.records
     return order_test(records, expand(data, Linear()), alpha)
 
 

@@ -12,7 +12,6 @@ from optid.identify.design.rules import (
     check_instruments,
     check_levels,
     check_lines,
-    longest_run,
     many_lines,
     remaining_shares,
 )
@@ -47,7 +46,7 @@ def test_few_lags_are_determined_by_a_sinusoid():
     """Nine regressors are excited: two lags of four functions are fine, three are not."""
     assert check_lines("u", [SINE], QUARTIC, 2).severity == "fine"
     check = check_lines("u", [SINE], QUARTIC, 3)
-    assert (check.severity, check.number, check.limit) == ("error", 9, 12) and "multisine" in check.sentence
+    assert (check.severity, check.number) == ("error", 9) and "12 are to be determined" in check.sentence
 
 
 @pytest.mark.parametrize("noise, severity", [(1e-4, "error"), (0.005, "warning"), (0.5, "fine")])
@@ -58,7 +57,7 @@ def test_noise_hides_a_sinusoid_by_degrees(noise, severity):
 
 def test_quantisation_and_missing_samples_do_not_cure_it():
     u = np.round(40 * SINE) / 40
-    u[1000:1010] = np.nan
+    u[1000:1010], u[2500] = np.nan, np.nan
     assert check_lines("u", [u], QUARTIC, 10).severity in ("error", "warning")
 
 
@@ -95,18 +94,11 @@ def test_pursuit_finds_the_lines_and_the_quick_test_never_contradicts_it():
     assert remaining_shares(np.ones((50, 2)), 3, 1e-3).tolist() == [0.0]
 
 
-def test_the_longest_run_is_the_one_without_gaps():
-    x = np.arange(100.0)
-    x[[10, 70]] = np.nan
-    np.testing.assert_array_equal(longest_run(x[:, None])[:, 0], np.arange(11.0, 70))
-    assert longest_run(np.full((5, 2), np.nan)).shape == (0, 2)
-
-
 def test_levels_against_the_basis():
     u = RNG.uniform(-1, 1, 500)
     assert check_levels("u", np.sign(u), BASIS).severity == "error"
     few = check_levels("u", np.round(2 * u), BASIS)
-    assert (few.severity, few.number, few.limit) == ("error", 5, BASIS.size + 1)
+    assert (few.severity, few.number) == ("error", 5) and f"the basis has {BASIS.size}" in few.sentence
     assert check_levels("u", np.round(5 * u), BASIS).severity == "warning"
     assert check_levels("u", np.round(5 * u), BASIS, few=0).severity == "fine"
     assert check_levels("u", u, BASIS).severity == "fine"

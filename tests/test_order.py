@@ -48,16 +48,12 @@ def linear(data):
     return expand(data, Linear())
 
 
-def records(data):
-    return [np.hstack([e.u, e.y]) for e in data.experiments]
-
-
 # -- the distribution ------------------------------------------------------------------------------------------------
 
 
 def test_moments_of_t_from_formed_windows():
     data, alpha, n0 = record(500, colour=0.7), 4, 2
-    found = order_test(records(data), linear(data), alpha)
+    found = order_test(data.records, linear(data), alpha)
     windows = windows_of(np.hstack([data.u, data.y]), 3 * alpha)
     j = len(windows)
     early = windows[:, : 2 * alpha]
@@ -91,7 +87,7 @@ def test_p_values_of_the_true_order_are_uniform(colour):
     p = []
     for seed in range(150):
         data = record(600, seed, colour=colour)
-        p.append(order_test(records(data), linear(data), 5).p_values[2])
+        p.append(order_test(data.records, linear(data), 5).p_values[2])
     assert kstest(p, "uniform").pvalue > 1e-3
 
 
@@ -118,7 +114,7 @@ def test_no_noise_is_decided_by_rounding():
 def test_no_dependence_on_the_input():
     rng = np.random.default_rng(0)
     data = Data(rng.normal(size=600), rng.normal(size=600))
-    assert order_test(records(data), linear(data), 5).order == 0
+    assert order_test(data.records, linear(data), 5).order == 0
     found = optid.order(data)
     assert found.nx == 1 and "may not depend on the inputs" in " ".join(str(found).split())
 
@@ -126,7 +122,7 @@ def test_no_dependence_on_the_input():
 def test_units_do_not_matter():
     data = benchmark.TWO_MODES.record(np.random.default_rng(0).normal(size=(1000, 2)), 1, process=0.2, measurement=0.5)
     other = Data(data.u * [1e3, 1], data.y * [1, 1e4] + [0, 5.0])
-    first, second = (order_test(records(d), linear(d), 6) for d in (data, other))
+    first, second = (order_test(d.records, linear(d), 6) for d in (data, other))
     assert second.order == first.order == 4
     assert second.p_values == pytest.approx(first.p_values, rel=1e-5, abs=1e-9)
 
@@ -152,7 +148,7 @@ def test_nonlinear_inputs_and_feedback():
 def test_simulated_outputs_follow_the_inputs_alone():
     data = record(3000, noise=0.5)
     signals = expand(data, Linear(), Polynomial(3).fitted(-9, 9))
-    (extended,), wider = with_simulated_outputs(records(data), signals, 8)
+    (extended,), wider = with_simulated_outputs(data.records, signals, 8)
     clean = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], data.u[:, 0])
     assert np.isnan(extended[:15, 2]).all() and wider.simulated
     assert np.std(extended[15:, 2] - clean[15:]) < 0.1 * clean.std()
@@ -163,7 +159,7 @@ def test_simulated_outputs_follow_the_inputs_alone():
 
 def test_the_choice_has_a_reason():
     data = record()
-    statistics = hankel_statistics(records(data), 15)
+    statistics = hankel_statistics(data.records, 15)
     z, phi, y = positions(statistics, 5, 1, 2)
     n, reason = rank_test(statistics, z, phi, y, rows=10).choice
     assert n == 2 and "order 1 is rejected" in reason
@@ -173,7 +169,7 @@ def test_the_choice_has_a_reason():
 
 def test_refusals_of_the_test():
     data = record()
-    statistics = hankel_statistics(records(data), 15)
+    statistics = hankel_statistics(data.records, 15)
     z, phi, y = positions(statistics, 5, 1, 2)
     with pytest.raises(StructureError, match="take windows that are longer"):
         rank_test(statistics, z, phi, y, rows=15)
@@ -194,7 +190,7 @@ def test_refusals_of_the_test():
 def test_prediction_errors_of_full_order_are_those_of_least_squares():
     data, alpha = record(700), 3
     signals = linear(data)
-    statistics = hankel_statistics(records(data), 2 * alpha, signals, centre="mean")
+    statistics = hankel_statistics(data.records, 2 * alpha, signals, centre="mean")
     found = state_criteria(statistics, signals, alpha, 2 * alpha, statistics, statistics)
     windows = windows_of(np.hstack([data.u, data.y]), 2 * alpha)
     j = len(windows)
@@ -347,7 +343,7 @@ def test_bad_records():
     sine = np.sin(0.5 * np.arange(600))
     with pytest.raises(RankError):
         optid.order(Data(sine, lfilter([1], [1, -0.5], sine) + 0.01 * rng.normal(size=600)), basis="polynomial:3")
-    assert block_rows_for(records(data), linear(data), None) == 10
+    assert block_rows_for(data.records, linear(data), None) == 10
 
 
 @pytest.mark.slow

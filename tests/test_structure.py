@@ -15,7 +15,7 @@ from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation import validate
-from optid.identify.validation.structure import FTest, structure_test
+from optid.identify.validation.structure import f_test, structure_test
 from optid.identify.validation.structure_design import (
     Design,
     Family,
@@ -94,18 +94,18 @@ def test_poles_behind_a_nonlinearity_in_coloured_noise():
 def test_f_test_by_hand():
     from scipy.stats import f
 
-    test = FTest.of(6.0, 3, 20.0, 40)
-    assert test.p_value == pytest.approx(f.sf(6 / 3 / (20 / 40), 3, 40))
-    assert test.saving == pytest.approx(1 - (20 / 40) / (26 / 43))
-    assert FTest.of(1.0, 0, 1.0, 10) == FTest() and FTest.of(-1e-12, 2, 1.0, 10).p_value == 1
+    p_value, saving = f_test(6.0, 3, 20.0, 40)
+    assert p_value == pytest.approx(f.sf(6 / 3 / (20 / 40), 3, 40))
+    assert saving == pytest.approx(1 - (20 / 40) / (26 / 43))
+    assert f_test(1.0, 0, 1.0, 10) == (1.0, 0.0) and f_test(-1e-12, 2, 1.0, 10)[0] == 1
 
 
 def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
     data = hammerstein(900)
     design = Design.of(data)
-    whole = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
+    whole = np.vstack([design.additive(u) for _, u, _, _ in design.stretches(0)])
     monkeypatch.setattr("optid.identify.validation.structure_design.CHUNK", 100)
-    parts = np.vstack([design.additive(u) for u, _, _ in design.stretches(0)])
+    parts = np.vstack([design.additive(u) for _, u, _, _ in design.stretches(0)])
     assert parts == pytest.approx(whole, abs=1e-10) and len(whole) == 900 - len(design.filters) + 1
     several = structure_test(data)
     monkeypatch.undo()
@@ -148,6 +148,27 @@ def test_records_without_noise():
     u = inputs(model, 1200)
     assert structure_test(Data(u, model.simulate(u))).passed
     assert structure_test(Data(u, np.ones(1200) + 0 * u[:, 0])).p_value == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0.0, 1e3, 1e6])
+def test_the_last_digits_of_records_without_noise(seed, level):
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-2, 2, (600, 1500)[seed % 2])
+    scale_u, scale_y = 10.0 ** rng.uniform(-6, 6), 10.0 ** rng.uniform(-9, 9)
+
+    def found(y):
+        return structure_test(Data(scale_u * u, scale_y * (y + level)))
+
+    f = u + 0.3 * u**2 - 0.2 * u**3
+    finite = lfilter([1, 0.5, 0.2], [1], f)
+    assert found(finite).p_value == 1  # the residuals are rounding
+    slow = lfilter([1, 0.5, 0.2], np.real(np.poly([0.9, 0.5 + 0.3j, 0.5 - 0.3j])), f)
+    assert found(slow).passed  # the residuals are what the filters cut off, 1e-5 of the output
+    second = found(finite + 1e-3 * np.r_[0, u[:-1] ** 2])
+    assert not second.passed and second.rank["y"] < 1e-20
+    product = found(finite + 1e-8 * max(1, level) * np.r_[0, u[1:] * u[:-1]])
+    assert not product.passed and product.products["y"] < 1e-20
 
 
 def test_missing_samples_and_experiments():

@@ -131,6 +131,11 @@ class Data(Ports):
         return len(self.experiments)
 
     @property
+    def records(self) -> list[np.ndarray]:
+        """Channels [u | y], (N, m + l), one array per experiment."""
+        return [np.hstack([e.u, e.y]) for e in self.experiments]
+
+    @property
     def u(self) -> Any:
         """Inputs (N, m), or a tuple of such arrays when there are several experiments."""
         return one_or_all([e.u for e in self.experiments])

@@ -55,9 +55,8 @@ def find_outliers(records: Sequence[Array]) -> list[np.ndarray]:
         records: (N,) samples of every experiment; NaN = missing. What is missing parts no neighbours.
     """
     present = [np.flatnonzero(~np.isnan(x)) for x in records]
-    parts = [np.asarray(x, dtype=float)[kept] for x, kept in zip(records, present)]
-    wild = _beyond(np.concatenate([_departures(x) for x in parts]), parts)
-    return [kept[mask] for kept, mask in zip(present, np.split(wild, _edges(parts)))]
+    wild = _wild([np.asarray(x, dtype=float)[kept] for x, kept in zip(records, present)])
+    return [kept[mask] for kept, mask in zip(present, wild)]
 
 
 def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Array) -> list[np.ndarray]:
@@ -119,9 +118,10 @@ def _running_median(x: Array) -> Array:
     return course
 
 
-def _beyond(d: Array, parts: Sequence[Array]) -> np.ndarray:
-    """Tell which samples of all experiments together are wild."""
-    none = np.zeros(d.size, dtype=bool)
+def _wild(parts: Sequence[Array]) -> list[np.ndarray]:
+    """Tell which samples of every experiment are wild, among those of all experiments together."""
+    d, none = np.concatenate([_departures(x) for x in parts]), [np.zeros(x.size, dtype=bool) for x in parts]
+    edges = np.cumsum([x.size for x in parts])[:-1]
     if d.size < LEAST_SAMPLES:
         return none
     below = min(max(d.size // 12, 20), 1000)  # departures that tell the steepness of the tail
@@ -132,16 +132,12 @@ def _beyond(d: Array, parts: Sequence[Array]) -> np.ndarray:
         return none  # at rest but for pulses: they are the signal
     for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
         size = float(top[k - 1]) / STEP
-        found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], _edges(parts)))]
+        found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], edges))]
         steps = sum(int(np.count_nonzero(np.abs(np.diff(x[~mask])) > size)) for x, mask in zip(parts, found))
         runs = sum(int(np.count_nonzero(np.diff(mask.astype(np.int8), prepend=0) > 0)) for mask in found)
         if runs and steps <= SWITCHING * runs:
-            return np.concatenate(found)
+            return found
     return none
-
-
-def _edges(parts: Sequence[Array]) -> np.ndarray:
-    return np.cumsum([x.size for x in parts])[:-1]
 
 
 def _splits(top: Array, n: int, below: int) -> np.ndarray:

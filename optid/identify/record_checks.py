@@ -69,9 +69,8 @@ def examine_figures(figures: Mapping[str, Any]) -> list[str]:
             estimated condition number of the column-scaled expanded regressor, and the condition number of R11, the
             regressors of a subspace method projected on its instruments.
     """
-    found = []
-    for key, check in (("condition", check_condition), ("condition of R11", check_instruments)):
-        found += _sentences(check(figures[key])) if key in figures else []
+    checks = {"condition": check_condition, "condition of R11": check_instruments}
+    found = [sentence for key in checks if key in figures for sentence in _sentences(checks[key](figures[key]))]
     found += [f"{key}, {samples}, were left out with every row that holds one"
               for key, samples in figures.items() if key.startswith(BY_RESIDUALS)]
     found = _warned(found)

@@ -9,7 +9,7 @@ and curved constraints, at the price of as many fits.
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,15 +32,13 @@ class Bootstrap:
     """The outcome of a residual bootstrap; both intervals offer what `optid.identify.uncertainty.Uncertainty` offers.
 
     Attributes:
-        percentile: quantiles of the refits.
+        percentile: quantiles of the refits; the models are in ``percentile.source.models``.
         basic: the same reflected at the estimate, which undoes a bias instead of doubling it.
-        models: the refitted models.
         failed: refits that gave no point.
     """
 
     percentile: Uncertainty
     basic: Uncertainty
-    models: tuple[HammersteinTF, ...] = field(repr=False)
     failed: int
 
 
@@ -92,10 +90,9 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
                       stacklevel=2)
     if len(models) < 2:
         raise StructureError(f"{failed} of {runs} refits gave no point: there is no scatter to report")
-    refits = tuple(models)
-    percentile, basic = (Uncertainty(fit.model, float(level), Refits(fit.model, refits, kind))
+    percentile, basic = (Uncertainty(fit.model, float(level), Refits(fit.model, tuple(models), kind))
                          for kind in ("percentile", "basic"))
-    return Bootstrap(percentile, basic, refits, failed)
+    return Bootstrap(percentile, basic, failed)
 
 
 def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:

@@ -36,7 +36,7 @@ def describe(study: OrderStudy) -> str:
                 word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
                 lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
     said = f"nx = {study.nx}"
-    if study.na is not None and study.lags is not None:
+    if study.lags is not None:
         said += f"; {study.lags.best('bic')}"
     lines.append(f"Recommended: {said}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.identify.order.ranks import moments_of_sum, shifted_moments
+from optid.identify.order.ranks import lagged_covariances, moments_of_sum
 from optid.statistics.hankel import HankelStatistics
 
 Positions = Sequence[int] | NDArray[np.intp]
@@ -121,10 +121,7 @@ def zero_test(
     energy = float(np.max(np.diag(left)[t.size :] / spread**2))
     shocks, noise = weights[:, on_t] @ normal, (weights[:, t.size :] - weights[:, on_t] @ theta) @ whitener
     statistic = float(np.sum((gains @ whitener) ** 2))
-    gram_of, lags = shifted_moments(statistics, width, rows), range(statistics.rows - rows + 1)
-    unbiased = j / max(j - o.size - t.size, 1)
-    e = [unbiased * noise.T @ gram_of(lag) @ noise for lag in lags]
-    z = [shocks.T @ gram_of(lag) @ shocks for lag in lags]
+    e, z = lagged_covariances(statistics, rows, noise, shocks, o.size + t.size)
     flat = energy <= QUIET**2
     if not kept.any() or flat:
         healthy = 0.0 if not kept.any() else float("inf")

@@ -1,4 +1,4 @@
-"""Design an excitation for a plant of which one record exists, and what it promises of the record taken with it."""
+"""Design an excitation for a plant of which one record exists, and predict the record taken with it."""
 
 import warnings
 from dataclasses import dataclass
@@ -39,30 +39,32 @@ BOOST = 4.0
 zone and noise."""
 
 
-@dataclass(frozen=True)
-class Promise:
-    """What may be expected of a record taken with an excitation.
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """An excitation to be applied, and what may be expected of a record taken with it.
 
     Attributes:
+        u: (N, m) inputs, read-only.
+        dt: sampling time.
+        inputs: names of the inputs.
+        kind: "multisine", "chirp", "noise" or "levels".
         condition: expected condition number of the windows of the expanded regressor, columns scaled.
         rows: samples of a window.
         functions: signals in the expanded regressor.
-        levels: distinct values of each input (counting stops at 1000).
         band: lowest and highest frequency aimed at, 1/unit of dt.
-        amplitude: (low, high) of each input.
-        crest: crest factor of each input.
         outputs: expected standard deviation of each output.
         checks: the rules of design, held against this excitation.
-        how: how it was computed.
+        how: how the condition number was computed.
     """
 
+    u: Array
+    dt: float
+    inputs: tuple[str, ...]
+    kind: str
     condition: float
     rows: int
     functions: int
-    levels: tuple[int, ...]
     band: tuple[float, float]
-    amplitude: tuple[tuple[float, float], ...]
-    crest: tuple[float, ...]
     outputs: tuple[float, ...]
     checks: tuple[Check, ...]
     how: str
@@ -70,37 +72,14 @@ class Promise:
     def __str__(self) -> str:
         facts = {
             "expected condition number": f"{self.condition:.3g}  of {self.functions} functions at {self.rows} lags",
-            "levels": ", ".join(map(str, self.levels)),
+            "levels": ", ".join(str(count_levels(x)) for x in self.u.T),
             "band": f"{self.band[0]:.4g} to {self.band[1]:.4g}",
-            "amplitude": ", ".join(f"{low:.4g} to {high:.4g}" for low, high in self.amplitude),
-            "crest factor": ", ".join(f"{c:.3g}" for c in self.crest),
+            "amplitude": ", ".join(f"{x.min():.4g} to {x.max():.4g}" for x in self.u.T),
+            "crest factor": ", ".join(f"{signals.crest_factor(x):.3g}" for x in self.u.T),
             "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)"}
         lines = [*facts.items(), *((check.rule, check) for check in self.checks), ("how", self.how)]
-        return "\n".join(f"{name:<26} {value}" for name, value in lines)
-
-
-@dataclass(frozen=True, eq=False)
-class Excitation:
-    """An excitation to be applied, with what it promises.
-
-    Attributes:
-        u: (N, m) inputs, read-only.
-        dt: sampling time.
-        inputs: names of the inputs.
-        input_units: their units.
-        kind: "multisine", "chirp", "noise" or "levels".
-        promise: what may be expected of a record taken with it.
-    """
-
-    u: Array
-    dt: float
-    inputs: tuple[str, ...]
-    input_units: tuple[str, ...]
-    kind: str
-    promise: Promise
-
-    def __str__(self) -> str:
-        return f"{self.kind}, {len(self.u)} samples every {self.dt:g}\n{self.promise}"
+        return "\n".join([f"{self.kind}, {len(self.u)} samples every {self.dt:g}",
+                          *(f"{name:<26} {value}" for name, value in lines)])
 
     def save(self, path: Path | str) -> Path:
         """Write time and inputs as CSV with a header; `optid.read` reads it, and so does a signal generator."""
@@ -162,7 +141,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         gain = measured.gain(frequency, c)
         return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
 
-    def realised(draw: int) -> tuple[Array, Promise]:
+    def realised(draw: int) -> Excitation:
         columns = []
         for c, (low, high) in enumerate(ranges):
             x = _signal(kind, n, (low, high), like.dt, limits, partial(weight, c) if shaped else None, hold, periods,
@@ -173,22 +152,22 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
                 step = (high - low) / (levels - 1)
                 x = low + step * np.round((x - low) / step)
             columns.append(x)
-        u = np.column_stack(columns)
-        return u, promised(u, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
+        return _expected(np.column_stack(columns), kind, like, measured, limits, basis, feedback_basis, rows, few,
+                         seed + draw)
 
     while True:
         draws = map(realised, range(1 if kind == "chirp" else candidates))
-        u, promise = min(draws, key=lambda pair: pair[1].condition)
-        if promise.condition <= WANTED or band is not None or kind == "levels" or limits[1] >= top:
+        found = min(draws, key=lambda excitation: excitation.condition)
+        if found.condition <= WANTED or band is not None or kind == "levels" or limits[1] >= top:
             break
         limits = limits[0], min(WIDER * limits[1], top)
-    for check in promise.checks:
+    for check in found.checks:
         if check.severity == "error":
             raise StructureError(f"this {kind} breaks a rule of design: {check.sentence}")
         if check.severity == "warning":
             warnings.warn(check.sentence, DataWarning, stacklevel=2)
-    u.flags.writeable = False
-    return Excitation(u, like.dt, like.inputs, like.input_units, kind, promise)
+    found.u.flags.writeable = False
+    return found
 
 
 def _check(kind: str, band: Any, shaped: bool, **counts: int | None) -> None:
@@ -220,7 +199,8 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
     top = float(measured.frequency[-1])
     if band is None:
         f = measured.frequency
-        gain = np.max([measured.gain(f, c) / np.max(measured.gain(f, c)) for c in range(len(measured.inputs))], axis=0)
+        gains = np.stack([measured.gain(f, c) for c in range(measured.response.shape[2])])
+        gain = np.max(gains / gains.max(axis=1, keepdims=True), axis=0)
         heard = (gain > FAINT) & (measured.coherence.max(axis=1) > TRUSTED)
         if not heard.any():
             raise DataError("no frequency at which the inputs explain half of the power of an output: the record shows "
@@ -253,17 +233,14 @@ def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple
     return sum(span) / 2 + (span[1] - span[0]) / 2 * x
 
 
-def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
-             feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Promise:
+def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
+              feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Excitation:
     """Predict what a record taken with u (N, m) would be like and hold it against the rules.
 
     Without functions of the outputs the condition number is that of the designed signal itself, so it holds for every
-    record taken with it. Otherwise the outputs are predicted (`predicted`).
-
-    Raises:
-        RankError: an excitation shorter than a window.
+    record taken with it. Otherwise the outputs are predicted (`_predicted`).
     """
-    y = predicted(u, like, measured, seed)
+    y = _predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # functions of outputs that are nearly linear: `check_feedback`
@@ -278,12 +255,11 @@ def promised(u: Array, like: Data, measured: FrequencyResponse, band: tuple[floa
         how = (f"from the designed signal and outputs predicted through the frequency response of "
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
-    return Promise(condition, rows, expansion.p + expansion.q, tuple(count_levels(x) for x in u.T), band,
-                   tuple((float(x.min()), float(x.max())) for x in u.T), tuple(signals.crest_factor(x) for x in u.T),
-                   tuple(float(s) for s in y.std(axis=0)), tuple(checks), how)
+    return Excitation(u, like.dt, like.inputs, kind, condition, rows, expansion.p + expansion.q, band,
+                      tuple(float(s) for s in y.std(axis=0)), tuple(checks), how)
 
 
-def predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:
+def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:
     """Predict the outputs (N, l) in the steady state, linearly, with a disturbance of the measured spectrum.
 
     The mean of the outputs is that of the record.
@@ -310,6 +286,5 @@ def expanded_condition(data: Data, expansion: Expansion, rows: int) -> float:
         RankError: no complete window.
     """
     count = expansion.p + expansion.q
-    records = [np.hstack([e.u, e.y]) for e in data.experiments]
-    return hankel_statistics(records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
+    return hankel_statistics(data.records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],
                              centre="mean").condition

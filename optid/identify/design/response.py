@@ -21,8 +21,6 @@ class FrequencyResponse:
         coherence: (F, l) share of the output power that the inputs explain linearly, 0 to 1.
         disturbance: (F, l) power spectral density of the rest, squared unit per unit of frequency.
         segments: number of segments averaged.
-        inputs: names of the m inputs.
-        outputs: names of the l outputs.
     """
 
     frequency: Array
@@ -30,8 +28,6 @@ class FrequencyResponse:
     coherence: Array
     disturbance: Array
     segments: int
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
 
     def at(self, frequency: Array) -> np.ndarray:
         """Return the response (K, l, m) at some frequencies (K,), linear between the bins, constant beyond."""
@@ -70,8 +66,7 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     window = np.hanning(size + 1)[:-1]
     m, l = data.m, data.l  # noqa: E741 - the field's letter
     sums, count = np.zeros((size // 2 + 1, m + l, m + l), dtype=complex), 0
-    for e in data.experiments:
-        samples = np.hstack([e.u, e.y])
+    for samples in data.records:
         samples = samples - np.nanmean(samples, axis=0)
         for start in range(0, len(samples) - size + 1, max(1, size // 2)):
             part = samples[start : start + size]
@@ -101,4 +96,4 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     coherence[k] = np.clip(explained / np.where(yy[k] > 0, yy[k], 1.0), 0.0, 1.0)
     # The estimate takes m of the averaged segments' degrees of freedom.
     disturbance[k] = yy[k] * (1 - coherence[k]) * count / (count - m)
-    return FrequencyResponse(frequency, response, coherence, disturbance, count, data.inputs, data.outputs)
+    return FrequencyResponse(frequency, response, coherence, disturbance, count)

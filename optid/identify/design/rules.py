@@ -35,17 +35,13 @@ class Check:
 
     Attributes:
         rule: "levels", "lines", "feedback", "excitation" or "instruments".
-        subject: the channel, or "" for the record.
         number: what was measured.
-        limit: what it is held against.
         severity: "fine", "warning" or "error".
         sentence: the finding with its remedy.
     """
 
     rule: str
-    subject: str
     number: float
-    limit: float
     severity: Severity
     sentence: str
 
@@ -64,8 +60,7 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
         basis: the fitted basis.
         few: number of values below which the curve between them counts as interpolation.
     """
-    needed = basis.size + 1
-    limit, severity, sentence = needed, "fine", f"input {name!r} takes many levels"
+    severity, sentence = "fine", f"input {name!r} takes many levels"
     levels = count_levels(u[:4096])
     if basis.size > 1 and levels <= 4 * FEW_LEVELS:
         levels = count_levels(u)
@@ -74,15 +69,15 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
             severity = "error"
             sentence = (f"input {name!r} is binary: a static nonlinearity cannot be identified from two levels "
                         "(any function is a straight line there); use the formulation 'arx' or a basis 'linear'")
-        elif levels < needed:
+        elif levels <= basis.size:
             severity = "error"
             sentence += (f", which determine at most {levels - 1} functions besides the constant; the basis has "
                          f"{basis.size}. Use a smaller basis or excite more levels")
         elif levels < few:
-            limit, severity = few, "warning"
+            severity = "warning"
             sentence = (f"too few levels: input {name!r} takes {levels} distinct values for {basis.size} basis "
                         "functions; the nonlinearity between them is interpolation")
-    return Check("levels", name, float(levels), limit, severity, sentence)
+    return Check("levels", float(levels), severity, sentence)
 
 
 def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) -> Check:
@@ -102,11 +97,11 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     """
     needed = lags * basis.size
     most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
-    fine = Check("lines", name, float("inf"), needed, "fine",
-                 f"the functions of input {name!r} have more than {most} spectral lines")
+    fine = Check("lines", float("inf"), "fine", f"the functions of input {name!r} have more than {most} spectral lines")
     lines, remaining, single = 0, 0.0, True
     for record in records:
-        u = longest_run(np.asarray(record, dtype=float)[:, None])[:, 0]
+        column = np.asarray(record, dtype=float)[:, None]
+        u = max(complete_runs(column, 1), key=len, default=column[:0])[:LONGEST, 0]
         if needed <= 3 or u.size < 4 * needed or np.ptp(u) == 0 or many_lines(u, most, DOMINANT):
             return fine
         shares = remaining_shares(basis.values(u), most, HIDDEN)
@@ -123,7 +118,7 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
         f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
         "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions")
-    return Check("lines", name, excited, needed, "error" if remaining <= HIDDEN else "warning", sentence)
+    return Check("lines", excited, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
 def check_feedback(name: str, share: float) -> Check:
@@ -136,14 +131,15 @@ def check_feedback(name: str, share: float) -> Check:
         name: of the output.
         share: spread outside 1 and y over the spread of the functions (`optid.statistics.expansion.Feedback.share`).
     """
-    sentence = f"{100 * share:.2g} % of the spread of the functions of output {name!r} is not linear in the outputs"
-    if share >= NEARLY_LINEAR:
-        return Check("feedback", name, share, NEARLY_LINEAR, "fine", sentence)
-    if share >= LINEAR:
-        sentence += ": little beside the noise. Excite larger amplitudes, or leave the feedback basis out"
-        return Check("feedback", name, share, NEARLY_LINEAR, "warning", sentence)
-    sentence += ": no feedback can be told from the dynamics. Leave the feedback basis out, or excite larger amplitudes"
-    return Check("feedback", name, share, LINEAR, "error", sentence)
+    severity, remedy = "fine", ""
+    if share < LINEAR:
+        severity, remedy = "error", (": no feedback can be told from the dynamics. Leave the feedback basis out, or "
+                                     "excite larger amplitudes")
+    elif share < NEARLY_LINEAR:
+        severity, remedy = "warning", (": little beside the noise. Excite larger amplitudes, or leave the feedback "
+                                       "basis out")
+    return Check("feedback", share, severity, f"{100 * share:.2g} % of the spread of the functions of output {name!r} "
+                                              f"is not linear in the outputs{remedy}")
 
 
 def check_condition(number: float) -> Check:
@@ -152,9 +148,10 @@ def check_condition(number: float) -> Check:
     Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input. The number
     is inf where they are singular.
     """
-    return _conditioning("excitation", number, f"condition number of the expanded regressor: {number:.2g}",
-                         f"the expanded regressor is poorly excited: condition number {number:.1e}; "
-                         "use fewer functions or lags, or a richer input")
+    if number > WORST_CONDITION:
+        return Check("excitation", number, "warning", f"the expanded regressor is poorly excited: condition number "
+                     f"{number:.1e}; use fewer functions or lags, or a richer input")
+    return Check("excitation", number, "fine", f"condition number of the expanded regressor: {number:.2g}")
 
 
 def check_instruments(number: float) -> Check:
@@ -162,39 +159,25 @@ def check_instruments(number: float) -> Check:
 
     With instruments that do not reach the regressors it grows with the root of the number of samples.
     """
-    return _conditioning("instruments", number, f"cond(R11) = {number:.2g}",
-                         f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented "
-                         "instruments (hammerstein_ss.asivid), fewer block rows or functions, or an input with more "
-                         "lines and levels")
-
-
-def _conditioning(rule: str, number: float, fine: str, poor: str) -> Check:
-    severity, sentence = ("warning", poor) if number > WORST_CONDITION else ("fine", fine)
-    return Check(rule, "", number, WORST_CONDITION, severity, sentence)
-
-
-def longest_run(signals: Array) -> Array:
-    """Return the longest stretch of rows (N, s) without NaN, at most `LONGEST` rows of it."""
-    return max(complete_runs(signals, 1), key=len, default=signals[:0])[:LONGEST]
+    if number > WORST_CONDITION:
+        return Check("instruments", number, "warning", f"the instruments hardly reach the regressors: cond(R11) = "
+                     f"{number:.1e}. Use augmented instruments (hammerstein_ss.asivid), fewer block rows or functions, "
+                     "or an input with more lines and levels")
+    return Check("instruments", number, "fine", f"cond(R11) = {number:.2g}")
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:
     """Whether x (N,) certainly needs more sinusoids to leave this share of its variance: a quick test by frequency."""
-    centred = x - x.mean()
-    energy = np.abs(np.fft.rfft(centred * np.hanning(x.size))) ** 2
-    total = energy.sum()
-    if total == 0:
-        return False
+    energy = np.sort(np.abs(np.fft.rfft((x - x.mean()) * np.hanning(x.size))) ** 2)[::-1]
     # No choice of `most` lobes holds more than as many of the largest bins.
-    largest = np.sort(energy)[::-1][: most * LOBE]
-    return bool(largest.sum() < (1 - tolerance) * total)
+    return bool(energy[: most * LOBE].sum() < (1 - tolerance) * energy.sum())
 
 
 def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     """Return the share of variance that 0, 1, 2, ... common sinusoids leave, greedily chosen and fitted jointly.
 
     Each step adds the frequency that explains most of what is left of all signals together (orthogonal matching
-    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993) and refines all frequencies between the bins.
+    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993) and refines the first few between the bins.
 
     Args:
         signals: (N, s) without missing samples; every one counts alike.
@@ -211,19 +194,11 @@ def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     if not x.shape[1]:
         return np.zeros(1)
     n, total = len(x), float(x.shape[1])
-    window, frequencies = np.hanning(n)[:, None], np.zeros(0)
-    basis, residual = np.full((n, 1), n**-0.5), x
+    window, frequencies, residual = np.hanning(n)[:, None], np.zeros(0), x
     while len(shares) <= most and shares[-1] > enough and 2 * len(shares) + 1 < n:
         frequencies = np.append(frequencies, _strongest(residual * window))
-        if frequencies.size <= JOINT:
-            for _ in range(STEPS):
-                frequencies, basis, residual = _refined(x, frequencies)
-        else:
-            pair = _waves(n, frequencies[-1:])
-            for _ in range(2):  # twice: once leaves what rounding left of the earlier lines
-                pair -= basis @ (basis.T @ pair)
-            new = np.linalg.qr(pair)[0]
-            basis, residual = np.column_stack([basis, new]), residual - new @ (new.T @ residual)
+        for _ in range(STEPS if frequencies.size <= JOINT else 1):
+            frequencies, residual = _refined(x, frequencies)
         shares.append(min(float(np.sum(residual**2)) / total, shares[-1]))
     return np.array(shares)
 
@@ -239,30 +214,24 @@ def _strongest(x: Array) -> float:
     return (peak + (0.5 * (left - right) / bend if bend < 0 else 0.0)) / n
 
 
-def _waves(n: int, frequencies: Array) -> Array:
-    """Return cosines, then sines, (n, 2 L), about the middle, where frequency and phase are nearly independent."""
-    angles = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None] * frequencies
-    return np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-def _refined(x: Array, frequencies: Array) -> tuple[Array, Array, Array]:
-    """Return frequencies (L,) after a Gauss-Newton step, and what the old ones span and leave of x (N, s).
+def _refined(x: Array, frequencies: Array) -> tuple[Array, Array]:
+    """Return frequencies (L,) after a Gauss-Newton step, and what the old ones leave of x (N, s).
 
     The amplitudes are projected out: variable projection, Golub and Pereyra 1973, without the second-order term.
     """
     n, count = len(x), frequencies.size
-    waves = _waves(n, frequencies)
+    times = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None]  # about the middle: no phase for a frequency
+    waves = np.column_stack([np.cos(times * frequencies), np.sin(times * frequencies)])
     basis, triangle = np.linalg.qr(np.column_stack([np.ones(n), waves]))
     projections = basis.T @ x
     residual = x - basis @ projections
     scale = np.abs(np.diag(triangle))
-    if scale.min() < 1e-6 * scale.max():  # two of them have met
-        return frequencies, basis, residual
-    amplitudes = np.linalg.solve(triangle, projections)[1:]
-    times, slopes = 2 * np.pi * (np.arange(n) - (n - 1) / 2)[:, None], []
+    if count > JOINT or scale.min() < 1e-6 * scale.max():  # too many to be moved, or two of them have met
+        return frequencies, residual
+    amplitudes, slopes = np.linalg.solve(triangle, projections)[1:], []
     for a, b in zip(amplitudes[:count].T, amplitudes[count:].T):  # signal by signal
         slope = times * (b * waves[:, :count] - a * waves[:, count:])
         slopes.append(slope - basis @ (basis.T @ slope))
     step = np.linalg.lstsq(np.vstack(slopes), residual.T.ravel(), rcond=1e-8)[0]
     moved = np.clip(frequencies + np.clip(step, -0.25 / n, 0.25 / n), 0.25 / n, 0.5)
-    return moved, basis, residual
+    return moved, residual

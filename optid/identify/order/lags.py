@@ -6,7 +6,8 @@ then every lag of an input has one column, f(u(k - lag)), and one coefficient.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -90,58 +91,53 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     layout = Layout(na, (nb + nk,) * data.m, (0,) * data.m, tuple(bases), data.outputs, data.inputs)
     statistics = collect(data, layout)
     change = _contraction(statistics)
-    scan = _Scan(layout, statistics.root @ change, statistics.rows)
+    other = None
     if test is not None:
         long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
         if not long:
             raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or "
                             "nothing.")
         part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
-        scan = replace(scan, other=(change.T @ part.gram @ change, part.rows))
-    found = [scan.judged(a, (b,) * data.m, (k,) * data.m)
-             for a in range(na + 1) for k in range(nk + 1) for b in range(1, nb + 1)]
+        other = change.T @ part.gram @ change, part.rows
+    judge = partial(_judge, layout, statistics.root @ change, statistics.rows, other)
+    pairs = [(b, k) for k in range(nk + 1) for b in range(1, nb + 1)]
+    found = [judge(a, (b,) * data.m, (k,) * data.m) for a in range(na + 1) for b, k in pairs]
     if data.m > 1:
         best = min(found, key=lambda c: c.bic)
         for c in range(data.m):
-            found += [scan.judged(best.na, _put(best.nb, c, b), _put(best.nk, c, k))
-                      for k in range(nk + 1) for b in range(1, nb + 1)]
+            found += [judge(best.na, _put(best.nb, c, b), _put(best.nk, c, k)) for b, k in pairs]
             best = min(found, key=lambda c: c.bic)
-        found += [scan.judged(a, best.nb, best.nk) for a in range(na + 1)]
+        found += [judge(a, best.nb, best.nk) for a in range(na + 1)]
     return LagScan(tuple(dict.fromkeys(found)), statistics.rows)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    layout: Layout
-    root: Array
-    rows: int
-    other: tuple[Array, int] | None = None
-
-    def judged(self, na: int, nb: tuple[int, ...], nk: tuple[int, ...]) -> Lags:
-        layout, l, lags = self.layout, self.layout.l, self.layout.nb[0]  # noqa: E741
-        past = layout.na * l
-        inputs = [past + c * lags + lag for c in range(layout.m) for lag in range(nk[c], nk[c] + nb[c])]
-        constant = past + layout.m * lags
-        columns = np.array([*range(na * l), *inputs, constant])
-        targets = np.arange(constant + 1, constant + 1 + l)
-        theta, *_ = np.linalg.lstsq(self.root[:, columns], self.root[:, targets], rcond=1e-12)
-        error = self.root[:, targets] - self.root[:, columns] @ theta
-        energy = np.sum(self.root[:, targets] ** 2, axis=0)
-        covariance = (error.T @ error + np.diag(1e-16 * energy)) / self.rows
-        k = l * columns.size + sum(basis.size - 1 for basis in layout.bases)
-        likelihood = self.rows * float(np.linalg.slogdet(covariance)[1])
-        fit = float("nan")
-        if self.other is not None:
-            gram, rows = self.other
-            both = np.concatenate([columns, targets])
-            gram = gram[np.ix_(both, both)]
-            weights = np.vstack([-theta, np.eye(l)])
-            mean = gram[columns.size - 1, columns.size :] / rows
-            spread = np.diag(gram)[columns.size :] / rows - mean**2
-            errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / rows
-            fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
-        aic, aicc, bic = criteria(likelihood, k, self.rows, l)
-        return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
+def _judge(layout: Layout, root: Array, rows: int, other: tuple[Array, int] | None, na: int, nb: tuple[int, ...],
+           nk: tuple[int, ...]) -> Lags:
+    """Fit one structure by the root (n, n) of the largest one; `other` is the Gram matrix of the part held out."""
+    l, lags = layout.l, layout.nb[0]  # noqa: E741
+    past = layout.na * l
+    inputs = [past + c * lags + lag for c in range(layout.m) for lag in range(nk[c], nk[c] + nb[c])]
+    constant = past + layout.m * lags
+    columns = np.array([*range(na * l), *inputs, constant])
+    targets = np.arange(constant + 1, constant + 1 + l)
+    theta, *_ = np.linalg.lstsq(root[:, columns], root[:, targets], rcond=1e-12)
+    error = root[:, targets] - root[:, columns] @ theta
+    energy = np.sum(root[:, targets] ** 2, axis=0)
+    covariance = (error.T @ error + np.diag(1e-16 * energy)) / rows
+    k = l * columns.size + sum(basis.size - 1 for basis in layout.bases)
+    likelihood = rows * float(np.linalg.slogdet(covariance)[1])
+    fit = float("nan")
+    if other is not None:
+        gram, count = other
+        both = np.concatenate([columns, targets])
+        gram = gram[np.ix_(both, both)]
+        weights = np.vstack([-theta, np.eye(l)])
+        mean = gram[columns.size - 1, columns.size :] / count
+        spread = np.diag(gram)[columns.size :] / count - mean**2
+        errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / count
+        fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
+    aic, aicc, bic = criteria(likelihood, k, rows, l)
+    return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
 
 
 def _contraction(statistics: Statistics) -> Array:

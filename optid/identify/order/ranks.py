@@ -165,8 +165,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     """
     from scipy.special import chdtrc, chdtri
 
-    reach = statistics.rows - rows
-    if reach < 1:
+    if statistics.rows <= rows:
         raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
                              "are longer by the number of future block rows, so that they tell the correlation between "
                              "windows.")
@@ -186,11 +185,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
         raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
     r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
     left, values, right = np.linalg.svd(r22)
-    gram_of = shifted_moments(statistics, width, rows)
-    unbiased = j / (j - z.size)  # residuals of a regression on the instruments
-    lags = range(reach + 1)
-    covariance_e = [unbiased * left.T @ (noise.T @ gram_of(lag) @ noise) @ left for lag in lags]
-    covariance_z = [right @ (shocks.T @ gram_of(lag) @ shocks) @ right.T for lag in lags]
+    covariance_e, covariance_z = lagged_covariances(statistics, rows, noise @ left, shocks @ right.T, z.size)
     tails = np.cumsum((values**2)[::-1])[::-1]
     expected, thresholds, p_values = np.zeros((3, values.size))
     for n0 in range(values.size):
@@ -225,14 +220,17 @@ def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray
     return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size
 
 
-def shifted_moments(statistics: HankelStatistics, width: int, rows: int):
-    """Return the function lag -> mean of s_t s_{t + lag}^T over windows s_t = [1; rows block rows]."""
+def lagged_covariances(statistics: HankelStatistics, rows: int, noise: Array, shocks: Array, count: int
+                       ) -> tuple[list[Array], list[Array]]:
+    """Covariances at lags 0 ... reach of e = noise^T s and z = shocks^T s over windows s = [1; rows block rows].
 
-    def gram_of(lag: int) -> Array:
-        later = np.concatenate([[0], 1 + lag * statistics.d + np.arange(rows * statistics.d)])
-        return statistics.gram[:width][:, later] / statistics.windows
-
-    return gram_of
+    The e are residuals of a regression on `count` instruments, whose degrees of freedom are given back.
+    """
+    width, lags = len(noise), range(statistics.rows - rows + 1)
+    later = [np.concatenate([[0], np.arange(1 + lag * statistics.d, width + lag * statistics.d)]) for lag in lags]
+    grams = [statistics.gram[:width][:, columns] / statistics.windows for columns in later]
+    unbiased = statistics.windows / max(statistics.windows - count, 1)
+    return [unbiased * noise.T @ gram @ noise for gram in grams], [shocks.T @ gram @ shocks for gram in grams]
 
 
 def moments_of_sum(covariance_e: Sequence[Array], covariance_z: Sequence[Array]) -> tuple[float, float]:

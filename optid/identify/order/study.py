@@ -33,9 +33,8 @@ class OrderStudy:
         block_rows: future block rows.
         ranks: test of the singular values.
         states: criteria by number of states, on prediction errors.
-        lags: scan of na, nb, nk, or None when `notes` says why.
+        lags: scan of na, nb, nk, the best of which is recommended; None when `notes` says why.
         nx: recommended number of states.
-        na, nb, nk: recommended lags, nb and nk by input; None without a scan.
         reasons: why.
         notes: what weakens the result; each was also given as a DataWarning.
     """
@@ -46,9 +45,6 @@ class OrderStudy:
     states: StateCriteria
     lags: LagScan | None
     nx: int
-    na: int | None
-    nb: tuple[int, ...] | None
-    nk: tuple[int, ...] | None
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
@@ -94,7 +90,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     if nx is not None:
         check_integer(nx, "nx")
     data = data.raw()
-    records = _records(data)
+    records = data.records
     check_channels(records, data.inputs, data.outputs)
     expansion = expand(data, Linear() if basis is None else basis, feedback_basis)
     alpha = block_rows_for(records, expansion, block_rows, nx)
@@ -104,7 +100,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     largest = min((alpha - 1) * data.l, ranks.singular_values.size - 1, alpha * (expansion.p + expansion.q + data.l))
     train, test = _parts(data, holdout, alpha, notes)
     whole = hankel_statistics(records, 2 * alpha, expansion, names=expansion.names, centre="mean")
-    parts = [hankel_statistics(_records(part), 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
+    parts = [hankel_statistics(part.records, 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
              for part in (train, test) if part is not None]
     states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
     lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
@@ -113,10 +109,8 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
                      "inputs if the plant is not linear.")
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
-    best = lags.best("bic") if lags is not None else None
-    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], *(
-        (best.na, best.nb, best.nk) if best is not None else (None, None, None)),
-        _reasons(ranks, states, lags), tuple(notes))
+    return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], _reasons(ranks, states, lags),
+                      tuple(notes))
 
 
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
@@ -166,17 +160,13 @@ def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha
     return extended, expansion.with_simulated()
 
 
-def _records(data: Data) -> list[Array]:
-    return [np.hstack([e.u, e.y]) for e in data.experiments]
-
-
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:
     if not holdout:
         return None, None
     try:
         train, test = data.split(1 - holdout)
         for part in (train, test):
-            hankel_statistics(_records(part), 2 * alpha, method="gram").check(1.2)
+            hankel_statistics(part.records, 2 * alpha, method="gram").check(1.2)
     except (DataError, RankError) as error:
         notes.append(f"Nothing is held out: the record is too short for it. {error}")
         return None, None

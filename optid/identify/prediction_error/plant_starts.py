@@ -142,7 +142,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
     """
     if not layout.na or sum(basis.size for basis in layout.bases) > WIDE:
         return None
-    records = [np.hstack([e.u, e.y]) for e in data.experiments]
+    records = data.records
     try:
         expansion = expand(data, layout.bases)
         with warnings.catch_warnings():

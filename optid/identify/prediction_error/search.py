@@ -84,7 +84,7 @@ def _part(criterion: TransferErrors) -> TransferErrors:
 
 def _complete(data: Data) -> float:
     """Share of the samples of which no channel is missing."""
-    return float(np.mean(np.concatenate([np.isfinite(np.hstack([e.u, e.y])).all(axis=1) for e in data.experiments])))
+    return float(np.mean(np.concatenate([np.isfinite(record).all(axis=1) for record in data.records])))
 
 
 def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:

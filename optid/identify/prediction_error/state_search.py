@@ -148,7 +148,7 @@ def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
     shown = unknowns.criterion == "measured feedback" or (
         unknowns.criterion == "simulation" and not unknowns.expansion.feedback)
     if shown and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
-        records = [np.hstack([e.u, e.y]) for e in errors.data.experiments]
+        records = errors.data.records
         bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
                                  2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
                                  "starts are compared")

@@ -66,7 +66,7 @@ class Plan:
     @cached_property
     def records(self) -> list[Array]:
         """Raw channels [u | y], (N, m + l), one array per experiment."""
-        return [np.hstack([e.u, e.y]) for e in self.data.experiments]
+        return self.data.records
 
     @property
     def order(self) -> int | None:

@@ -12,14 +12,7 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.identify.record_checks import list_outside
 from optid.identify.validation.correlations import LEVEL, Correlation, autocorrelation, cross_correlation
-from optid.identify.validation.predictions import (
-    ONE_STEP,
-    SIMULATION,
-    Measures,
-    one_step,
-    predictors,
-    simulated,
-)
+from optid.identify.validation.predictions import ONE_STEP, SIMULATION, Measures, one_step, predictors, simulated
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.functions import has_feedback, static_functions
 from optid.registry import render

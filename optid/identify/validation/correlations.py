@@ -64,7 +64,7 @@ def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25, *, 
     """
     first = int(past is not None)
     own = _standardised(residuals)
-    values, counts = _products(own, own if past is None else _standardised(past), range(first, lags + 1))
+    values, counts = lagged_products(own, own if past is None else _standardised(past), range(first, lags + 1))
     late, inflation = slice(1 - first, None), 1.0 if first else 1 + 2 / max(counts[0], 1)
     return Correlation(output, other, np.arange(first, lags + 1), values, _band(counts),
                        _portmanteau(values[late], counts[late] * inflation))
@@ -79,8 +79,8 @@ def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], outpu
     """
     e, u = _standardised(residuals), _standardised(inputs)
     around = np.arange(-lags, lags + 1)
-    values, counts = _products(e, u, around)
-    own, _ = _products(u, u, range(lags + 1))
+    values, counts = lagged_products(e, u, around)
+    own, _ = lagged_products(u, u, range(lags + 1))
     p_value = float("nan")
     if np.isfinite(values).all() and np.isfinite(own).all():
         scale, axes = np.linalg.eigh(toeplitz(own))
@@ -108,8 +108,12 @@ def _standardised(signals: Sequence[Array]) -> list[Array]:
     return [(s - mean) / (size if size > 1e-14 * abs(mean) else np.nan) for s in signals]
 
 
-def _products(first: list[Array], second: list[Array], lags: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
-    """Mean of first(k) second(k - lag) over the pairs present, and their number."""
+def lagged_products(first: Sequence[Array], second: Sequence[Array], lags: Sequence[int] | NDArray[np.int64]
+                    ) -> tuple[Array, Array]:
+    """Return the mean of first(k) second(k - lag) over the pairs present, NaN where there are none, and their number.
+
+    Both have one array (N,) per experiment; NaN = missing.
+    """
     sums, counts = np.zeros(len(lags)), np.zeros(len(lags))
     for a, b in zip(first, second):
         here_a, here_b = ~np.isnan(a), ~np.isnan(b)

@@ -84,8 +84,10 @@ class Measures:
         y, error = y[here], (y - predicted)[here]
         e_n = float(np.mean(error**2))
         snr = float(np.mean(y**2)) / e_n if e_n > 0 else float("inf")
-        vaf = 100 * (1 - float(np.var(error) / np.var(y))) if np.ptp(y) > 0 else float("nan")
-        fit = float(fit_percent(y[:, None], (y - error)[:, None])[0])
+        fit = vaf = float("nan")
+        if np.ptp(y) > 0:
+            fit = 100 * (1 - float(np.linalg.norm(error) / np.linalg.norm(y - y.mean())))
+            vaf = 100 * (1 - float(np.var(error) / np.var(y)))
         return cls(fit, vaf, float(np.sqrt(e_n)), e_n, snr, float(np.sqrt(snr)), int(here.sum()))
 
 
@@ -96,13 +98,7 @@ def fit_percent(y: Array, predicted: Array) -> Array:
         y: (N, l) measured.
         predicted: (N, l) predicted or simulated.
     """
-    fits = np.full(y.shape[1], np.nan)
-    for o in range(y.shape[1]):
-        here = ~(np.isnan(y[:, o]) | np.isnan(predicted[:, o]))
-        if here.any() and np.ptp(y[here, o]) > 0:
-            spread = np.linalg.norm(y[here, o] - y[here, o].mean())
-            fits[o] = 100 * (1 - np.linalg.norm(y[here, o] - predicted[here, o]) / spread)
-    return fits
+    return np.array([Measures.of(measured, found).fit for measured, found in zip(y.T, predicted.T)])
 
 
 def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
@@ -131,12 +127,15 @@ def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
     raw = data.raw()
     if word == ONE_STEP:
         return common_fits(raw, [one_step(model, raw)])[0]
-    if not any(data.missing[name] for name in data.inputs):
-        try:
-            return common_fits(raw, [simulated(model, raw, word)])[0]
-        except DataError:  # it leaves the range of the data
-            pass
-    return np.full(data.l, np.nan)
+    return common_fits(raw, [simulated_or_nan(model, raw, word)])[0]
+
+
+def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
+    """Return the simulated outputs (N, l) of every experiment; NaN where an input is missing or the model runs away."""
+    try:
+        return simulated(model, data, word)
+    except DataError:
+        return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +177,7 @@ def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None
     for h, arrays in zip(chosen, ahead):
         if np.isnan(np.vstack(arrays)).all():
             raise DataError(f"no sample can be predicted {h} samples ahead; use shorter horizons")
-    try:
-        free = simulated(model, raw)
-    except DataError:
-        free = [np.full(e.y.shape, np.nan) for e in raw.experiments]
-    fits = common_fits(raw, [*ahead, free])
+    fits = common_fits(raw, [*ahead, simulated_or_nan(model, raw)])
     return HorizonCurve(raw.outputs, tuple(chosen), fits[:-1], fits[-1])
 
 

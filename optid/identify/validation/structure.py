@@ -10,22 +10,26 @@ mark of a Wiener system, save nothing; (2) the matrix of coefficients, lags time
 
 Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals makes the noise
 white, and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of
-any colour. All columns exist chunk by chunk only.
+any colour. What is regressed on them are the residuals of the best Hammerstein model rather than y: the statistics are
+the same, and keep their digits where hardly any noise is left. All columns exist chunk by chunk only.
 Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher-order correlations as structure tests
 (Billings and Voon 1986); rank one (Bai 1998).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.validation.structure_design import Design
-from optid.statistics.factors import dependent_column, root_of_gram
+from optid.identify.validation.correlations import lagged_products
+from optid.identify.validation.structure_design import EXPLAINED, Design
+from optid.statistics.factors import conditioning, dependent_column, root_of_gram
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
@@ -39,8 +43,6 @@ NOISE_ORDER, KEPT = 12, 0.4
 DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
-
-DIGITS = 1e-6  # a residual below this share of the standard deviation of the output is rounding in Gram matrices
 
 
 @dataclass(frozen=True)
@@ -77,25 +79,17 @@ class Structure:
         return "does not look Hammerstein: different lags see different nonlinearities"
 
 
-@dataclass(frozen=True)
-class FTest:
-    """An F test.
+def f_test(more: float, extra: int, rest: float, spare: int) -> tuple[float, float]:
+    """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
 
-    Attributes:
-        p_value: of the hypothesis; 1 when nothing is to be tested.
-        saving: share of the residual variance saved by giving it up, degrees of freedom discounted.
+    Returns:
+        p value of the hypothesis that they are zero, 1 when nothing is to be tested, and the share of the residual
+        variance that they save, degrees of freedom discounted.
     """
-
-    p_value: float = 1.0
-    saving: float = 0.0
-
-    @classmethod
-    def of(cls, more: float, extra: int, rest: float, spare: int) -> "FTest":
-        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom."""
-        if extra <= 0 or rest <= 0:
-            return cls()
-        free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
-        return cls(float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted))
+    if extra <= 0 or rest <= 0:
+        return 1.0, 0.0
+    free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
+    return float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted)
 
 
 def structure_test(data: Data) -> Structure:
@@ -117,15 +111,15 @@ def structure_test(data: Data) -> Structure:
     found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
     tests = [test for products, rank, _ in found.values() for test in (products, rank)]
     # what is significant but too small to notice must not hide what is both
-    telling = min(tests, key=lambda test: (test.p_value if test.saving > NOTICEABLE else 1.0, test.p_value))
+    p_value, saving = min(tests, key=lambda test: (test[0] if test[1] > NOTICEABLE else 1.0, test[0]))
     ratios = np.max([each for _, _, each in found.values()], axis=0)
-    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * telling.p_value), telling.saving,
-                     {name: products.p_value for name, (products, _, _) in found.items()},
-                     {name: rank.p_value for name, (_, rank, _) in found.items()})
+    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * p_value), saving,
+                     {name: products[0] for name, (products, _, _) in found.items()},
+                     {name: rank[0] for name, (_, rank, _) in found.items()})
 
 
-def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
-    """Test products and rank on one output; also second over first singular value by input."""
+def _test_output(design: Design, o: int) -> tuple[tuple[float, float], tuple[float, float], list[float]]:
+    """Return the F tests of products and rank on one output, and the second over first singular value by input."""
     additive = _additive_gram(design, o)
     problem = _rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
@@ -135,16 +129,19 @@ def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
     responses = _responses(design, leading, _linear_coefficients(additive, design.blocks))
     bs = [np.asarray(b, dtype=float) for b in hypothesis.bs]
     lines = [design.filters @ b for b in bs]
-    residuals, mean, spread = _residuals(design, o, np.asarray(hypothesis.lift(), dtype=float), responses)
-    y = np.concatenate([e.y[:, o] for e in design.data.experiments])
-    if np.nanstd(np.concatenate(residuals)) <= DIGITS * np.nanstd(y):
-        return FTest(), FTest(), [0.0] * design.data.m
+    theta = np.asarray(hypothesis.lift(), dtype=float)
+    residuals, mean, spread, size = _residuals(design, o, theta, responses)
+    # in units of eps: one for every term of the sum, and the condition number for theta, found from a Gram matrix
+    rounding = np.finfo(float).eps * (theta.size + conditioning(problem.root)) * size
+    if np.nanstd(np.concatenate(residuals)) <= rounding:
+        return (1.0, 0.0), (1.0, 0.0), [0.0] * design.data.m
     noise = _autoregression(residuals)
     past = noise.size - 1
     gram, sizes, rows = np.zeros((1, 1)), [0], 0
-    for u, output, valid in design.stretches(o, past):
+    for _, u, output, valid in design.stretches(o, past):
         carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
-        blocks = [design.additive(u), design.finer(u, lines), _alternatives(carriers), output[:, None]]
+        additive = design.additive(u)
+        blocks = [additive, design.finer(u, lines), _alternatives(carriers), (output - additive @ theta)[:, None]]
         sizes, columns = [block.shape[1] for block in blocks], np.hstack(blocks)
         complete = np.convolve(~valid, np.ones(past + 1))[past : valid.size] < 0.5
         white = np.sum([a * columns[past - i : len(columns) - i] for i, a in enumerate(noise)], axis=0)[complete]
@@ -155,14 +152,14 @@ def _test_output(design: Design, o: int) -> tuple[FTest, FTest, list[float]]:
         raise RankError(f"{rows} complete rows for {edges[-1]} columns of the structure test: use a longer record.")
     keep = np.r_[: edges[2], edges[-1] - 1]
     return (_products_test(gram, int(edges[2]), rows),
-            *_rank_test(gram[np.ix_(keep, keep)], bs, design.blocks, rows))
+            *_rank_test(gram[np.ix_(keep, keep)], theta, bs, design.blocks, rows))
 
 
 def _additive_gram(design: Design, o: int) -> Array:
     """Gram matrix [1 | filters of functions by input | y] of the additive regression."""
     size = 2 + sum(p * j for p, j in design.blocks)
     gram, rows = np.zeros((size, size)), 0
-    for u, output, valid in design.stretches(o):
+    for _, u, output, valid in design.stretches(o):
         used = np.column_stack([design.additive(u), output])[valid]
         gram += used.T @ used
         rows += len(used)
@@ -199,31 +196,30 @@ def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
     return np.stack(responses, axis=1)
 
 
-def _residuals(design: Design, o: int, additive: Array, responses: Array) -> tuple[list[Array], Array, Array]:
-    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs."""
-    residuals: list[Array] = []
-    sums, count = np.zeros((2, responses.shape[1])), 0
-    for i in range(len(design.u)):
-        parts = [np.zeros(0)]
-        for u, output, valid in design.stretches(o, among=[i]):
-            parts.append(np.where(valid, output - design.additive(u) @ additive, np.nan))
-            carriers = design.filtered(u, responses)
-            sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
-            count += len(carriers)
-        residuals.append(np.concatenate(parts))
+def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[list[Array], Array, Array, float]:
+    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs.
+
+    The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
+    """
+    residuals: list[Array] = [np.zeros(0)] * len(design.u)
+    sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
+    for i, u, output, valid in design.stretches(o):
+        columns = design.additive(u)
+        residuals[i] = np.append(residuals[i], np.where(valid, output - columns @ theta, np.nan))
+        moduli += float(np.sum((np.abs(columns) @ np.abs(theta)) ** 2))
+        carriers = design.filtered(u, responses)
+        sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
+        count += len(carriers)
     mean = sums[0] / count
-    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300))
+    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300)), float(np.sqrt(moduli / count))
 
 
 def _alternatives(carriers: Array) -> Array:
     """Products of two of all and of three of the first three carriers, and further functions of the first two."""
     first, second = np.triu_indices(carriers.shape[1])
-    leading = carriers[:, :3]
-    n = leading.shape[1]
-    triples = [(i, j, k) for i in range(n) for j in range(i, n) for k in range(j, n)]
-    cubes = np.column_stack([leading[:, i] * leading[:, j] * leading[:, k] for i, j, k in triples])
-    x = leading[:, 0]
-    return np.column_stack([carriers[:, first] * carriers[:, second], cubes, x**4, x**5, np.abs(leading[:, :2])])
+    cubes = [a * b * c for a, b, c in combinations_with_replacement(carriers.T[:3], 3)]
+    x = carriers[:, 0]
+    return np.column_stack([carriers[:, first] * carriers[:, second], *cubes, x**4, x**5, np.abs(carriers[:, :2])])
 
 
 def _autoregression(residuals: list[Array]) -> Array:
@@ -235,10 +231,8 @@ def _autoregression(residuals: list[Array]) -> Array:
     most = min(NOISE_ORDER, total // 50, max(len(r) for r in residuals) - 1)
     while most > 1 and complete ** (most + 1) < KEPT:  # a row is lost with any of its samples
         most -= 1
-    covariance = np.zeros(most + 1)
-    for lag in range(most + 1):
-        products = np.concatenate([r[lag:] * r[: max(len(r) - lag, 0)] for r in residuals])
-        covariance[lag] = np.nanmean(products) * (1 - lag / total) if not np.isnan(products).all() else 0.0
+    covariance = np.nan_to_num(lagged_products(residuals, residuals, range(most + 1))[0])
+    covariance *= 1 - np.arange(most + 1) / total
     best, least = np.ones(1), total * np.log(covariance[0])
     for order in range(1, most + 1):
         a = np.concatenate([[1.0], -solve_toeplitz(covariance[:order], covariance[1 : order + 1])])
@@ -256,8 +250,8 @@ def _distinct(gram: Array, least: float) -> Array:
     return vectors[:, values > least] / np.sqrt(values[values > least])
 
 
-def _products_test(gram: Array, n: int, rows: int) -> FTest:
-    """Test whether columns n ... of the Gram matrix [additive | alternatives | y] save anything."""
+def _products_test(gram: Array, n: int, rows: int) -> tuple[float, float]:
+    """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] save anything."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram / np.outer(scale, scale)
     sound = _distinct(scaled[:n, :n], 1e-10)
@@ -268,7 +262,8 @@ def _products_test(gram: Array, n: int, rows: int) -> FTest:
     distinct = _distinct((left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)], DISTINCT)
     more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
     extra = distinct.shape[1]
-    return FTest.of(more, extra, float(left[-1, -1]) - more, rows - sound.shape[1] - extra)
+    rest = max(float(left[-1, -1]) - more, EXPLAINED)
+    return f_test(more, extra, rest, rows - sound.shape[1] - extra)
 
 
 def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
@@ -281,9 +276,9 @@ def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> 
     return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
 
 
-def _rank_test(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
-               ) -> tuple[FTest, list[float]]:
-    """Test rank one of every block of the Gram matrix [1 | blocks | fine | y]; also second over first singular values.
+def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
+               ) -> tuple[tuple[float, float], list[float]]:
+    """Test rank one of every block of [1 | blocks | fine | residual]; also second over first singular values.
 
     The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
     for a second nonlinearity.
@@ -294,24 +289,21 @@ def _rank_test(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, i
     unit = np.eye(len(gram))
     change = np.hstack([unit[:, :1], finer, unit[:, 1:size], unit[:, -1:]])
     problem = _rank_one(change.T @ gram @ change, blocks, linear)
+    output = problem.target + problem.root @ np.concatenate([theta[:1], np.zeros(linear - 1), theta[1:]])
+    problem = replace(problem, target=output, scale=float("nan"))
     free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
     singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
-    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), problem.remainder
+    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
     more = minimise(problem, count=3).value - rest if extra else 0.0
-    return FTest.of(more, extra, rest, rows - len(problem.target)), ratios
+    return f_test(more, extra, rest, rows - len(problem.target)), ratios
 
 
 def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:
     """Combinations (columns of `gram`) of the fine functions that the blocks' functions, so filtered, do not give."""
-    size = 1 + sum(p * j for p, j in blocks)
-    fine = np.eye(len(gram))[:, size:-1]
-    coarse, start = [np.eye(len(gram))[:, :1]], 1
-    for (p, j), coefficients in zip(blocks, leading):
-        coarse.append(np.zeros((len(gram), p)))
-        coarse[-1][start : start + p * j] = np.kron(coefficients[:, None], np.eye(p))
-        start += p * j
-    coarse = np.hstack(coarse)
+    filtered = np.asarray(block_diag(1.0, *(np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, leading))))
+    size = len(filtered)
+    coarse, fine = np.pad(filtered, ((0, len(gram) - size), (0, 0))), np.eye(len(gram))[:, size:-1]
     fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
     inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
     fine = fine - coarse @ (inner @ (coarse.T @ gram @ fine))

@@ -5,6 +5,7 @@ The functions follow any static nonlinearity, and the filters are found whatever
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,18 @@ from optid.data.stretches import interpolated
 from optid.errors import RankError
 from optid.identify.order.ranks import rank_test
 from optid.models.recursions import lfilter
+from optid.statistics.expansion import Expansion
+from optid.statistics.factors import ROUNDING
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
+EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1  # poles more than the order that the data show: what is too weak for that may still matter to a sharp test
+SPARE = 1
+"""Poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test."""
+
 FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
@@ -97,22 +103,22 @@ def delay_of(data: Data) -> int:
     coefficients look significant. A delay too short costs a few filters, one too long is wrong: hence the generous
     level. Zero where the record is too short to tell.
     """
-    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
-    p = sum(family.size for family in families)
-    shortest = min(e.n_samples for e in data.experiments)
+    records, signals = _signals(data, 0)
+    p, shortest = signals.p, min(e.n_samples for e in data.experiments)
     lags = min(LATEST + 10, data.n_samples // (6 * p), shortest // 3)
     if lags < 3:
         return 0
-    statistics = _statistics(data, families, lags, 0)
-    past = np.concatenate([[0], *(statistics.at(range(p), [lags - 1 - lag]) for lag in range(lags))])
+    statistics = _statistics(records, signals, lags)
+    past = np.concatenate([[0], *(statistics.at(signals.eta, [lags - 1 - lag]) for lag in range(lags))])
     spare = statistics.windows - past.size
     if spare < past.size:
         return 0
-    now = statistics.at(range(p, p + data.l), [lags - 1])
+    now = statistics.at(signals.y, [lags - 1])
     gram = statistics.gram
     inverse = np.linalg.pinv(gram[np.ix_(past, past)], hermitian=True)
     theta = inverse @ gram[np.ix_(past, now)]
-    rest = np.maximum(np.diag(gram[np.ix_(now, now)] - theta.T @ gram[np.ix_(past, now)]), 1e-300)
+    whole = np.diag(gram)[now]
+    rest = np.maximum(whole - np.einsum("ij,ij->j", theta, gram[np.ix_(past, now)]), EXPLAINED * whole + 1e-300)
     for lag in range(lags):
         block = slice(1 + lag * p, 1 + (lag + 1) * p)
         weight = np.linalg.pinv(inverse[block, block], hermitian=True)
@@ -138,20 +144,16 @@ def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
     Raises:
         RankError: the record is too short or does not excite the functions.
     """
-    families = [Family.of(data, c, FEW, 0) for c in range(data.m)]
-    p, outs = sum(family.size for family in families), data.l
-    alpha = BLOCK_ROWS
-    while alpha > FEWEST and 6 * alpha * (p + outs) > data.n_samples:
-        alpha -= 1
-    statistics = _statistics(data, families, 3 * alpha, delay)
-    z = np.concatenate([[0], statistics.at(range(p), range(2 * alpha))])
-    phi = np.concatenate([[0], statistics.at(range(p), range(alpha, 2 * alpha))])
-    y = statistics.at(range(p, p + outs), range(alpha, 2 * alpha))
-    order = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=(alpha - 1) * outs).order
-    if order == 0:
+    records, signals = _signals(data, delay)
+    alpha = int(np.clip(data.n_samples // (6 * len(signals.names)), FEWEST, BLOCK_ROWS))
+    statistics, largest = _statistics(records, signals, 3 * alpha), (alpha - 1) * data.l
+    z, phi, y = signals.positions(statistics.at, "inputs", alpha)
+    ranks = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=largest)
+    if ranks.order == 0:
         return np.zeros(0, dtype=complex)
-    observability = rq(statistics, z, phi, y).decomposition[0][:, : min(order + SPARE, (alpha - 1) * outs)]
-    a = np.linalg.lstsq(observability[:-outs], observability[outs:])[0]
+    order = ranks.order if ranks.exact else min(ranks.order + SPARE, largest)
+    observability = rq(statistics, z, phi, y).decomposition[0][:, :order]
+    a = np.linalg.lstsq(observability[: -data.l], observability[data.l :])[0]
     poles = np.asarray(np.linalg.eigvals(a), dtype=complex)
     radius = min(RADIUS, 1 - SLOWEST / data.n_samples)
     return poles * np.minimum(1.0, radius / np.maximum(np.abs(poles), 1e-300))
@@ -189,15 +191,17 @@ def convolved(values: Array, filters: Array) -> Array:
     return found
 
 
-def _statistics(data: Data, families: Sequence[Family], rows: int, delay: int) -> HankelStatistics:
-    m = data.m
-
-    def expand(raw: Array) -> Array:
-        return np.hstack([*(family.values(raw[:, c]) for c, family in enumerate(families)), raw[:, m:]])
-
+def _signals(data: Data, delay: int) -> tuple[Sequence[Array], Expansion]:
+    """Raw channels [u | y], the outputs that many samples earlier, and their expansion in a few functions."""
     # windows without a gap would be few; interpolation adds noise and a zero, but leaves the poles where they are
     records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
-    return hankel_statistics([r for r in records if len(r) >= rows] or records, rows, expand, centre="mean")
+    families: Any = tuple(Family.of(data, c, FEW, 0) for c in range(data.m))
+    return records, Expansion(families, (), data.inputs, data.outputs)
+
+
+def _statistics(records: Sequence[Array], signals: Expansion, rows: int) -> HankelStatistics:
+    long = [record for record in records if len(record) >= rows]
+    return hankel_statistics(long or records, rows, signals, names=signals.names, centre="mean")
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,23 +244,18 @@ class Design:
         """Functions and filters by input."""
         return tuple((family.size, self.filters.shape[1]) for family in self.families)
 
-    def stretches(self, o: int, before: int = 0, among: Sequence[int] | None = None
-                  ) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
-        """Yield inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
+    def stretches(self, o: int, before: int = 0) -> Iterator[tuple[int, Array, Array, NDArray[np.bool_]]]:
+        """Yield experiment, inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
 
-        Args:
-            o: the output.
-            before: rows repeated from the stretch before.
-            among: experiments; all when not given.
+        The first `before` rows of every stretch are those before it, once more.
         """
         reach = len(self.filters) - 1
-        for i in range(len(self.u)) if among is None else among:
-            e, u = self.data.experiments[i], self.u[i]
+        for i, (e, u) in enumerate(zip(self.data.experiments, self.u)):
             lost = np.isnan(e.u).any(axis=1).astype(float)
             valid = (np.convolve(lost, np.ones(self.heavy))[: len(u)] < 0.5) & ~np.isnan(e.y[:, o])
             for start in range(reach + before, len(u), CHUNK):
                 rows = slice(start - before, min(start + CHUNK, len(u)))
-                yield u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
+                yield i, u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
 
     def additive(self, u: Array) -> Array:
         """Return [1, filters of functions], (T, 1 + sum P_c J); per input, filters outermost."""
