@@ -192,14 +192,15 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
 
 def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) -> Block:
     """Evaluate the signals of one stretch (T, c)."""
-    missing = np.logical_or.reduce(np.isnan(raw), axis=1)
+    missing = np.isnan(raw @ np.ones(raw.shape[1]))  # sums of rows, by far the fastest in this form
     padded = np.zeros((len(raw) + 2 * frame.reach, centre.size))
     inner = padded[frame.reach : frame.reach + len(raw)]
     for start in range(0, len(raw), chunk):
         part = slice(start, start + chunk)
-        present = ~missing[part] if missing[part].any() else slice(None)
-        if not missing[part].all():
-            inner[part][present] = expand(raw[part][present]) - centre
+        if not missing[part].any():
+            np.subtract(expand(raw[part]), centre, out=inner[part])
+        elif not missing[part].all():
+            inner[part][~missing[part]] = expand(raw[part][~missing[part]]) - centre
     valid = np.pad(rows_present([missing], frame.lags, frame.reach), frame.reach)
     return Block(frame, (Signals.dense(padded),), valid, None, 0)
 

@@ -222,5 +222,5 @@ class Sums(Total):
                 kernels.add_outer(*block.sparse_rows(part), weights, gram)
             else:
                 formed = block.dense_rows(part)
-                gram += formed.T @ (formed * weights[:, None])
+                gram += formed.T @ (formed if block.weights is None else formed * weights[:, None])
         return gram
