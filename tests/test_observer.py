@@ -84,7 +84,7 @@ def columns(form, record, experiment):
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("offset", [False, True])
 def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypatch):
-    monkeypatch.setattr("optid.identify.subspace.realisation.CHUNK", 20)
+    monkeypatch.setattr("optid.identify.subspace.regressors.CHUNK", 20)
     records = records_of(np.random.default_rng(0), [60, 45])
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
@@ -113,7 +113,7 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
     step = observer_problem(records, form)
-    monkeypatch.setattr("optid.identify.subspace.realisation.MANY", np.inf)
+    monkeypatch.setattr("optid.identify.subspace.regressors.MANY", np.inf)
     stacked = observer_problem(records, form)
     scale = np.sqrt(np.outer(np.diag(gram(stacked)), np.diag(gram(stacked))))
     np.testing.assert_allclose(gram(step) / scale, gram(stacked) / scale, atol=1e-11)
