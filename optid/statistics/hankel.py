@@ -17,7 +17,7 @@ from optid.arrays import Array, check_integer
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
 from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
-from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums
 
 Expand = Callable[[Array], Array]
@@ -25,10 +25,6 @@ Expand = Callable[[Array], Array]
 
 CHUNK = 4096
 """Samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time."""
-
-CONDITION_LIMIT = 1e5
-"""Condition number of the scaled windows beyond which their Gram matrix, which squares it, is replaced by a streamed QR
-decomposition: small singular values would drown in its rounding, about 1e-16 times the square of it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,7 @@ from optid.identify.subspace.realisation import ObserverForm, Realisation, obser
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
-from optid.statistics.channels import check_channels
-from optid.statistics.expansion import Expansion
+from optid.statistics.expansion import Expansion, check_channels
 from optid.statistics.hankel import complete_runs
 
 WEAK = 0.1

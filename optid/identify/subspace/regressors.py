@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.statistics.factors import add_to_root, conditioning, root_of_gram
-from optid.statistics.hankel import CONDITION_LIMIT
+from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, root_of_gram
 
 BLOCK = 32
 """Samples whose responses are one product with a Toeplitz matrix."""
