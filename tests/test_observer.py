@@ -7,7 +7,7 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.noise import observer_gain
-from optid.identify.subspace.observability import simulate_clipped
+from optid.identify.subspace.instruments import simulate_clipped
 from optid.identify.subspace.realisation import ObserverForm, observer_problem
 from optid.statistics.expansion import expand
 

@@ -1,7 +1,6 @@
 """The observability matrix of a record: order, weighting, missing outputs and simulated instruments."""
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
-from optid.identify.subspace.imputation import clipping_range, impute
+from optid.identify.subspace.imputation import impute
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
 from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
@@ -27,10 +26,6 @@ WEAK = 0.1
 SCARCE, INTACT = 20, 0.8
 """Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 smaller share than this of all windows."""
-
-GRID, CHUNK = 2001, 8192
-"""Points at which feedback functions are tabulated for simulated instruments, which need not be exact, and samples
-expanded at a time."""
 
 INSIDE = 0.999
 """Modulus to which the poles of an unstable estimate are brought."""
@@ -213,6 +208,8 @@ class _Windows:
             return self
         if not self.expansion.q:
             return replace(self, plan=replace(plan, instruments=plan.instruments.replace("simulated", "inputs")))
+        from optid.identify.subspace.instruments import simulate_clipped  # compiled code is loaded where it is needed
+
         windows = replace(self, plan=replace(plan, instruments="inputs+past"))
         for i in range(plan.iterations):
             try:
@@ -266,35 +263,3 @@ class _Windows:
             raise RankError(f"order {nx}, but the projected outputs have rank {rank}: use nx={rank} or less, more "
                             "block rows or a richer input.")
         return nx, reason
-
-
-def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
-                     ez: Array, d: Array) -> list[Array]:
-    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
-
-    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
-    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
-    """
-    from optid.statistics.subspace_kernels import clipped_run
-
-    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
-    low, high = clipping_range([record[:, m : m + l] for record in records])
-    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
-    start = 0
-    for family in expansion.feedback:
-        e = ez[:, start : start + family.size]
-        grid = np.linspace(low[family.output], high[family.output], GRID)
-        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
-        start += family.size
-    simulated = []
-    open_loop = expansion.without_feedback()
-    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
-    for record in records:
-        out, x = np.empty((len(record), l)), np.zeros(n)
-        for first in range(0, len(record), CHUNK):
-            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
-            eta = np.where(np.isnan(eta), 0.0, eta)
-            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
-                        out[first : first + CHUNK])
-        simulated.append(out)
-    return simulated
