@@ -156,7 +156,7 @@ def nuclear_programme(structured: Structured, penalty: float) -> Program:
     weight = cp.Parameter(nonneg=True, name="weight", value=penalty)
     constraints = {"structure": (inner == matrix,), "residual": (residual == misfit,)}
     view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
-                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.plan.units)
+                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.windows.plan.units)
     return Program(
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,
