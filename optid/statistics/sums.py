@@ -173,10 +173,7 @@ class Sums(Total):
             gram[columns, constant] += total
             gram[constant, columns] += total
         gram[constant, constant] += self._stretched
-        upper = np.triu(gram)
-        symmetric = upper + upper.T
-        np.fill_diagonal(symmetric, np.diag(gram))
-        return symmetric
+        return np.triu(gram) + np.triu(gram, 1).T
 
     def _is_small(self, rows: int, products: float) -> bool:
         return rows * self.frame.n**2 <= products
