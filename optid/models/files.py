@@ -121,14 +121,3 @@ def read_state(
     if head.get("version") != version:
         raise ModelFileError(f"{path} has version {head.get('version')!r}; this optid reads version {version}.")
     return head, arrays
-
-
-def set_arrays(state: Any, arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Give a fresh state the arrays of a file; refuse other types and shapes than its own (`ModelFileError`)."""
-    for name, array in arrays.items():
-        wanted = getattr(state, name)
-        if array.dtype != wanted.dtype or array.shape != wanted.shape:
-            raise ModelFileError(
-                f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} is needed."
-            )
-        setattr(state, name, np.ascontiguousarray(array))

@@ -50,8 +50,6 @@ class RecursiveARX(SavedState):
 
     Attributes:
         layout: the columns of phi.
-        forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
-        dt: sampling time.
         samples: samples seen.
         candidates: rows there would have been, had no sample been missing.
         rows: rows used.
@@ -80,7 +78,7 @@ class RecursiveARX(SavedState):
             inputs: names of the inputs; their number is the number of inputs.
             outputs: names of the outputs.
             dt: sampling time.
-            forgetting: lambda in (0, 1].
+            forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
             theta0: prior estimate: a number, (n,) or (n, l) in the order of `layout.names()`.
             P0: prior covariance over the noise variance: a number, (n,) diagonal or (n, n). Infinity is no prior at
                 all, and then the estimate is that of the batch least squares.
@@ -144,13 +142,9 @@ class RecursiveARX(SavedState):
         return self._absorb(u, y, weights, 0)[0]
 
     def trace(self, u: ArrayLike, y: ArrayLike, every: int = 1, weights: ArrayLike = 1.0) -> Trace:
-        """Take in a block as `update` does and record the estimate on the way.
+        """Take in a block as `update` does, and record the estimate after every so many samples.
 
-        Args:
-            u: as in `update`.
-            y: as in `update`.
-            every: the estimate is recorded after every so many samples, counted from the first one seen.
-            weights: as in `update`.
+        They are counted from the first one seen. The other arguments are those of `update`.
         """
         first, every = self.samples, check_integer(every, "every")
         innovations, theta = self._absorb(u, y, weights, every)

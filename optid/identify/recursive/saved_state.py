@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from optid.errors import ModelFileError, OptidError
-from optid.models.files import read_state, set_arrays, write_state
+from optid.models.files import read_state, write_state
 
 VERSION = 1  # version of the file
 
@@ -54,5 +56,10 @@ class SavedState:
             if "functions=" in str(error):
                 raise
             raise ModelFileError(f"{path}: the settings in the file cannot be read ({error}).") from error
-        set_arrays(state, arrays, path)
+        for name, array in arrays.items():
+            wanted = getattr(state, name)
+            if array.dtype != wanted.dtype or array.shape != wanted.shape:
+                raise ModelFileError(f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} is "
+                                     "needed.")
+            setattr(state, name, np.ascontiguousarray(array))
         return state
