@@ -8,7 +8,8 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.noise import observer_gain
 from optid.identify.subspace.instruments import simulate_clipped
-from optid.identify.subspace.realisation import ObserverForm, observer_problem
+from optid.identify.subspace.realisation import observer_problem
+from optid.identify.subspace.regressors import ObserverForm
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])

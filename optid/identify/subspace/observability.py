@@ -13,7 +13,8 @@ from optid.identify.order.ranks import largest_gap, order_test
 from optid.identify.subspace.imputation import impute
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
-from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
+from optid.identify.subspace.realisation import Realisation, observer_problem
+from optid.identify.subspace.regressors import ObserverForm
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius

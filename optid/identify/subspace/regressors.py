@@ -1,17 +1,24 @@
-"""The rows of the step for (B, D, E, offset, x0): responses of a linear recursion, many samples at a time.
+"""The equations of the step for (B, D, E, offset, x0) with A and C known, in observer form.
 
-Products of matrices take the place of a loop over samples. Rows lie with time along the last axis, so that every copy
-is of long stretches.
+With an observer gain L and F = A - L C the outputs
+
+    y(k) = C F^k x0 + sum_{i<k} C F^(k-1-i) ((B - L D) eta(i) + E zeta(i) + L (y(i) - d)) + D eta(k) + d
+
+are linear in the unknowns, whatever the poles of A. L = 0 minimises the simulation error with measured feedback;
+a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Products of
+matrices take the place of a loop over samples; time is the last axis, so that every copy is of long stretches.
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.statistics.expansion import Expansion
 from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, root_of_gram
+from optid.structures.rank_one import matrices
 
 BLOCK = 32
 """Samples whose responses are one product with a Toeplitz matrix."""
@@ -27,6 +34,78 @@ MANY = 10
 
 HELD = 1 << 22
 """Numbers held at once at most: models with many functions and states take shorter chunks."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverForm:
+    """What is known and how the unknowns are laid out.
+
+    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
+    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
+
+    Attributes:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) observer gain L.
+        expansion: the signals.
+        experiments: number of experiments.
+        feedthrough: whether every input acts on the outputs at once.
+        offset: whether there is a constant d.
+        weights: (l,) by which the residuals are multiplied.
+    """
+
+    a: Array
+    c: Array
+    gain: Array
+    expansion: Expansion
+    experiments: int
+    feedthrough: tuple[bool, ...]
+    offset: bool
+    weights: Array
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.c)
+
+    @property
+    def linear(self) -> int:
+        """Number of unknowns outside the blocks: initial states and offset."""
+        return self.experiments * self.n + self.l * self.offset
+
+    @property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
+        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
+        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
+
+    def thetas(self, z: Array) -> list[Array]:
+        """Return the matrices Theta_i of the unknowns z."""
+        return matrices(z[self.linear :], self.blocks)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.linear + sum(functions * entries for functions, entries in self.blocks)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels in words, those of the feedback last."""
+        x = self.expansion
+        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+
+    def names(self) -> list[str]:
+        """Name the unknowns in words for messages."""
+        named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
+        named += ["the offset"] * (self.l * self.offset)
+        for channel, (p, b) in zip(self.channels, self.blocks):
+            named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
+        return named
 
 
 def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterable[Array]
@@ -83,8 +162,8 @@ class Regressors:
         needed: channels that must be present.
     """
 
-    def __init__(self, form: Any, instruments: bool) -> None:
-        """Lay out the equations of an `ObserverForm`."""
+    def __init__(self, form: ObserverForm, instruments: bool) -> None:
+        """Lay out the equations."""
         self.form, x = form, form.expansion
         self.injected = bool(np.any(form.gain))
         self.extra = form.n * x.q if instruments else 0
