@@ -220,6 +220,10 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
         y = np.clip(C @ x + du @ eta[k] + d, low, high)
         np.testing.assert_allclose(found[k], y, atol=1e-6)  # the feedback is read from a table
         x = 0.3 * A @ x + 0.1 * bu @ eta[k] + ez @ expansion.feedback[0].values(y[None])[0]
+    silent = records[0].copy()
+    silent[:, 2] = np.nan  # an experiment without the output: its range is that of the others
+    np.testing.assert_array_equal(simulate_clipped([records[0], silent], expansion, A, C, bu, du, ez, d)[1],
+                                  simulate_clipped(records, expansion, A, C, bu, du, ez, d)[0])
     (wild,) = simulate_clipped(records, expansion, 2 * A, C, bu, du, 50 * ez, d)
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
 

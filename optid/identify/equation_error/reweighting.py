@@ -56,7 +56,7 @@ def parse_loss(loss: str) -> tuple[str, float]:
         threshold = float(number)
     except ValueError:
         threshold = -1.0
-    if kind != "huber" or not threshold > 0:
+    if kind != "huber" or not 0 < threshold < np.inf:
         raise StructureError(f"loss {loss!r}: only huber takes a threshold, a positive number as in huber:1.345")
     return kind, threshold
 

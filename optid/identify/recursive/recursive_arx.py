@@ -107,18 +107,19 @@ class RecursiveARX(SavedState):
         self.restart()
 
     @classmethod
-    def like(cls, data: Data | Stream, **settings: Any) -> "RecursiveARX":
+    def like(cls, data: Data | Stream, *, basis: Any, **settings: Any) -> "RecursiveARX":
         """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
 
         Args:
             data: the record, in raw units; its samples are not used (see `read`).
-            settings: na, nb, basis and the other arguments of the class.
+            basis: as in the class; one without interval takes the range of its input.
+            settings: na, nb and the other arguments of the class.
 
         Raises:
             DataError: detrended or scaled data.
         """
         _check_raw(data)
-        return cls(basis=fitted_bases(data, settings.pop("basis")), inputs=data.inputs, outputs=data.outputs,
+        return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
                    dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     # -- samples ---------------------------------------------------------------------------------------------------

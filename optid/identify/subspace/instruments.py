@@ -21,7 +21,7 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
     Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
     """
     m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
-    low, high = clipping_range([record[:, m : m + l] for record in records])
+    low, high = clipping_range(np.vstack(records)[:, m : m + l])
     tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
     start = 0
     for family in expansion.feedback:

@@ -65,9 +65,10 @@ def track(
         for j in range(r):
             row[j] = y[j]
         counts[1] += 1
+        mean = sums[1] / sums[0] if sums[0] > 0.0 else 0.0
         sums[0] = forgetting * sums[0] + 1.0
         share = (present - r) / (n - r)
-        sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else sums[1] / max(sums[0] - 1.0, 1.0))
+        sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else mean)
         rotate(root, row, 0, r, fade)
         _gain(root, y, g)
         size = 0.0
