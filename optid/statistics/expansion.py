@@ -276,7 +276,8 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
     m = len(inputs)
     for kind, names, columns in (("input", inputs, slice(0, m)), ("output", outputs, slice(m, None))):
         samples = np.concatenate([record[:, columns] for record in records])
-        samples = samples[~np.isnan(samples @ np.ones(len(names)))]
+        present = ~np.isnan(samples @ np.ones(len(names)))
+        samples = samples if present.all() else samples[present]
         if len(samples) <= len(names) + 1:
             raise DataError(f"only {len(samples)} samples have all {kind}s at once: {len(names)} {kind}s cannot be "
                             "told apart from so few.")
