@@ -30,22 +30,19 @@ from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import Core, reduce
 
 
-def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
-            nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
-            ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+def nuclear(  # noqa: D417 - the other arguments by reference
+    data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+    nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
+    ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm"
+) -> Program | Procedure:
     """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
     shrinks Theta, so a rank-one answer is a start for `hammerstein_arx.exact` rather than its solution.
 
-    Named variables: ``Theta``, ``a``, ``offset``.
+    Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `formulations.hammerstein_arx.exact`.
 
     Args:
-        data: the record.
-        na: number of past outputs in A.
-        nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
-        nk: delay in samples, one per input or one for all.
         weight: weight of the penalty, in units of the objective per unit of Theta.
         constraints: builders in the variables ``a``, ``Theta``, ``offset``.
         loss: "squares", "huber[:threshold in robust standard deviations]" or "l1", all with a dual bound.
@@ -64,26 +61,17 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
                           convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
 
 
-def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
-                     basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
-                     constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
-                     curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+def overparametrised(  # noqa: D417 - the other arguments by reference
+    data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+    nk: int | Sequence[int] = 0, svd: str = "whitened", constraints: Sequence[Any] = (), loss: str = "squares",
+    ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm"
+) -> Program | Procedure:
     """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
-    Named variables: ``Theta``, ``a``, ``offset``.
+    Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `nuclear`.
 
     Args:
-        data: as in `nuclear`.
-        na: as in `nuclear`.
-        nb: as in `nuclear`.
-        basis: as in `nuclear`.
-        nk: as in `nuclear`.
         svd: "whitened" (in the Kronecker metric of the Gram matrix) or "plain" (as in the dissertation).
-        constraints: as in `nuclear`.
-        loss: as in `nuclear`.
-        ridge: as in `nuclear`.
-        curvature: as in `nuclear`.
-        gauge: as in `nuclear`.
 
     Raises:
         StructureError: impossible orders, unknown gauge or split, nonconvex constraints.

@@ -42,7 +42,7 @@ WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
 """Weights tried by default, each the inverse of a noise variance relative to the variance of the outputs."""
 
 
-def nuclear(
+def nuclear(  # noqa: D417 - the other arguments by reference
     data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
     feedback_basis: FeedbackBases = None, form: str = "predictor", weight: float | str | Sequence[float] = "auto",
     noise: float | None = None, hold_out: float = 0.3, offset: bool = True,
@@ -51,14 +51,13 @@ def nuclear(
 ) -> Procedure:
     """Identify a state-space model from a low-rank Hankel matrix found by convex optimisation.
 
-    Named variables: ``output``, ``yhat``.
+    Named variables: ``output``, ``yhat``. Other arguments as in `formulations.hammerstein_ss.sid`.
 
     Args:
         data: the record; missing outputs are estimated, windows with missing inputs left out.
         nx: order, or "auto": chosen with the weight by simulation of the parts held out; with one weight, the number
             of singular values above a thousandth of the largest, at most ten.
         block_rows: block rows, more than the order. None chooses.
-        basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         feedback_basis: basis of the feedback, None for none; needs form "predictor".
         form: "predictor", "projection" or "instruments".
         weight: weight of the misfit, or several, or "auto": the one that simulates the last part of every experiment
@@ -66,12 +65,6 @@ def nuclear(
         noise: standard deviation of the noise in units of the output, instead of a weight (one output, or outputs of
             one size).
         hold_out: part of every experiment kept back to choose a weight.
-        offset: as in `formulations.hammerstein_ss.sid`.
-        feedthrough: as there.
-        observer: as there.
-        split: as there.
-        stability: as there.
-        constraints: rules about poles and about coefficients, as there.
 
     Raises:
         StructureError: words or orders that do not fit, or a record too long for the method.
@@ -156,7 +149,7 @@ def nuclear_programme(structured: Structured, penalty: float) -> Program:
     weight = cp.Parameter(nonneg=True, name="weight", value=penalty)
     constraints = {"structure": (inner == matrix,), "residual": (residual == misfit,)}
     view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
-                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.plan.units)
+                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.windows.plan.units)
     return Program(
         "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,

@@ -43,7 +43,7 @@ def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
     shape = form.n if form.experiments == 1 else (form.n, form.experiments)
     linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
                                                       if form.offset else {})
-    names = [realisation.names(i) for i in range(len(form.blocks))]
+    names = realisation.names
     if realisation.factored:
         mus = [cp.Variable(p, name=mu) for (mu, _, _), (p, _) in zip(names, form.blocks)]
         bs = [cp.Variable(entries, name=b) for (_, b, _), (_, entries) in zip(names, form.blocks)]
@@ -72,7 +72,7 @@ def _view(realisation: Realisation, units: Transform, variables: dict[str, Any],
           ) -> View:
     """Return what constraints may speak about; Theta_i is (P, n + l) or, without feedthrough, (P, n)."""
     form, x, n = realisation.form, realisation.form.expansion, realisation.form.n
-    expressions = variables | {realisation.names(i)[2]: theta for i, theta in enumerate(thetas)}
+    expressions = variables | {name: theta for (_, _, name), theta in zip(realisation.names, thetas)}
     inner = [theta[:, :n].T for theta in thetas]
     direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
               for theta, direct in zip(thetas, form.feedthrough)]

@@ -174,7 +174,7 @@ def test_blocks_against_projectors(form, tolerance, future):
     np.testing.assert_allclose(found.gain, y @ np.linalg.pinv(phi), atol=1e-8)
     left, own = np.linalg.svd(perp)[0][:, :2], found.decomposition[0][:, :2]
     np.testing.assert_allclose(own @ own.T, left @ left.T, atol=1e-7)
-    assert found.windows == 400 - 2 * s + 1 and found.discarded == 0
+    assert statistics.windows == 400 - 2 * s + 1 and found.discarded == 0
 
 
 def test_centred_statistics_ask_for_the_constant():

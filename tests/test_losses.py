@@ -123,7 +123,8 @@ def test_without_outliers_a_wide_huber_is_least_squares():
 
 
 @pytest.mark.parametrize("loss, words", [("hubr", "Did you mean 'huber'"), ("huber:x", "positive number"),
-                                         ("huber:-1", "positive number"), ("l1:2", "only huber"), (3, "'3'|3")])
+                                         ("huber:-1", "positive number"), ("huber:inf", "positive number"),
+                                         ("l1:2", "only huber"), (3, "'3'|3")])
 def test_unknown_losses(loss, words):
     with pytest.raises(StructureError, match=words):
         losses.parse_loss(loss)

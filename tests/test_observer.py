@@ -7,8 +7,9 @@ from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.noise import observer_gain
-from optid.identify.subspace.observability import simulate_clipped
-from optid.identify.subspace.realisation import ObserverForm, observer_problem
+from optid.identify.subspace.instruments import simulate_clipped
+from optid.identify.subspace.realisation import observer_problem
+from optid.identify.subspace.regressors import ObserverForm
 from optid.statistics.expansion import expand
 
 A = np.array([[0.8, 0.3], [-0.3, 0.7]])
@@ -84,7 +85,7 @@ def columns(form, record, experiment):
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("offset", [False, True])
 def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypatch):
-    monkeypatch.setattr("optid.identify.subspace.realisation.CHUNK", 20)
+    monkeypatch.setattr("optid.identify.subspace.regressors.CHUNK", 20)
     records = records_of(np.random.default_rng(0), [60, 45])
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
@@ -113,7 +114,7 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
     step = observer_problem(records, form)
-    monkeypatch.setattr("optid.identify.subspace.realisation.MANY", np.inf)
+    monkeypatch.setattr("optid.identify.subspace.regressors.MANY", np.inf)
     stacked = observer_problem(records, form)
     scale = np.sqrt(np.outer(np.diag(gram(stacked)), np.diag(gram(stacked))))
     np.testing.assert_allclose(gram(step) / scale, gram(stacked) / scale, atol=1e-11)
@@ -219,6 +220,10 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
         y = np.clip(C @ x + du @ eta[k] + d, low, high)
         np.testing.assert_allclose(found[k], y, atol=1e-6)  # the feedback is read from a table
         x = 0.3 * A @ x + 0.1 * bu @ eta[k] + ez @ expansion.feedback[0].values(y[None])[0]
+    silent = records[0].copy()
+    silent[:, 2] = np.nan  # an experiment without the output: its range is that of the others
+    np.testing.assert_array_equal(simulate_clipped([records[0], silent], expansion, A, C, bu, du, ez, d)[1],
+                                  simulate_clipped(records, expansion, A, C, bu, du, ez, d)[0])
     (wild,) = simulate_clipped(records, expansion, 2 * A, C, bu, du, 50 * ez, d)
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
 

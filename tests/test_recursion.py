@@ -10,7 +10,7 @@ from optid.data.record import Data
 from optid.errors import DataError, ModelFileError, RankError, StructureError
 from optid.examples import example
 from optid.identify.recursive import RecursiveARX
-from optid.statistics import collect
+from optid.statistics import collect, factorise
 
 INSIDE = (-1.0, 1.0)
 
@@ -117,7 +117,7 @@ def test_agrees_with_the_batch_fit_when_nothing_is_forgotten(case):
     recursion, (u, y) = started(case)
     recursion.update(u, y)
     layout = recursion.layout
-    batch = collect(Data(u, y, inputs=layout.inputs, outputs=layout.outputs), layout, method="qr")
+    batch = factorise(Data(u, y, inputs=layout.inputs, outputs=layout.outputs), layout)
     n = layout.n_columns
     expected = np.linalg.solve(batch.root[:n, :n], batch.root[:n, n:])
     np.testing.assert_allclose(recursion.theta, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
@@ -140,7 +140,7 @@ def test_a_second_record_continues_the_first():
     data = Data([first[0], second[0]], [first[1], second[1]])
     recursion = RecursiveARX(**CASES["triangular"])
     innovations = recursion.read(data)
-    batch = collect(data, recursion.layout, method="qr")
+    batch = factorise(data, recursion.layout)
     np.testing.assert_allclose(recursion.statistics.gram, batch.gram, atol=1e-9)
     assert [len(e) for e in innovations] == [300, 300] and np.isnan(innovations[1][:2]).all()
     carried_on = RecursiveARX(**CASES["triangular"])
@@ -312,7 +312,7 @@ def test_a_million_samples_do_not_drift():
     # 0.999^60000 is 1e-26: earlier samples do not count
     late = Data(u[-60000:], y[-60000:])
     weights = 0.999 ** np.arange(len(late.u) - 1, -1, -1)
-    batch = collect(late, fading.layout, [weights], method="qr").root
+    batch = factorise(late, fading.layout, [weights]).root
     np.testing.assert_allclose(fading.theta, np.linalg.solve(batch[:k, :k], batch[:k, k:]), rtol=0, atol=1e-11)
     np.testing.assert_allclose(fading.root, batch, rtol=0, atol=1e-11 * np.abs(batch).max())
     assert np.linalg.eigvalsh(fading.P).min() > 0

@@ -241,13 +241,13 @@ def test_root_is_upper_triangular_and_squares_to_the_gram():
     data = random_data(rng, [800], 1, 3, offset=100.0)
     scaled = Data(u=data.u, y=data.y * [1e-3, 1.0, 1e4])
     layout = layout_of(scaled, (Triangular(5),), 1, [2], [0])
-    for statistics in (collect(scaled, layout, method="gram"), collect(scaled, layout, method="qr")):
+    for statistics in (accumulate(scaled, layout), factorise(scaled, layout)):
         root = statistics.root
         assert (np.tril(root, -1) == 0).all() and (np.diag(root) >= 0).all()
         norms = np.sqrt(np.diag(statistics.gram))
         np.testing.assert_allclose((root.T @ root) / norms[:, None] / norms,
                                    statistics.gram / norms[:, None] / norms, atol=1e-13)
-    both = [collect(scaled, layout, method=method).root for method in ("gram", "qr")]
+    both = [take(scaled, layout).root for take in (accumulate, factorise)]
     np.testing.assert_allclose(both[0] / norms, both[1] / norms, atol=1e-9)
 
 
@@ -274,13 +274,13 @@ def test_falls_back_to_qr_and_says_so():
     assert collect(random_data(rng, [500], 2, 1), well).method == "gram"
 
 
-@pytest.mark.parametrize("method", ["auto", "gram", "qr"])
-def test_dependent_columns_are_named(method):
+@pytest.mark.parametrize("take", [collect, accumulate, factorise])
+def test_dependent_columns_are_named(take):
     u = np.random.default_rng(8).uniform(-1, 1, 500)
     data = Data(u=np.column_stack([u, -u]), y=u**2, inputs=["left", "right"])
     layout = Layout(na=0, nb=(2, 1), nk=(0, 1), bases=(Linear(), Linear()), outputs=("y",), inputs=("left", "right"))
     with pytest.raises(RankError, match=r"linear1\(right\(k-1\)\) .* depends on linear1\(left\(k-1\)\)"):
-        _ = collect(data, layout, method=method).root
+        _ = take(data, layout).root
 
 
 def test_silent_function_is_named():
@@ -367,8 +367,6 @@ def test_arguments_are_refused():
     layout = Layout(**good)
     with pytest.raises(DataError, match="The data have 1 inputs"):
         collect(Data(u=data.u[:, 0], y=data.y), layout)
-    with pytest.raises(StructureError, match="method"):
-        collect(data, layout, method="fast")
     for threads in (0, True, 1.5):
         with pytest.raises(StructureError, match="threads"):
             collect(data, layout, threads=threads)

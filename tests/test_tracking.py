@@ -174,6 +174,14 @@ def test_one_update_with_a_missing_entry_by_hand():
     assert tracker.W == pytest.approx(other.W, abs=1e-12)
 
 
+def test_a_sample_without_an_entry_to_spare_says_nothing_of_the_noise():
+    tracker = SubspaceTracker(5, 2, forgetting=0.9)
+    tracker.update(np.random.default_rng(1).normal(size=(20, 5)))
+    before = tracker.floor
+    tracker.update([0.4, -1.0, np.nan, np.nan, np.nan])
+    assert tracker.counts.tolist() == [21, 21, 0] and tracker.floor == pytest.approx(before, rel=1e-12)
+
+
 def test_samples_that_do_not_determine_their_coordinates_are_passed_over():
     tracker = SubspaceTracker(4, 2, start=np.eye(4)[:, :2])
     x = np.array([[np.nan, 1.0, 2.0, 3.0], [np.nan, np.nan, np.nan, 1.0], [np.nan] * 4, [1.0, 2.0, 3.0, 4.0]])

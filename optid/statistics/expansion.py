@@ -17,6 +17,7 @@ from optid.bases import Bases, FeedbackBases, feedback_bases, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
+from optid.statistics.factors import ROUNDING, root_of_rows
 from optid.statistics.hankel import hankel_statistics
 
 SMALLEST = 1e-6
@@ -258,3 +259,36 @@ def _nearly_linear(basis: Basis, name: str, share: float) -> str:
 
 def _family(basis: Basis) -> str:
     return type(basis).__name__.lower()
+
+
+def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    """Refuse constant outputs, and channels that are sums of multiples of others.
+
+    Args:
+        records: (N, m + l) arrays [u | y], one per experiment; NaN = missing.
+        inputs: m names.
+        outputs: l names.
+
+    Raises:
+        DataError: an output that never changes.
+        RankError: an input that the other inputs and a constant give exactly, or an output that other outputs give.
+    """
+    m = len(inputs)
+    for kind, names, columns in (("input", inputs, slice(0, m)), ("output", outputs, slice(m, None))):
+        samples = np.concatenate([record[:, columns] for record in records])
+        present = ~np.isnan(samples @ np.ones(len(names)))
+        samples = samples if present.all() else samples[present]
+        if len(samples) <= len(names) + 1:
+            raise DataError(f"only {len(samples)} samples have all {kind}s at once: {len(names)} {kind}s cannot be "
+                            "told apart from so few.")
+        root = root_of_rows(np.hstack([np.ones((len(samples), 1)), samples]))
+        for c, name in enumerate(names, start=1):
+            if np.abs(root[c, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
+                if np.linalg.norm(root[1 : c + 1, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
+                    raise DataError(f"{kind} {name!r} is constant: leave the channel out, or use a record in which it "
+                                    "moves.")
+                shares = np.linalg.lstsq(root[:c, :c], root[:c, c], rcond=None)[0][1:]
+                sizes = np.abs(shares) * np.linalg.norm(root[1:, 1:c], axis=0)
+                partners = [str(names[j]) for j in np.argsort(-sizes) if sizes[j] > 1e-6 * sizes.max()]
+                raise RankError(f"{kind} {name!r} is a sum of multiples of {', '.join(partners)} and a constant: their "
+                                "effects cannot be told apart. Leave one channel out.")

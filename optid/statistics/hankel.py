@@ -17,7 +17,7 @@ from optid.arrays import Array, check_integer
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
 from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
-from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums
 
 Expand = Callable[[Array], Array]
@@ -25,10 +25,6 @@ Expand = Callable[[Array], Array]
 
 CHUNK = 4096
 """Samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time."""
-
-CONDITION_LIMIT = 1e5
-"""Condition number of the scaled windows beyond which their Gram matrix, which squares it, is replaced by a streamed QR
-decomposition: small singular values would drown in its rounding, about 1e-16 times the square of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,14 +188,15 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
 
 def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) -> Block:
     """Evaluate the signals of one stretch (T, c)."""
-    missing = np.logical_or.reduce(np.isnan(raw), axis=1)
+    missing = np.isnan(raw @ np.ones(raw.shape[1]))  # sums of rows, by far the fastest in this form
     padded = np.zeros((len(raw) + 2 * frame.reach, centre.size))
     inner = padded[frame.reach : frame.reach + len(raw)]
     for start in range(0, len(raw), chunk):
         part = slice(start, start + chunk)
-        present = ~missing[part] if missing[part].any() else slice(None)
-        if not missing[part].all():
-            inner[part][present] = expand(raw[part][present]) - centre
+        if not missing[part].any():
+            np.subtract(expand(raw[part]), centre, out=inner[part])
+        elif not missing[part].all():
+            inner[part][~missing[part]] = expand(raw[part][~missing[part]]) - centre
     valid = np.pad(rows_present([missing], frame.lags, frame.reach), frame.reach)
     return Block(frame, (Signals.dense(padded),), valid, None, 0)
 

@@ -133,21 +133,18 @@ class Statistics:
                           DataWarning, stacklevel=3)
 
 
-def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None,
-            method: Literal["auto", "gram", "qr"] = "auto", chunk: int = CHUNK, threads: int | None = None
-            ) -> Statistics:
+def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | None = None, chunk: int = CHUNK,
+            threads: int | None = None) -> Statistics:
     """Take the statistics of a record that determines the parameters.
 
-    A row is used when every sample it touches is present, in all inputs and outputs.
+    A row is used when every sample it touches is present, in all inputs and outputs. The Gram matrix is replaced by a
+    streamed QR decomposition, slower and with twice the digits, when `condition` exceeds 1e7 or the unexplained share
+    of an output is so small that rounding reaches it; `Statistics.method` says which it was.
 
     Args:
         data: experiments in memory, or a stream that can be read twice.
         layout: the columns.
         weights: one array (N,) per experiment, weight >= 0 of the row of each sample; None for ones. Not for streams.
-        method: "gram" in one pass; "qr" by QR decomposition of the factor so far stacked on the next rows, slower and
-            with twice the digits; "auto" takes the Gram matrix first and "qr" when `condition` exceeds 1e7 or the
-            unexplained share of an output is so small that rounding reaches it.
-            `Statistics.method` says which it was.
         chunk: samples evaluated at a time.
         threads: threads that sum up Gram matrices while the record is read; None for one per core. The result is the
             same to the last digit whatever their number, and a short record takes one.
@@ -160,15 +157,9 @@ def collect(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | No
     Warns:
         DataWarning: less than half of the rows are left by missing samples.
     """
-    if method not in ("auto", "gram", "qr"):
-        raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
-    if method == "qr":
-        statistics = factorise(data, layout, weights, chunk)
-        statistics.check()
-        return statistics
     statistics = accumulate(data, layout, weights, chunk, threads)
     statistics.check()
-    if method == "auto" and (statistics.condition > CONDITION_LIMIT or statistics.remainder < LEAST_REMAINDER):
+    if statistics.condition > CONDITION_LIMIT or statistics.remainder < LEAST_REMAINDER:
         statistics = factorise(data, layout, weights, chunk)
         _ = statistics.root  # refuses dependent columns by name
     return statistics

@@ -34,7 +34,6 @@ class RQ:
         gain: (y, p) H = R21 R11^-1 in units of the signals.
         condition: condition number of the projected regressors, their rows scaled to the norm of the regressors
             themselves: it grows with the record where instruments and regressors are not correlated.
-        windows: number of Hankel columns.
         discarded: directions of the regressors that a tolerance left out.
         triangle: (z, z) triangular factor of the instruments.
         projected: (p, z) regressors on the orthonormal instruments, and (y, z) outputs.
@@ -44,7 +43,6 @@ class RQ:
     residual: Array
     gain: Array
     condition: float
-    windows: int
     discarded: int
     triangle: Array
     projected: tuple[Array, Array]
@@ -52,8 +50,7 @@ class RQ:
     @cached_property
     def decomposition(self) -> tuple[Array, Array, Array]:
         """Left vectors, singular values and right vectors (as rows) of r22."""
-        left, values, right = np.linalg.svd(self.r22)
-        return left, values, right
+        return np.linalg.svd(self.r22)
 
     @property
     def singular_values(self) -> Array:
@@ -119,5 +116,4 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
         kept = int(np.sum(values > tolerance * values[0]))
         r22, discarded = l31 @ right[kept:].T, phi.size - kept
         gain = (l31 @ right[:kept].T / values[:kept]) @ left[:, :kept].T
-    return RQ(r22, residual.T, gain / size, condition, statistics.windows, discarded, triangle[: z.size, : z.size],
-              (l21, l31))
+    return RQ(r22, residual.T, gain / size, condition, discarded, triangle[: z.size, : z.size], (l21, l31))

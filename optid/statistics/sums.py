@@ -173,10 +173,7 @@ class Sums(Total):
             gram[columns, constant] += total
             gram[constant, columns] += total
         gram[constant, constant] += self._stretched
-        upper = np.triu(gram)
-        symmetric = upper + upper.T
-        np.fill_diagonal(symmetric, np.diag(gram))
-        return symmetric
+        return np.triu(gram) + np.triu(gram, 1).T
 
     def _is_small(self, rows: int, products: float) -> bool:
         return rows * self.frame.n**2 <= products
@@ -222,5 +219,5 @@ class Sums(Total):
                 kernels.add_outer(*block.sparse_rows(part), weights, gram)
             else:
                 formed = block.dense_rows(part)
-                gram += formed.T @ (formed * weights[:, None])
+                gram += formed.T @ (formed if block.weights is None else formed * weights[:, None])
         return gram

@@ -56,7 +56,7 @@ def parse_loss(loss: str) -> tuple[str, float]:
         threshold = float(number)
     except ValueError:
         threshold = -1.0
-    if kind != "huber" or not threshold > 0:
+    if kind != "huber" or not 0 < threshold < np.inf:
         raise StructureError(f"loss {loss!r}: only huber takes a threshold, a positive number as in huber:1.345")
     return kind, threshold
 
@@ -91,10 +91,11 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
     problem, base = whole, pose(whole)
     scale = base.scale  # the weights of a pass are no unit of the data
 
-    def weighted(weights: list[np.ndarray], start: Any) -> Program:
-        """Pose a weighted pass: the answer before is the best start, and no proof belongs to it."""
+    def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
+        """Pose a pass, and return its weights: the answer before is the best start, and no proof belongs to it."""
+        weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics)
-        return replace(pose(compressed), start=start, certify=None, scale=scale)
+        return replace(pose(compressed), start=start, certify=None, scale=scale), weights
 
     while True:
         if used.weights is not None:
@@ -109,9 +110,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
             errors = used.residuals(problem, solution)
             spread = max(float(np.nanmedian(np.concatenate(_sizes(errors)))) / NORMAL_MEDIAN, 1e-300)
             width = spread * (1.0 if kind == "l1" else threshold)
-            start = dict(solution.values) if weights else base.start
-            weights = used.only(_weights(r, kind, width) for r in _sizes(errors))
-            program = weighted(weights, start)
+            program, weights = weighted(_sizes(errors), dict(solution.values) if weights else base.start)
         if not used.leave_out(errors, problem.regression(solution.values)):
             break
     best = gap = np.inf
@@ -131,8 +130,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
             break
         best, gap = min(best, found.objective) if final else np.inf, now
         final = width <= spread * threshold
-        weights = used.only(_weights(r, kind, width) for r in sizes)
-        program = weighted(weights, dict(solution.values))
+        program, weights = weighted(sizes, dict(solution.values))
     return replace(found, figures=used.figures(kind, problem.units.y_scale[0] * width))
 
 

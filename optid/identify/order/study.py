@@ -16,8 +16,7 @@ from optid.identify.order.lags import LagScan, scan_lags
 from optid.identify.order.ranks import RankTest, order_test
 from optid.identify.order.states import StateCriteria, state_criteria
 from optid.registry import render
-from optid.statistics.channels import check_channels
-from optid.statistics.expansion import Expansion, expand
+from optid.statistics.expansion import Expansion, check_channels, expand
 from optid.statistics.hankel import hankel_statistics
 
 FEWEST, PER_ROW = 2, 1.5

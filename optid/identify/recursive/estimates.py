@@ -46,14 +46,12 @@ class Trace:
         known = np.asarray(np.isfinite(self.theta).all(axis=(1, 2)))
         basis, cols = self.layout.bases[c], self.layout.nb[c] * self.layout.l
         mu, b, ratio = (np.full((len(known), *s), np.nan) for s in ((basis.size,), (cols,), ()))
-        stack = [theta_matrices(theta, self.layout)[c] for theta in self.theta[known]]
-        if stack:
-            left, size, right = np.linalg.svd(np.stack(stack), full_matrices=False)
-            sign = np.where(right[:, 0, 0] < 0, -1.0, 1.0)
-            mu[known] = beta * (sign * size[:, 0])[:, None] * left[:, :, 0]
-            b[known] = sign[:, None] * right[:, 0] / beta
-            second = size[:, 1] if size.shape[1] > 1 else np.zeros(len(size))
-            ratio[known] = second / np.where(size[:, 0] > 0, size[:, 0], 1.0)
+        left, size, right = np.linalg.svd(theta_matrices(self.theta[known], self.layout)[c], full_matrices=False)
+        sign = np.where(right[:, 0, 0] < 0, -1.0, 1.0)
+        mu[known] = beta * (sign * size[:, 0])[:, None] * left[:, :, 0]
+        b[known] = sign[:, None] * right[:, 0] / beta
+        second = size[:, 1] if size.shape[1] > 1 else np.zeros(len(size))
+        ratio[known] = second / np.where(size[:, 0] > 0, size[:, 0], 1.0)
         return mu, b, ratio
 
 
@@ -65,7 +63,9 @@ def past_coefficients(theta: Array, layout: Layout) -> Array:
 
 
 def theta_matrices(theta: Array, layout: Layout) -> tuple[Array, ...]:
-    """Return Theta_c (P_c, nb_c l) from the coefficients (n, l)."""
-    blocks = (theta[layout.block(c)].reshape(b, basis.size, -1)
-              for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)))
-    return tuple(block.transpose(1, 2, 0).reshape(block.shape[1], -1) for block in blocks)
+    """Return Theta_c (..., P_c, nb_c l) from the coefficients (..., n, l)."""
+    found, (*several, _, l) = [], theta.shape  # noqa: E741
+    for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)):
+        block = theta[..., layout.block(c), :].reshape(*several, b, basis.size, l)
+        found.append(np.moveaxis(block, -3, -1).reshape(*several, basis.size, l * b))
+    return tuple(found)

@@ -50,8 +50,6 @@ class RecursiveARX(SavedState):
 
     Attributes:
         layout: the columns of phi.
-        forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
-        dt: sampling time.
         samples: samples seen.
         candidates: rows there would have been, had no sample been missing.
         rows: rows used.
@@ -80,7 +78,7 @@ class RecursiveARX(SavedState):
             inputs: names of the inputs; their number is the number of inputs.
             outputs: names of the outputs.
             dt: sampling time.
-            forgetting: lambda in (0, 1].
+            forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
             theta0: prior estimate: a number, (n,) or (n, l) in the order of `layout.names()`.
             P0: prior covariance over the noise variance: a number, (n,) diagonal or (n, n). Infinity is no prior at
                 all, and then the estimate is that of the batch least squares.
@@ -109,18 +107,19 @@ class RecursiveARX(SavedState):
         self.restart()
 
     @classmethod
-    def like(cls, data: Data | Stream, **settings: Any) -> "RecursiveARX":
+    def like(cls, data: Data | Stream, *, basis: Any, **settings: Any) -> "RecursiveARX":
         """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
 
         Args:
             data: the record, in raw units; its samples are not used (see `read`).
-            settings: na, nb, basis and the other arguments of the class.
+            basis: as in the class; one without interval takes the range of its input.
+            settings: na, nb and the other arguments of the class.
 
         Raises:
             DataError: detrended or scaled data.
         """
         _check_raw(data)
-        return cls(basis=fitted_bases(data, settings.pop("basis")), inputs=data.inputs, outputs=data.outputs,
+        return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
                    dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     # -- samples ---------------------------------------------------------------------------------------------------
@@ -144,13 +143,9 @@ class RecursiveARX(SavedState):
         return self._absorb(u, y, weights, 0)[0]
 
     def trace(self, u: ArrayLike, y: ArrayLike, every: int = 1, weights: ArrayLike = 1.0) -> Trace:
-        """Take in a block as `update` does and record the estimate on the way.
+        """Take in a block as `update` does, and record the estimate after every so many samples.
 
-        Args:
-            u: as in `update`.
-            y: as in `update`.
-            every: the estimate is recorded after every so many samples, counted from the first one seen.
-            weights: as in `update`.
+        They are counted from the first one seen. The other arguments are those of `update`.
         """
         first, every = self.samples, check_integer(every, "every")
         innovations, theta = self._absorb(u, y, weights, every)

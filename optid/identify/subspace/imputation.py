@@ -27,10 +27,9 @@ BEYOND = 0.2
 """Estimated outputs are clipped to the range of the record, wider by this share of it on either side."""
 
 
-def clipping_range(outputs: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the limits (l,) of simulated outputs: those of outputs (N, l) on record, and `BEYOND`."""
-    low = np.nanmin([np.nanmin(y, axis=0) for y in outputs], axis=0)
-    high = np.nanmax([np.nanmax(y, axis=0) for y in outputs], axis=0)
+def clipping_range(outputs: Array) -> tuple[Array, Array]:
+    """Return the limits (l,) of simulated outputs: those of the outputs (N, l) on record, and `BEYOND`."""
+    low, high = np.nanmin(outputs, axis=0), np.nanmax(outputs, axis=0)
     return low - BEYOND * (high - low), high + BEYOND * (high - low)
 
 
@@ -66,7 +65,7 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> tupl
     stacked = np.vstack(outputs)
     if np.any(np.sum(~np.isnan(stacked), axis=0) < 2):
         raise RankError("an output has fewer than two samples: leave it out")
-    spread, (low, high) = np.nanstd(stacked, axis=0), clipping_range([stacked])
+    spread, (low, high) = np.nanstd(stacked, axis=0), clipping_range(stacked)
     filled, count, change, rounds = [interpolated(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
     while rounds < ROUNDS and change > SETTLED:
         rounds += 1

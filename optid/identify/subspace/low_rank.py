@@ -9,14 +9,13 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.subspace.observability import Observability, prepared
+from optid.identify.subspace.observability import Observability, Windows
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
 from optid.identify.validation import fit_percent
 from optid.identify.validation.predictions import MEASURED, SIMULATION, simulated
 from optid.program.program import Program
 from optid.program.solution import Solution
-from optid.statistics.expansion import Expansion
 from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
 
 Values = Mapping[str, Array]
@@ -31,16 +30,14 @@ class Structured:
     """The structured problem of a record, in outputs of mean zero and unit variance.
 
     Attributes:
-        plan: what was asked for.
-        expansion: the signals.
+        windows: the record.
         problem: the numbers.
         centre: (l,) subtracted from the outputs.
         scale: (l,) by which they were divided.
         size: largest singular value of the matrix of the measured outputs.
     """
 
-    plan: Plan
-    expansion: Expansion
+    windows: Windows
     problem: NuclearProblem
     centre: Array
     scale: Array
@@ -68,16 +65,15 @@ class Structured:
         return left * np.tile(self.scale, problem.rows)[:, None], sizes
 
     def observability(self, values: Values, parts: tuple[Array, Array], nx: int) -> Observability:
-        """Return the observability matrix of a decomposed point, in coordinates with states of about unit size."""
-        gamma = self._gamma(values, *parts, nx)
-        return Observability(self.plan, self.plan.records, self.expansion, gamma, self.scale)
+        """Return the observability matrix of a decomposed point, in coordinates with states of about unit size.
 
-    def _gamma(self, values: Values, vectors: Array, sizes: Array, nx: int) -> Array:
-        """What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T."""
+        What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T.
+        """
+        vectors, sizes = parts
         found = vectors[:, :nx] * np.sqrt(sizes[:nx]) / self.problem.shape[1] ** 0.25
         predictor, l = self.problem.predictor, self.problem.l  # noqa: E741
         if predictor is None:
-            return found
+            return Observability(self.windows, found, self.scale)
         inner, c = realise(found, l)
         k, signal = predictor.places.T
         first = predictor.windows.shape[1] - l  # the outputs come last
@@ -88,7 +84,7 @@ class Structured:
         a, blocks = inner + gain @ c, [c]
         for _ in range(self.problem.rows - 1):
             blocks.append(blocks[-1] @ a)
-        return np.vstack(blocks)
+        return Observability(self.windows, np.vstack(blocks), self.scale)
 
 
 def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program]
@@ -99,7 +95,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
     parameter "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
-    structured, trials = structure(replace(plan, data=part, block_rows=prepared(plan)[1])), []
+    structured, trials = structure(replace(plan, data=part, block_rows=Windows.of(plan).alpha)), []
     program = pose(structured)
     for weight in weights:
         program.parameters["weight"].value = structured.penalty(weight)
@@ -116,7 +112,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
 
 def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
     """Return the simulation fit in %, on another record, of the models of a point, by order: that asked for, or all."""
-    order, parts, found = structured.plan.order, structured.decomposed(values), {}
+    order, parts, found = structured.windows.plan.order, structured.decomposed(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
     for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
         try:
@@ -141,8 +137,9 @@ def structure(plan: Plan) -> Structured:
         StructureError: feedback in a form other than "predictor", or a record too long.
         RankError: too few usable windows.
     """
-    expansion, alpha = prepared(plan)
-    l, form = expansion.l, plan.instruments  # noqa: E741
+    windows = Windows.of(plan)
+    expansion, alpha, form = windows.expansion, windows.alpha, plan.instruments
+    l = expansion.l  # noqa: E741
     if form != "predictor" and expansion.q:
         raise StructureError(f"form={form!r} projects on the complement of the inputs, which outputs that are fed back "
                              "do not allow: use form='predictor'")
@@ -167,17 +164,17 @@ def structure(plan: Plan) -> Structured:
         raise RankError(f"{len(starts)} usable windows of {alpha + past} samples for {rows} known rows: use a longer "
                         f"record, fewer block rows or fewer functions{remedy}")
     outputs = (y - centre) / scale
-    windows = np.stack([signals[starts + i].T for i in range(alpha)])
+    known = np.stack([signals[starts + i].T for i in range(alpha)])
     problem = NuclearProblem(outputs, starts, alpha)
     if form == "predictor":
         direct = np.repeat([*plan.direct(), False], [*expansion.input_sizes, expansion.q + l])
-        problem = replace(problem, predictor=Predictor(windows, direct, plan.offset))
+        problem = replace(problem, predictor=Predictor(known, direct, plan.offset))
     else:
-        known = windows.reshape(-1, len(starts))
+        known = known.reshape(-1, len(starts))
         known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known
         problem = _weighted(problem, known, np.nan_to_num(np.hstack([signals, outputs])) if past else None)
     measured = problem.matrix(problem.data, problem.explained(problem.hankel(problem.data)))
-    return Structured(plan, expansion, problem, centre, scale, float(np.linalg.norm(measured, 2)))
+    return Structured(windows, problem, centre, scale, float(np.linalg.norm(measured, 2)))
 
 
 def _weighted(problem: NuclearProblem, known: Array, instruments: Array | None) -> NuclearProblem:

@@ -1,7 +1,6 @@
 """The observability matrix of a record: order, weighting, missing outputs and simulated instruments."""
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,15 +10,15 @@ from optid.arrays import Array, check_integer
 from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.order.ranks import largest_gap, order_test
-from optid.identify.subspace.imputation import clipping_range, impute
+from optid.identify.subspace.imputation import impute
 from optid.identify.subspace.plan import BEST, Plan
 from optid.identify.subspace.projection import WEIGHTINGS, Projection, project, realise, weakest_feedback
-from optid.identify.subspace.realisation import ObserverForm, Realisation, observer_problem
+from optid.identify.subspace.realisation import Realisation, observer_problem
+from optid.identify.subspace.regressors import ObserverForm
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
-from optid.statistics.channels import check_channels
-from optid.statistics.expansion import Expansion
+from optid.statistics.expansion import Expansion, check_channels
 from optid.statistics.hankel import complete_runs
 
 WEAK = 0.1
@@ -29,181 +28,73 @@ SCARCE, INTACT = 20, 0.8
 """Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 smaller share than this of all windows."""
 
-GRID, CHUNK = 2001, 8192
-"""Points at which feedback functions are tabulated for simulated instruments, which need not be exact, and samples
-expanded at a time."""
-
 INSIDE = 0.999
 """Modulus to which the poles of an unstable estimate are brought."""
 
 
 @dataclass(frozen=True, eq=False)
-class Observability:
-    """An estimate of the observability matrix, and the record on which the other matrices follow from it.
+class Windows:
+    """The signals of a record in windows of 2 alpha samples.
 
     Attributes:
         plan: what was asked for.
         records: raw channels, with simulated outputs where the expansion reads them.
         expansion: the signals.
-        gamma: (rows l, n) observability matrix, in units of the outputs.
-        scale: (l,) sizes of the outputs, by which it and the residuals are divided.
-        figures: what was measured on the way.
+        alpha: block rows of the past and of the future.
     """
-
-    plan: Plan
-    records: list[Array]
-    expansion: Expansion
-    gamma: Array
-    scale: Array
-    figures: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def scaled(self) -> Array:
-        """Gamma of the outputs divided by their sizes: least squares on it weighs all outputs alike."""
-        return self.gamma / np.tile(self.scale, len(self.gamma) // len(self.scale))[:, None]
-
-    def least_squares(self) -> Array:
-        """Return A (n, n) by least squares."""
-        return realise(self.scaled, len(self.scale))[0]
-
-    def contracted(self) -> Array:
-        """Return A by least squares, contracted where it is unstable: for simulations and comparisons."""
-        a = self.least_squares()
-        radius = spectral_radius(a)
-        return a if radius < 1 else a * (INSIDE / radius)
-
-    def step(self, a: Array, *, instruments: bool = True) -> Realisation:
-        """Compress the least squares for B, D, E, offset and x0 with a given A.
-
-        Args:
-            a: (n, n).
-            instruments: take simulated feedback functions as instruments where the noise may be coloured; where past
-                outputs may be instruments, it is white and least squares has the smaller variance.
-        """
-        plan, c = self.plan, self.gamma[: len(self.scale)].copy()
-        closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
-        # noise of one size at all outputs, which are in units of their own: what states hardly explain counts as noisy
-        level = float(np.mean(np.sum(c**2, axis=1))) * np.eye(len(c))
-        gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
-        form = ObserverForm(a, c, gain, self.expansion, len(self.records), plan.direct(), plan.offset, 1 / self.scale)
-        coloured = instruments and self.expansion.simulated and not plan.instruments.endswith("past")
-        return observer_problem(self.records, form, instruments=coloured,
-                                targets=[record[:, plan.data.m :] for record in plan.records])
-
-    def model(self) -> HammersteinSS:
-        """Return the least-squares model, for comparisons: no constraints, A contracted.
-
-        Raises:
-            RankError: the record does not determine it.
-        """
-        step = self.step(self.contracted())
-        return step.model(self.plan.data, step.start())
-
-
-def prepared(plan: Plan) -> tuple[Expansion, int]:
-    """Return the signals of a plan and its number of block rows, after the checks of its channels.
-
-    Raises:
-        StructureError: an order that the block rows cannot carry.
-        DataError: a constant channel.
-    """
-    expansion, nx = plan.expansion(), plan.order
-    check_channels(plan.records, plan.data.inputs, plan.data.outputs)
-    alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
-             else check_integer(plan.block_rows, "block_rows", 2))
-    if nx is not None and alpha <= nx:
-        raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are needed; use "
-                             f"block_rows={nx + 1} or more, or nx={alpha - 1} or less.")
-    return expansion, alpha
-
-
-def estimate_observability(plan: Plan) -> Observability:
-    """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
-
-    Raises:
-        RankError: the record does not determine the model.
-
-    Warns:
-        DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
-    """
-    expansion, alpha = prepared(plan)
-    windows, imputed = _Windows(plan, plan.records, expansion, alpha), {}
-    if _lacks_windows(plan, expansion, alpha):
-        filled, how = impute(plan.data, lambda records: _preliminary(replace(windows, records=records)))
-        windows, imputed = replace(windows, records=filled), {"missing outputs": how}
-        warnings.warn(f"missing outputs leave too few complete windows of {2 * alpha} samples; {how}. The "
-                      "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
-    windows = windows.instrumented()
-    projection, expansion = windows.projected(), windows.expansion
-    nx, reason = windows.order(projection)
-    figures: dict[str, Any] = {
-        "order": nx, **({"order chosen": reason} if reason else {}), "block rows": alpha,
-        "windows": projection.statistics.windows, **imputed, "instruments": windows.plan.instruments}
-    if plan.weighting == BEST:
-        projection = windows.best_weighting(projection, nx)
-        figures["weighting"] = f"{projection.weighting}: the smallest error on the record"
-    height = 1.0 if plan.weighting == "cva" else plan.units.y_scale[0]  # unit of the singular values
-    figures |= {"singular values": height * projection.values, "condition of R11": projection.blocks.condition}
-    if expansion.simulated:
-        share, output = weakest_feedback(projection, expansion)
-        figures["share of the feedback that the simulated one explains"] = share
-        if share < WEAK:
-            warnings.warn(f"the simulated feedback of output {output!r} explains {100 * share:.1f} % of the measured "
-                          "one: its effect will be uncertain. Use noise='white' where the noise allows it, more "
-                          "iterations or a stronger input.", DataWarning, stacklevel=2)
-    if projection.blocks.discarded:
-        figures["regressor directions left out"] = projection.blocks.discarded
-    return replace(windows.observability(projection, nx), figures=figures)
-
-
-def _lacks_windows(plan: Plan, expansion: Expansion, alpha: int) -> bool:
-    """Whether missing outputs cost many of the windows, and those left are few for the rows of the Hankel matrix.
-
-    Block rows that were asked for stay: what is missing is then refused.
-    """
-    gaps = any(plan.data.missing[name] for name in plan.data.outputs)
-    if not gaps or plan.block_rows is not None and not plan.imputes:
-        return False
-    rows, runs = 2 * alpha, [run for record in plan.records for run in complete_runs(record, 2 * alpha)]
-    complete, candidates = (sum(max(len(part) - rows + 1, 0) for part in parts) for parts in (runs, plan.records))
-    return complete < INTACT * candidates and complete < SCARCE * rows * (expansion.p + expansion.q + expansion.l)
-
-
-def _preliminary(windows: "_Windows") -> HammersteinSS:
-    """Return the model, with its noise model, of records whose missing outputs are estimated."""
-    plan = windows.plan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
-        if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
-            plan = replace(plan, instruments=f"{plan.instruments}+past")
-        found = replace(windows, plan=plan).instrumented().ordered()
-        return with_noise_or_reason(found.model(), plan.data)[0]
-
-
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """Signals in windows of 2 alpha samples."""
 
     plan: Plan
     records: list[Array]
     expansion: Expansion
     alpha: int
 
+    @classmethod
+    def of(cls, plan: Plan) -> "Windows":
+        """Return the signals of a plan and its number of block rows, after the checks of its channels.
+
+        Raises:
+            StructureError: an order that the block rows cannot carry.
+            DataError: a constant channel.
+        """
+        expansion, nx = plan.expansion(), plan.order
+        check_channels(plan.records, plan.data.inputs, plan.data.outputs)
+        alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
+                 else check_integer(plan.block_rows, "block_rows", 2))
+        if nx is not None and alpha <= nx:
+            raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are needed; use "
+                                 f"block_rows={nx + 1} or more, or nx={alpha - 1} or less.")
+        return cls(plan, plan.records, expansion, alpha)
+
+    def are_scarce(self) -> bool:
+        """Whether missing outputs cost many windows, and those left are few for the rows of the Hankel matrix.
+
+        Block rows that were asked for stay: what is missing is then refused.
+        """
+        plan, x, rows = self.plan, self.expansion, 2 * self.alpha
+        gaps = any(plan.data.missing[name] for name in plan.data.outputs)
+        if not gaps or plan.block_rows is not None and not plan.imputes:
+            return False
+        runs = [run for record in self.records for run in complete_runs(record, rows)]
+        complete, candidates = (sum(max(len(part) - rows + 1, 0) for part in parts) for parts in (runs, self.records))
+        return complete < INTACT * candidates and complete < SCARCE * rows * (x.p + x.q + x.l)
+
     def projected(self) -> Projection:
+        """Return the projection with the instruments and the weighting that were asked for."""
         plan = self.plan
         found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
                         form=plan.form, tolerance=plan.tolerance)
         return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
-    def ordered(self) -> Observability:
+    def ordered(self) -> "Observability":
         """Return the observability matrix in the weighting that was asked for."""
         projection = self.projected()
         return self.observability(projection, self.order(projection)[0])
 
-    def observability(self, projection: Projection, nx: int) -> Observability:
-        return Observability(self.plan, self.records, self.expansion, projection.gamma(nx), projection.scale)
+    def observability(self, projection: Projection, nx: int) -> "Observability":
+        """Return the observability matrix of a projection for order nx."""
+        return Observability(self, projection.gamma(nx), projection.scale)
 
-    def instrumented(self) -> "_Windows":
+    def instrumented(self) -> "Windows":
         """Return the same with simulated outputs where these are instruments.
 
         Any preliminary model will do for the simulation, which depends on the inputs alone. The first one has past
@@ -214,6 +105,8 @@ class _Windows:
             return self
         if not self.expansion.q:
             return replace(self, plan=replace(plan, instruments=plan.instruments.replace("simulated", "inputs")))
+        from optid.identify.subspace.instruments import simulate_clipped  # compiled code is loaded where it is needed
+
         windows = replace(self, plan=replace(plan, instruments="inputs+past"))
         for i in range(plan.iterations):
             try:
@@ -226,7 +119,7 @@ class _Windows:
             a = found.contracted()
             step = found.step(a)
             bu, du, ez, d, _ = step.matrices(step.least_squares())
-            outputs = simulate_clipped(raw, found.expansion, a, step.form.c, bu, du, ez, d)
+            outputs = simulate_clipped(raw, found.windows.expansion, a, step.form.c, bu, du, ez, d)
             windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
                               expansion=self.expansion.with_simulated())
         return windows
@@ -269,33 +162,110 @@ class _Windows:
         return nx, reason
 
 
-def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
-                     ez: Array, d: Array) -> list[Array]:
-    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """An estimate of the observability matrix, and the record on which the other matrices follow from it.
 
-    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
-    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
+    Attributes:
+        windows: the record.
+        gamma: (rows l, n) observability matrix, in units of the outputs.
+        scale: (l,) sizes of the outputs, by which it and the residuals are divided.
+        figures: what was measured on the way.
     """
-    from optid.statistics.subspace_kernels import clipped_run
 
-    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
-    low, high = clipping_range([record[:, m : m + l] for record in records])
-    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
-    start = 0
-    for family in expansion.feedback:
-        e = ez[:, start : start + family.size]
-        grid = np.linspace(low[family.output], high[family.output], GRID)
-        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
-        start += family.size
-    simulated = []
-    open_loop = expansion.without_feedback()
-    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
-    for record in records:
-        out, x = np.empty((len(record), l)), np.zeros(n)
-        for first in range(0, len(record), CHUNK):
-            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
-            eta = np.where(np.isnan(eta), 0.0, eta)
-            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
-                        out[first : first + CHUNK])
-        simulated.append(out)
-    return simulated
+    windows: Windows
+    gamma: Array
+    scale: Array
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def scaled(self) -> Array:
+        """Gamma of the outputs divided by their sizes: least squares on it weighs all outputs alike."""
+        return self.gamma / np.tile(self.scale, len(self.gamma) // len(self.scale))[:, None]
+
+    def least_squares(self) -> Array:
+        """Return A (n, n) by least squares."""
+        return realise(self.scaled, len(self.scale))[0]
+
+    def contracted(self) -> Array:
+        """Return A by least squares, contracted where it is unstable: for simulations and comparisons."""
+        a = self.least_squares()
+        radius = spectral_radius(a)
+        return a if radius < 1 else a * (INSIDE / radius)
+
+    def step(self, a: Array, *, instruments: bool = True) -> Realisation:
+        """Compress the least squares for B, D, E, offset and x0 with a given A.
+
+        Args:
+            a: (n, n).
+            instruments: take simulated feedback functions as instruments where the noise may be coloured; where past
+                outputs may be instruments, it is white and least squares has the smaller variance.
+        """
+        plan, records, expansion = self.windows.plan, self.windows.records, self.windows.expansion
+        c = self.gamma[: len(self.scale)].copy()
+        closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
+        # noise of one size at all outputs, which are in units of their own: what states hardly explain counts as noisy
+        level = float(np.mean(np.sum(c**2, axis=1))) * np.eye(len(c))
+        gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
+        form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / self.scale)
+        coloured = instruments and expansion.simulated and not plan.instruments.endswith("past")
+        return observer_problem(records, form, instruments=coloured,
+                                targets=[record[:, plan.data.m :] for record in plan.records])
+
+    def model(self) -> HammersteinSS:
+        """Return the least-squares model, for comparisons: no constraints, A contracted.
+
+        Raises:
+            RankError: the record does not determine it.
+        """
+        step = self.step(self.contracted())
+        return step.model(self.windows.plan.data, step.start())
+
+
+def estimate_observability(plan: Plan) -> Observability:
+    """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
+
+    Raises:
+        RankError: the record does not determine the model.
+
+    Warns:
+        DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
+    """
+    windows, imputed = Windows.of(plan), {}
+    if windows.are_scarce():
+        filled, how = impute(plan.data, lambda records: _preliminary(replace(windows, records=records)))
+        windows, imputed = replace(windows, records=filled), {"missing outputs": how}
+        warnings.warn(f"missing outputs leave too few complete windows of {2 * windows.alpha} samples; {how}. The "
+                      "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
+    windows = windows.instrumented()
+    projection, expansion = windows.projected(), windows.expansion
+    nx, reason = windows.order(projection)
+    figures: dict[str, Any] = {
+        "order": nx, **({"order chosen": reason} if reason else {}), "block rows": windows.alpha,
+        "windows": projection.statistics.windows, **imputed, "instruments": windows.plan.instruments}
+    if plan.weighting == BEST:
+        projection = windows.best_weighting(projection, nx)
+        figures["weighting"] = f"{projection.weighting}: the smallest error on the record"
+    height = 1.0 if plan.weighting == "cva" else plan.units.y_scale[0]  # unit of the singular values
+    figures |= {"singular values": height * projection.values, "condition of R11": projection.blocks.condition}
+    if expansion.simulated:
+        share, output = weakest_feedback(projection, expansion)
+        figures["share of the feedback that the simulated one explains"] = share
+        if share < WEAK:
+            warnings.warn(f"the simulated feedback of output {output!r} explains {100 * share:.1f} % of the measured "
+                          "one: its effect will be uncertain. Use noise='white' where the noise allows it, more "
+                          "iterations or a stronger input.", DataWarning, stacklevel=2)
+    if projection.blocks.discarded:
+        figures["regressor directions left out"] = projection.blocks.discarded
+    return replace(windows.observability(projection, nx), figures=figures)
+
+
+def _preliminary(windows: Windows) -> HammersteinSS:
+    """Return the model, with its noise model, of records whose missing outputs are estimated."""
+    plan = windows.plan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
+        if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
+            plan = replace(plan, instruments=f"{plan.instruments}+past")
+        found = replace(windows, plan=plan).instrumented().ordered()
+        return with_noise_or_reason(found.model(), plan.data)[0]

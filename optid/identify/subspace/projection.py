@@ -38,15 +38,11 @@ class Projection:
     scale: Array
     weighting: str = WEIGHTINGS[0]
 
-    @property
-    def block_rows(self) -> int:
-        """Number of block rows of the future."""
-        return self.statistics.rows // 2
-
     @cached_property
     def decomposition(self) -> tuple[Array, Array]:
         """Left singular vectors of the weighted outputs, the weights undone, and the singular values, largest first."""
-        sizes = np.tile(self.scale, self.block_rows) if self.weighting != "plain" else np.ones(len(self.blocks.r22))
+        scale = self.scale if self.weighting != "plain" else np.ones(len(self.scale))
+        sizes = np.tile(scale, self.statistics.rows // 2)  # the future is the second half of a window
         r22, unweighted = self.blocks.r22 / sizes[:, None], np.diag(sizes)
         if self.weighting == "cva":
             whole = np.concatenate([r22, self.blocks.residual / sizes[:, None]], axis=1)

@@ -43,21 +43,16 @@ def track(
         counts[0] += 1
         residuals[t] = np.nan
         present = 0
+        for j in range(r):
+            y[j] = 0.0
         for i in range(n):
             if not np.isnan(x[t, i]):
                 present += 1
-        if present == 0:
+                for j in range(r):
+                    y[j] += basis[i, j] * x[t, i]
+        if present < r or present < n and not _solved(basis, x[t], factor, y):
             counts[2] += 1
             continue
-        for j in range(r):
-            y[j] = 0.0
-            for i in range(n):
-                if not np.isnan(x[t, i]):
-                    y[j] += basis[i, j] * x[t, i]
-        if present < n:
-            if present < r or not _solved(basis, x[t], factor, y):
-                counts[2] += 1
-                continue
         energy = 0.0
         for i in range(n):
             e[i] = 0.0
@@ -70,29 +65,24 @@ def track(
         for j in range(r):
             row[j] = y[j]
         counts[1] += 1
+        mean = sums[1] / sums[0] if sums[0] > 0.0 else 0.0
         sums[0] = forgetting * sums[0] + 1.0
-        share = (present - r) / (n - r) if n > r else 1.0
-        sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else sums[1] / max(sums[0] - 1.0, 1.0))
+        share = (present - r) / (n - r)
+        sums[1] = forgetting * sums[1] + (energy / share if share > 0.0 else mean)
         rotate(root, row, 0, r, fade)
         _gain(root, y, g)
         size = 0.0
         for j in range(r):
             size += g[j] * g[j]
-        if orthonormal:
-            stretch = np.sqrt(1.0 + energy * size)
-            tau = -energy / (stretch * (1.0 + stretch))
-            scale = 1.0 + tau * size
-            for i in range(n):
-                inside = 0.0
+        stretch = np.sqrt(1.0 + energy * size)
+        tau = -energy / (stretch * (1.0 + stretch)) if orthonormal else 0.0
+        for i in range(n):
+            step = (1.0 + tau * size) * e[i]
+            if orthonormal:
                 for j in range(r):
-                    inside += basis[i, j] * g[j]
-                step = tau * inside + scale * e[i]
-                for j in range(r):
-                    basis[i, j] += step * g[j]
-        else:
-            for i in range(n):
-                for j in range(r):
-                    basis[i, j] += e[i] * g[j]
+                    step += tau * basis[i, j] * g[j]
+            for j in range(r):
+                basis[i, j] += step * g[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

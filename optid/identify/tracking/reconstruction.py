@@ -73,10 +73,8 @@ def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> 
     """
     c = as_covariance(covariance)
     chosen = check_indices(indices, len(c), "indices")
-    values, vectors = _descending(c)
-    return Reconstruction(vectors[:, chosen], float(np.sum(np.delete(values, chosen))),
-                          float(np.sum(values[len(chosen) :])), float(np.sum(values[: len(c) - len(chosen)])),
-                          "sub-optimal")
+    found = constrained_reconstruction(c, len(chosen), within=_descending(c)[1][:, chosen])
+    return replace(found, kind="sub-optimal")
 
 
 def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLike | None = None,
@@ -242,12 +240,12 @@ def filled(x: ArrayLike, basis: ArrayLike | None = None, *, covariance: ArrayLik
         RankError: a sample whose entries do not determine its coordinates, by number.
     """
     samples = np.array(x, dtype=float)
-    rows = samples.reshape(-1, samples.shape[-1]) if samples.ndim in (1, 2) else samples
     if (basis is None) == (covariance is None):
         raise StructureError("Give either a basis or a covariance.")
     n = len(np.asarray(basis if covariance is None else covariance))
-    if rows.ndim != 2 or rows.shape[1] != n:
+    if samples.ndim not in (1, 2) or samples.shape[-1] != n:
         raise DataError(f"x has shape {samples.shape}; samples of {n} coordinates are needed.")
+    rows = samples.reshape(-1, n)  # a view
     if np.isinf(rows).any():
         k, i = (int(v[0]) for v in np.nonzero(np.isinf(rows)))
         raise DataError(f"coordinate {i + 1} is {rows[k, i]} at sample {k}: only NaN marks a missing entry.")
@@ -256,7 +254,7 @@ def filled(x: ArrayLike, basis: ArrayLike | None = None, *, covariance: ArrayLik
         where = np.flatnonzero((missing == pattern).all(axis=1))
         weights = _from_present(pattern, basis, covariance, int(where[0]))
         rows[np.ix_(where, np.flatnonzero(pattern))] = rows[np.ix_(where, np.flatnonzero(~pattern))] @ weights
-    return rows.reshape(samples.shape)
+    return samples
 
 
 def _from_present(pattern: NDArray[np.bool_], basis: ArrayLike | None, covariance: ArrayLike | None, sample: int

@@ -30,12 +30,6 @@ class SubspaceTracker(SavedState):
     coordinates the sample is passed over and counted.
 
     Attributes:
-        n: dimension of the vectors.
-        r: dimension of the subspace.
-        method: "past", nearly orthonormal, or "opast", orthonormal at every sample.
-        forgetting: in (0, 1]; remembers about 1 / (1 - forgetting) samples.
-        missing: "fill" as above, "skip" leaves incomplete samples out, "refuse" raises by name.
-        names: of the coordinates.
         W: (n, r) the basis as the recursion carries it.
         root: (r, r) triangular factor of the weighted sum of y y^T, y = W^T x.
         sums: (2,) weighted count of samples and weighted sum of residual energy.
@@ -55,11 +49,11 @@ class SubspaceTracker(SavedState):
         Args:
             n: dimension of the vectors.
             r: dimension of the subspace, below n.
-            method: "past" or "opast".
-            forgetting: factor on earlier samples, in (0, 1].
+            method: "past", nearly orthonormal, or "opast", orthonormal at every sample.
+            forgetting: factor on earlier samples, in (0, 1]; remembers about 1 / (1 - forgetting) samples.
             start: (n, r) a first guess, orthonormalised; the first r coordinates when not given.
             information: weight of the guess, in energy of y: the inverse of P(0) in the textbook form.
-            missing: what to do with incomplete samples.
+            missing: "fill" as above, "skip" leaves incomplete samples out, "refuse" raises by name.
             names: one name per coordinate; x1, x2, ... when not given.
 
         Raises:

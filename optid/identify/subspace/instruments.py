@@ -1,0 +1,88 @@
+"""Outputs simulated from the inputs alone, functions of which are instruments."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
+from optid.arrays import Array
+from optid.identify.subspace.imputation import clipping_range
+from optid.statistics.expansion import Expansion
+
+GRID, CHUNK = 2001, 8192
+"""Points at which feedback functions are tabulated, which need not be exact, and samples expanded at a time."""
+
+
+def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
+                     ez: Array, d: Array) -> list[Array]:
+    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
+
+    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
+    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
+    """
+    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
+    low, high = clipping_range(np.vstack(records)[:, m : m + l])
+    tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
+    start = 0
+    for family in expansion.feedback:
+        e = ez[:, start : start + family.size]
+        grid = np.linspace(low[family.output], high[family.output], GRID)
+        tables[family.output] += family.basis.values(grid) @ family.vectors @ e.T
+        start += family.size
+    simulated = []
+    open_loop = expansion.without_feedback()
+    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
+    for record in records:
+        out, x = np.empty((len(record), l)), np.zeros(n)
+        for first in range(0, len(record), CHUNK):
+            eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
+            eta = np.where(np.isnan(eta), 0.0, eta)
+            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
+                        out[first : first + CHUNK])
+        simulated.append(out)
+    return simulated
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clipped_run(
+    a: Array, c: Array, drive: Array, direct: Array, tables: Array, injection: Array, low: Array, high: Array,
+    x: Array, out: Array
+) -> None:
+    """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
+
+    Args:
+        a: (n, n).
+        c: (l, n).
+        drive: (T, n) what the inputs add to the state.
+        direct: (T, l) what they add to the outputs.
+        tables: (l, G, n) feedback of output o at G points spread evenly over [low, high]; read with straight lines.
+        injection: (n, l).
+        low: (l,).
+        high: (l,).
+        x: (n,) state at the first sample; left at the sample after the last.
+        out: (T, l) clipped outputs, written.
+    """
+    n, l, last = x.size, low.size, tables.shape[1] - 1  # noqa: E741
+    following = np.empty(n)
+    for t in range(drive.shape[0]):
+        for i in range(n):
+            following[i] = drive[t, i]
+            for h in range(n):
+                following[i] += a[i, h] * x[h]
+        for o in range(l):
+            y = direct[t, o]
+            for i in range(n):
+                y += c[o, i] * x[i]
+            y = min(max(y, low[o]), high[o])
+            out[t, o] = y
+            place = (y - low[o]) / (high[o] - low[o]) * last
+            cell = min(int(place), last - 1)
+            share = place - cell
+            for i in range(n):
+                following[i] += (1 - share) * tables[o, cell, i] + share * tables[o, cell + 1, i] + injection[i, o] * y
+        size = 0.0
+        for i in range(n):
+            size = max(size, abs(following[i]))
+        scale = 1.0 if size < 1e12 else 1e12 / size  # a diverging run stays finite; its outputs sit at the limits
+        for i in range(n):
+            x[i] = following[i] * scale

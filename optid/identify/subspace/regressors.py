@@ -1,0 +1,237 @@
+"""The equations of the step for (B, D, E, offset, x0) with A and C known, in observer form.
+
+With an observer gain L and F = A - L C the outputs
+
+    y(k) = C F^k x0 + sum_{i<k} C F^(k-1-i) ((B - L D) eta(i) + E zeta(i) + L (y(i) - d)) + D eta(k) + d
+
+are linear in the unknowns, whatever the poles of A. L = 0 minimises the simulation error with measured feedback;
+a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Products of
+matrices take the place of a loop over samples; time is the last axis, so that every copy is of long stretches.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.statistics.expansion import Expansion
+from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, root_of_gram
+from optid.structures.rank_one import matrices
+
+BLOCK = 32
+"""Samples whose responses are one product with a Toeplitz matrix."""
+
+TINY = 1e-150
+"""States below it are zero: denormal numbers would make every product with them slow."""
+
+CHUNK = 8192
+"""Samples whose regressors are formed at once."""
+
+MANY = 10
+"""Rows per column from which their Gram matrix is formed first."""
+
+HELD = 1 << 22
+"""Numbers held at once at most: models with many functions and states take shorter chunks."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverForm:
+    """What is known and how the unknowns are laid out.
+
+    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
+    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
+
+    Attributes:
+        a: (n, n).
+        c: (l, n).
+        gain: (n, l) observer gain L.
+        expansion: the signals.
+        experiments: number of experiments.
+        feedthrough: whether every input acts on the outputs at once.
+        offset: whether there is a constant d.
+        weights: (l,) by which the residuals are multiplied.
+    """
+
+    a: Array
+    c: Array
+    gain: Array
+    expansion: Expansion
+    experiments: int
+    feedthrough: tuple[bool, ...]
+    offset: bool
+    weights: Array
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    @property
+    def l(self) -> int:  # noqa: E743 - the field's letter
+        """Number of outputs."""
+        return len(self.c)
+
+    @property
+    def linear(self) -> int:
+        """Number of unknowns outside the blocks: initial states and offset."""
+        return self.experiments * self.n + self.l * self.offset
+
+    @property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
+        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
+        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
+
+    def thetas(self, z: Array) -> list[Array]:
+        """Return the matrices Theta_i of the unknowns z."""
+        return matrices(z[self.linear :], self.blocks)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.linear + sum(functions * entries for functions, entries in self.blocks)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels in words, those of the feedback last."""
+        x = self.expansion
+        return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
+
+    def names(self) -> list[str]:
+        """Name the unknowns in words for messages."""
+        named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
+        named += ["the offset"] * (self.l * self.offset)
+        for channel, (p, b) in zip(self.channels, self.blocks):
+            named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
+        return named
+
+
+def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterable[Array]
+                      ) -> Iterator[tuple[Array, Array]]:
+    """Yield the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
+
+    The regressor of output o is the matrix X_o(k) (d, n), like M transposed, with X_o(k + 1) = X_o(k) F + s(k) C_o.
+
+    Args:
+        inner: (n, n) F.
+        outputs: (l, n) C.
+        state: (l, d, n) X at the first sample, for every output.
+        parts: (d, T) signals s, one stretch after the other.
+
+    Yields:
+        (d, T) and (l, d, n, T), every stretch and its X.
+    """
+    (l, n), d = outputs.shape, state.shape[1]  # noqa: E741
+    powers = np.empty((BLOCK + 1, n, n))
+    powers[0] = np.eye(n)
+    for k in range(BLOCK):
+        powers[k + 1] = powers[k] @ inner
+    toeplitz = np.zeros((BLOCK, l, n, BLOCK + 1))
+    for i in range(BLOCK):
+        toeplitz[i, :, :, i + 1 :] = np.einsum("oh,khi->oik", outputs, powers[: BLOCK - i])
+    toeplitz = toeplitz.reshape(BLOCK, -1)
+    free = powers[:BLOCK].transpose(1, 2, 0).reshape(n, -1)
+    for part in parts:
+        count = part.shape[1]
+        blocks = count // BLOCK + 1  # the state after the last sample stands in the last block, too
+        signals = np.zeros((d, blocks * BLOCK))
+        signals[:, :count] = part
+        signals = signals.reshape(d, blocks, BLOCK).transpose(1, 0, 2).reshape(-1, BLOCK)
+        within = (signals @ toeplitz).reshape(blocks, d, l, n, BLOCK + 1)
+        starts = np.concatenate([state.transpose(1, 0, 2)[None], within[:-1, ..., BLOCK]]).reshape(-1, n)
+        step, decay = d * l, powers[BLOCK]
+        while step < len(starts):  # the sum of all that came before, twice as many blocks each time
+            starts[step:] += starts[:-step] @ decay
+            step, decay = 2 * step, decay @ decay
+        starts[np.abs(starts) < TINY] = 0.0
+        found = np.empty((l, d, n, blocks, BLOCK))
+        np.add(within[..., :BLOCK], (starts @ free).reshape(blocks, d, l, n, BLOCK), out=found.transpose(3, 1, 0, 2, 4))
+        found = found.reshape(l, d, n, -1)
+        state = found[..., count]
+        yield part, found[..., :count]
+
+
+class Regressors:
+    """Equations of one run: [x0 | d | Theta of the inputs | E simulated | E], as in the unknowns z, and the target.
+
+    Attributes:
+        extra: number of instruments, as many as entries of all E_o; zero where there are none.
+        size: number of unknowns and instruments.
+        needed: channels that must be present.
+    """
+
+    def __init__(self, form: ObserverForm, instruments: bool) -> None:
+        """Lay out the equations."""
+        self.form, x = form, form.expansion
+        self.injected = bool(np.any(form.gain))
+        self.extra = form.n * x.q if instruments else 0
+        self.size = form.size - (form.experiments - 1) * form.n + self.extra
+        self.outputs = slice(x.m, x.m + x.l)
+        self.needed = np.repeat([True, x.q > 0 or self.injected, instruments], [x.m, x.l, x.l * x.simulated])
+
+    def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
+        """Return the triangular factor of the equations of a run, how many there are, and the outputs' energy.
+
+        Many equations enter by their Gram matrix, unless its condition would cost digits.
+        """
+        given = (self.form.weights * target)[~np.isnan(target)]
+        root = np.zeros((self.size + 1, self.size + 1))
+        if given.size > MANY * len(root):
+            root = root_of_gram(sum((part @ part.T for part in self._weighted(run, target)), root), self.size)
+        if not conditioning(root) <= CONDITION_LIMIT:
+            parts = (part.T for part in self._weighted(run, target))
+            root = reduce(add_to_root, parts, np.zeros((self.size + 1, self.size + 1)))
+        return root, given.size, float(given @ given)
+
+    def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
+        """Yield the weighted equations (size + 1, K), some samples of one output at a time."""
+        form = self.form
+        chunk = min(CHUNK, max(64, HELD // (form.l * form.n * (form.expansion.p + 2 * form.expansion.q + form.l + 1))))
+        starts = range(0, len(run), chunk)
+        state = np.zeros((form.l, len(self._signals(run[:1])), form.n))
+        state[:, 0] = form.c  # C_o F^k, the effect of x0
+        responses = adjoint_responses(form.a - form.gain @ form.c, form.c, state,
+                                      (self._signals(run[start : start + chunk]) for start in starts))
+        for start, (signals, out) in zip(starts, responses):
+            y = target[start : start + chunk].T
+            for o in range(form.l):
+                rows = self._rows(o, signals, out[o], y[o])
+                rows *= form.weights[o]
+                present = ~np.isnan(y[o])
+                yield rows if present.all() else rows[:, present]
+
+    def _signals(self, raw: Array) -> Array:
+        """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
+        x = self.form.expansion
+        found, one = x(raw).T, np.ones((1, len(raw)))
+        parts = [0 * one, found[: x.p]]
+        if self.extra:
+            parts.append(found[x.zeta_simulated.start :])
+        parts.append(found[x.p : x.p + x.q])
+        if self.injected:
+            parts += [one, raw[:, self.outputs].T]
+        return np.concatenate(parts)
+
+    def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
+        """Return the equations of output o with their target, from the responses (d, n, T) to the signals."""
+        form, x, count = self.form, self.form.expansion, len(y)
+        p, target = x.p, y
+        offset, direct = np.zeros((x.l, count)), np.zeros((x.l, p, count))
+        offset[o], direct[o] = 1.0, signals[1 : 1 + p]
+        if self.injected:
+            past = len(signals) - 1 - x.l
+            offset -= form.gain.T @ out[past]
+            direct -= np.tensordot(form.gain.T, out[1 : 1 + p], (1, 1))
+            target = y - np.einsum("jit,ij->t", out[past + 1 :], form.gain)
+        parts, start = [out[0], offset] if form.offset else [out[0]], 0
+        for size, feedthrough in zip(x.input_sizes, form.feedthrough):
+            own = slice(start, start + size)
+            parts += [out[1 + start : 1 + start + size].transpose(1, 0, 2), *([direct[:, own]] if feedthrough else [])]
+            start += size
+        sizes = [family.size for family in x.feedback]
+        for size in sizes * (2 if self.extra else 1):
+            parts.append(out[1 + start : 1 + start + size].transpose(1, 0, 2))
+            start += size
+        return np.concatenate([part.reshape(-1, count) for part in [*parts, target]])
