@@ -126,8 +126,10 @@ def _wild(parts: Sequence[Array]) -> list[np.ndarray]:
         return none
     below = min(max(d.size // 12, 20), 1000)  # departures that tell the steepness of the tail
     count = int(MOST * d.size) + below + 1
-    top = np.sort(np.partition(d, d.size - count)[d.size - count :])[::-1]
-    scale = max(float(np.median(d)) / NORMAL_MEDIAN, float(np.quantile(d, 0.8)) / 1.2816)
+    middle, fifth = d.size // 2, int(0.8 * d.size)
+    ordered = np.partition(d, np.unique([middle, fifth, d.size - count]))
+    top = np.sort(ordered[d.size - count :])[::-1]
+    scale = max(float(ordered[middle]) / NORMAL_MEDIAN, float(ordered[fifth]) / 1.2816)
     if scale <= 8 * np.finfo(float).eps * max(float(np.max(np.abs(x), initial=0.0)) for x in parts):
         return none  # at rest but for pulses: they are the signal
     for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
@@ -149,12 +151,14 @@ def _splits(top: Array, n: int, below: int) -> np.ndarray:
     whole = (logs[k] - np.log(NORMAL_MEDIAN)) / np.log(0.5 * n / k)  # where the tail has not begun, near is too flat
     steepness = np.maximum(np.where(k > TAIL * n, np.maximum(near, whole), near), FLATTEST)
     gap, excess = logs[k - 1] - logs[k], sums[k] - k * logs[k]
+    far = top[k - 1] > FAR
+    k, gap, excess, steepness = k[far], gap[far], excess[far], steepness[far]
     tries = k * (k + 1.0)  # the inverses of which add up to one
     wide = (fdtrc(2, 2 * below, k * gap / steepness) < GAP_RISK / tries) & (gap > np.log(GAP))
     heavy = fdtrc(2 * k, 2 * below, excess / (k * steepness)) < TAIL_RISK / tries
-    likely = k[(wide | heavy) & (top[k - 1] > FAR)]
-    widest = likely[np.argsort(-gap[likely - 1])[:TRIED]]
-    return np.unique(np.concatenate([widest, likely[-1:]]))[::-1]
+    likely = np.flatnonzero(wide | heavy)
+    widest = likely[np.argsort(-gap[likely])[:TRIED]]
+    return k[np.unique(np.concatenate([widest, likely[-1:]]))[::-1]]
 
 
 def _isolated(x: Array, mask: np.ndarray, size: float) -> np.ndarray:
