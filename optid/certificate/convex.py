@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
-from optid.certificate.lifting import lift_linear
+from optid.certificate.lifting import lift
 from optid.program.gradients import flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
@@ -149,8 +149,7 @@ def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
 
 def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
-    problem = form.problem
-    lifted = lift_linear(program, form.linear, len(problem.target))
+    problem, lifted = form.problem, lift(program, form)
     linear = lifted.linear
     if lifted.refused or not len(linear.right):
         return None

@@ -6,7 +6,7 @@ from typing import Any
 
 import cvxpy as cp
 
-from optid.certificate.lifting import lift_exact, places
+from optid.certificate.lifting import lift, places
 from optid.program.expressions import flat
 from optid.program.gradients import flat_value, jacobians
 from optid.program.limits import EQUALITIES
@@ -67,7 +67,7 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
         copy = member if where is None else member.tree_copy(where.stand_in)
         found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
     if form is not None and where is not None:
-        lifted = lift_exact(program.without(*(set(program.user_constraints) - set(names))), form)
+        lifted = lift(program.without(*(set(program.user_constraints) - set(names))), form)
         count = len(lifted.linear.right)  # these are there already
         lifted.add_products(form.problem)
         rows = lifted.linear.rows[count:]

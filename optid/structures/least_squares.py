@@ -21,6 +21,7 @@ class LeastSquaresStructure(Structure):
         problem: the numbers, see `optid.program.compressed.Compressed`.
         linear: names of the linear variables in the order of z (each flattened column by column).
         blocks: (mu name, b name) of every rank-one block; none without products.
+        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
     """
 
     word: ClassVar[str] = "least-squares"
@@ -28,6 +29,7 @@ class LeastSquaresStructure(Structure):
     problem: Any
     linear: tuple[str, ...]
     blocks: tuple[tuple[str, str], ...] = ()
+    gauge: str = "norm"
 
     def flat(self, values: Mapping[str, Any]) -> Array:
         """Return the linear variables among named values as they follow one another in z."""
@@ -58,15 +60,10 @@ class LeastSquaresStructure(Structure):
 
 @dataclass(frozen=True, eq=False)
 class RankOneStructure(LeastSquaresStructure):
-    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate.
-
-    Attributes:
-        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
-    """
+    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
 
     word: ClassVar[str] = "rank-one"
     problem: RankOne
-    gauge: str = "norm"
 
     @property
     def about(self) -> str:
