@@ -5,13 +5,11 @@ zero the objective is smooth, so that a Newton step from there ends the crawl; g
 the optimality conditions. The iteration stops by the duality gap, whose dual point is feasible by construction.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 
 from optid.arrays import Array
-from optid.backends.back_end import Answer, Settings
+from optid.backends.back_end import Answer, Minimum, Settings
 from optid.program.program import Program
 from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
@@ -39,40 +37,12 @@ def run(program: Program, settings: Settings) -> Answer:
         return Answer(Status.FAILED, f"the penalty is {penalty}; this method needs a positive one")
     start = form.flat(program.start) if settings.warm and program.start else None
     found = minimise(form.problem, penalty, settings.accuracy, int(dict(settings.options).get("limit", 2000)), start)
-    values = form.shaped(found.a)
-    duals = {form.residual: -found.point}
-    if found.gap <= tolerance(settings.accuracy):
-        return Answer(Status.LOCAL, "duality gap closed", values, duals, found.rounds)
-    return Answer(Status.LIMIT, f"stopped at a relative gap of {found.gap:.1e}", values, duals, found.rounds)
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where the iteration stopped.
-
-    Attributes:
-        a: (p,) coefficients.
-        point: (m,) feasible point of the dual.
-        value: objective at a.
-        bound: value of the dual at the point.
-        rounds: number of rounds of descent and Newton step.
-    """
-
-    a: Array
-    point: Array
-    value: float
-    bound: float
-    rounds: int
-
-    @property
-    def gap(self) -> float:
-        """Duality gap relative to the value."""
-        return max(self.value - self.bound, 0.0) / max(self.value, np.finfo(float).tiny)
+    return found.answer(tolerance(settings.accuracy), form.shaped(found.point), {form.residual: -found.dual})
 
 
 def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,
              start: Array | None = None) -> Minimum:
-    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``.
+    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``: point a (p,), dual point (m,).
 
     Args:
         problem: the numbers.

@@ -18,7 +18,7 @@ from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
 from optid.program.gradients import flat_value
 from optid.program.judging import measure_violation, term_size
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
@@ -145,7 +145,7 @@ class _Constrained:
                 continue
             self.program.assign(self.at.unpack(x))
             if measure_violation(self.program)[0] <= 1e-14:
-                duals = {name: np.zeros(sum(d.size for c in group for d in c.dual_variables))
+                duals = {name: np.zeros(max((span.stop for span in spans(group)), default=0))
                          for name, group in self.program.constraints.items()}
                 return Answer(Status.LOCAL, "stationary; no constraint is active", self.at.unpack(x),
                               {**duals, "residual": -2.0 * self._residual(x)}, 0)
@@ -182,7 +182,7 @@ class _Constrained:
         # with b fixed the residual is affine, so that one linearisation is exact
         self.half.set_model(x, {}, second_order=False)
         answer = self.half.run(self.inner, self.settings)
-        found = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+        found = self._in_gauge(self.form.point(answer.values)) if answer.values else None
         return None if found is None else (self._merit(found, 0.0), found)
 
     def _in_gauge(self, point: Point) -> np.ndarray | None:
@@ -213,7 +213,7 @@ class _Constrained:
             count += 1
             self.full.set_model(x, multipliers, damping=damping)
             answer = self.full.run(self.inner, self.settings)
-            new = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+            new = self._in_gauge(self.form.point(answer.values)) if answer.values else None
             size, before, after, rises = np.inf, 0.0, np.inf, True
             if new is not None:
                 multipliers = answer.duals
@@ -245,7 +245,7 @@ class _Constrained:
         A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
         """
         self.at.assign(x)
-        tangent, usual = self.at.slope_of_lift(x), self.program.usual_sizes()
+        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes()
         slope = 2.0 * tangent.T @ (self.problem.root.T @ self._residual(x))
         units = 1.0 / np.maximum(np.linalg.norm(self.problem.root @ tangent, axis=0), 1e-12)
         rows, given, equal, touched, sizes = [], [], [], [], {}

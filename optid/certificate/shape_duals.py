@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
 from optid.errors import StructureError
 from optid.structures.multipliers import fit_multipliers
-from optid.structures.rank_one import Array, RankOne
+from optid.structures.rank_one import Array, Point, RankOne
 
 ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of the size of its terms
 
@@ -37,7 +36,6 @@ class Linear:
     def slack(self, z: Array) -> tuple[Array, Array]:
         """(slack, size of the terms), each (r,)."""
         return self.right - self.rows @ z, np.abs(self.rows) @ np.abs(z) + np.abs(self.right)
-
 
     @classmethod
     def none(cls, n: int) -> "Linear":
@@ -78,9 +76,7 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
     if not cones and not len(linear.right):
         return {}, np.zeros(0)
     units = [mu / (np.linalg.norm(mu) or 1.0) for mu in mus]
-    jacobian = np.asarray(block_diag(np.eye(offset), *(
-        np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
-        for mu, b in zip(units, bs))))
+    jacobian = Point(np.zeros(offset), tuple(units), tuple(bs)).tangent()
     firsts = np.cumsum([offset, *(p + nb for p, nb in shapes)])  # of every mu in the tangent coordinates
     active, parts = {}, []
     for i, cone in cones.items():

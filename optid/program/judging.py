@@ -10,7 +10,7 @@ from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
 from optid.program.gradients import flat_value, jacobians
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
@@ -162,13 +162,11 @@ class Lagrangian:
         """Add up the named constraints, multipliers projected on the dual cones; None where one has none, or no use."""
         found = cls(program)
         for name in names:
-            position = 0
             if name not in duals:
                 return None
-            for member in program.constraints[name]:
-                length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, duals[name][position : position + length])
-                position += length
+            group = program.constraints[name]
+            for member, span in zip(group, spans(group)):
+                terms = multiplier_terms(member, duals[name][span])
                 if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
                     return None
                 products = [flat_value(expression) * weights for expression, weights in terms]

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import block_diag, get_lapack_funcs
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
@@ -82,6 +82,12 @@ class Point:
     def lift(self) -> Array:
         """Return z = [w; kron(b_1, mu_1); ...]."""
         return np.concatenate([self.w, *(np.outer(b, mu).ravel() for mu, b in zip(self.mus, self.bs))])
+
+    def tangent(self) -> Array:
+        """Return the Jacobian of `lift` in [w; mu_1; b_1; mu_2; ...]."""
+        factors = [np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
+                   for mu, b in zip(self.mus, self.bs)]
+        return np.asarray(block_diag(np.eye(len(self.w)), *factors))
 
     def normalised(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""
