@@ -205,9 +205,7 @@ class Program:
             if name in self.structural and not any(c.variables() for c in kept):
                 continue
             constraints[name] = kept
-        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, iterate=self.view.iterate,
-                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
-                    reference=self.view.reference, outputs=self.view.outputs, units=self.view.units)
+        view = replace(self.view, inner={name: inner.tree_copy(swap) for name, inner in self.view.inner.items()})
         limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}
         left = {name: v for name, v in self.variables.items() if name not in values}
         held = {name: parameters[name] for name in values}

@@ -1,6 +1,7 @@
 """What a constraint may speak about: the named expressions of a programme, in the units of the record."""
 
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,7 @@ Values = Mapping[str, np.ndarray]
 """Values of variables by name."""
 
 
+@dataclass(eq=False, repr=False)
 class View(Mapping[str, cp.Expression]):
     """The named expressions that a constraint may speak about, and the structure it may need.
 
@@ -23,31 +25,29 @@ class View(Mapping[str, cp.Expression]):
     ``Theta`` = functions x [B; D] with A and C held.
 
     Attributes:
+        inner: the expressions in the units of the programme.
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
         bases: the fitted basis of every channel.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
         reference: values of the unconstrained least-squares estimate, for constraints that need a centre; matrices
             ``A`` and ``C`` of a state-space model, held where they are no variables.
-        iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
-        inner: the expressions in the units of the programme.
+        iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
     """
 
-    def __init__(self, expressions: Mapping[str, cp.Expression], *, channels: tuple[str, ...] = (),
-                 bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None,
-                 outputs: tuple[str, ...] = (), units: Transform | None = None, iterate: bool = False) -> None:
-        self.inner = dict(expressions)
-        self.units = units
-        self.reference = dict(reference or {})
-        self._auxiliaries: dict[int, cp.Variable] = {}
-        self.outputs = tuple(outputs)
-        self.iterate = iterate
-        self.channels = channels
-        self.bases = dict(bases or {})
-        self.gauge = gauge
+    inner: Mapping[str, cp.Expression]
+    _: KW_ONLY
+    channels: tuple[str, ...] = ()
+    bases: Mapping[str, Any] = field(default_factory=dict)
+    gauge: str = ""
+    reference: Values = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+    units: Transform | None = None
+    iterate: bool = False
+    _auxiliaries: set[int] = field(default_factory=set, init=False)
 
     @cached_property
     def _expressions(self) -> Mapping[str, cp.Expression]:
@@ -83,7 +83,7 @@ class View(Mapping[str, cp.Expression]):
             attributes: CVXPY attributes, such as ``symmetric=True``.
         """
         variable = cp.Variable(shape, name=name, **attributes)
-        self._auxiliaries[variable.id] = variable
+        self._auxiliaries.add(variable.id)
         return variable
 
     def owns(self, variable: cp.Variable) -> bool:
