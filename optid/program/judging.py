@@ -15,6 +15,10 @@ from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
 
+KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
+         "sum_largest", "lambda_sum_largest", "pos", "neg"}
+"""Atoms whose gradient says nothing where they have a kink."""
+
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
     """Measure a point: objective, violation, stationarity and complementarity.
@@ -25,8 +29,7 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
         duals: {constraint: flat multipliers}; names may be missing.
 
     Returns:
-        The recomputed objective and the residuals. Stationarity is ``nan`` where multipliers are missing or the
-        objective has a kink at the point.
+        The recomputed objective and the residuals; see `Residuals` for where they are ``nan``.
     """
     program.assign(values)
     violation, worst = measure_violation(program)
@@ -34,8 +37,15 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
     if known is not None:
         objective, stationarity = known
         return objective, Residuals(violation, worst, stationarity, 0.0)
-    objective = float(np.asarray(program.objective.expr.value))
-    stationarity, complementarity = _first_order(program, duals, objective)
+    objective, stationarity, complementarity = float(np.asarray(program.objective.expr.value)), np.nan, np.nan
+    try:
+        lagrangian = Lagrangian.of(program, duals, program.constraints)
+        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
+            stationarity = lagrangian.residual(max(abs(objective), program.scale))
+            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
+            complementarity = lagrangian.complementarity / size
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        pass
     return objective, Residuals(violation, worst, stationarity, complementarity)
 
 
@@ -111,13 +121,8 @@ def bounds_of(variable: cp.Variable) -> tuple[np.ndarray, np.ndarray] | None:
 def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
     """Return (expression, weights) pairs whose inner products are the constraint's part of the Lagrangian.
 
-    Args:
-        member: a CVXPY constraint.
-        dual: its multipliers, flat, in the order of its dual variables.
-
-    Returns:
-        The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
-        or None for a cone whose multipliers are not used here.
+    The flat multipliers are projected on the dual cone, so that one of the wrong sign leaves a residual. None for a
+    cone whose multipliers are not used here.
     """
     if isinstance(member, EQUALITIES):
         return [(member.expr, dual)]
@@ -179,7 +184,7 @@ class Lagrangian:
 
     def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
         """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
-        if not _smooth(expression):
+        if not expression.is_affine() and {atom.__name__ for atom in expression.atoms()} & KINKS:
             return False
         slopes = jacobians(expression)
         for variable, slope in (slopes or {}).items():
@@ -211,22 +216,3 @@ class Lagrangian:
             held = ((value <= bounds[0] + margin) & (gradient > 0)) | ((value >= bounds[1] - margin) & (gradient < 0))
             gradient = np.where(held, 0.0, gradient)
         return np.abs(np.ravel(gradient, order="F"))
-
-
-def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
-    try:
-        lagrangian = Lagrangian.of(program, duals, program.constraints)
-        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
-            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
-            return (lagrangian.residual(max(abs(objective), program.scale)), float(lagrangian.complementarity / size))
-    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        pass
-    return float("nan"), float("nan")
-
-
-_KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
-          "sum_largest", "lambda_sum_largest", "pos", "neg"}
-
-
-def _smooth(expression: cp.Expression) -> bool:
-    return expression.is_affine() or not {atom.__name__ for atom in expression.atoms()} & _KINKS

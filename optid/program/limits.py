@@ -55,7 +55,11 @@ class Limit:
         if not isinstance(self.member, EQUALITIES | INEQUALITIES):
             return self.member, self
         sizes = row_sizes(self.member.expr, usual)
-        scaled = times(1 / sizes, self.member.expr)
+        expression = self.member.expr
+        if sizes.size > 1:
+            scaled = cp.multiply(np.reshape(1 / sizes, expression.shape, order="F"), expression)
+        else:
+            scaled = expression if sizes.item() == 1.0 else 1 / sizes.item() * expression
         posed = scaled == 0 if isinstance(self.member, EQUALITIES) else scaled <= 0
         return posed, replace(self, sizes=sizes)
 
@@ -68,13 +72,6 @@ class Limit:
         """Return the shift of every row at the assigned point, flat."""
         shift = flat_value(self.shift) if isinstance(self.shift, cp.Expression) else np.atleast_1d(self.shift)
         return np.broadcast_to(shift, (self.member.size,))
-
-
-def times(factors: np.ndarray, expression: cp.Expression) -> cp.Expression:
-    """Multiply an expression, column by column, by flat factors."""
-    if factors.size == 1:
-        return expression if factors.item() == 1.0 else factors.item() * expression
-    return cp.multiply(np.reshape(factors, expression.shape, order="F"), expression)
 
 
 def spans(group: Sequence[Constraint]) -> list[slice]:
