@@ -55,11 +55,6 @@ class HankelBounds:
         best = int(np.nanargmax(column))
         return float(column[best]), self.block_rows[best]
 
-    def smallest_order(self, error: float) -> int:
-        """Return the least order that the bounds allow for a squared error, or one more than they examine."""
-        allowed = [n for n in range(self.values.shape[1]) if self.value(n)[0] <= error]
-        return allowed[0] if allowed else self.values.shape[1]
-
     def bound(self, n: int, error: float) -> Bound:
         """Return the certificate of a fit of order n with a squared simulation error, in the units of the bound.
 
@@ -70,9 +65,8 @@ class HankelBounds:
         if error < value * (1 - 1e-9) - 1e-12 * self.energy:
             raise StructureError(f"an error of {error:.6g} lies below the bound {value:.6g} for order {n}: it was not "
                                  "measured by the simulator with measured feedback on this record and these functions")
-        need = self.smallest_order(error)
         reason = f"no model of order {n} with these functions simulates with a squared error below {value:.4g}"
-        if need == n and n:
+        if n and self.value(n - 1)[0] > error >= value:
             reason += f"; order {n - 1} cannot reach what order {n} reached"
         return Bound(value, False, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
 

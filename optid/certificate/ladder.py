@@ -27,8 +27,8 @@ EFFORTS = ("instant", "ascent", "sdp")
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Multipliers of a bound, in the whitened coordinates of ``core``.
+class Multipliers:
+    """What a bound can be recomputed from, in the whitened coordinates of ``core``.
 
     Attributes:
         core: coordinates; ``core.whitening.columns`` is the change of coordinates.
@@ -63,8 +63,7 @@ class Case:
     """What the stages share, in whitened coordinates; block indices are those of the core.
 
     Attributes:
-        problem: the problem.
-        core: its reduction.
+        core: reduction of the problem.
         mus: (P_i,) each, oriented so that C mu >= 0.
         bs: (nb_i,) each, of unit length.
         objective: the objective around the point.
@@ -75,7 +74,6 @@ class Case:
         began: clock at the start.
     """
 
-    problem: RankOne
     core: Core
     mus: list[Array]
     bs: list[Array]
@@ -197,7 +195,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     else:
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
+    return Case(core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
@@ -288,9 +286,8 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     """Recompute the bound from its multipliers and say what it proves."""
     value = case.objective.value
     bound = float(case.lagrangian(linear).bound(minors, case.cut_form(cuts)))
-    gap = relative_gap(value, bound, case.problem.scale)
-    broken = case.violation()
-    undercut = relative_gap(bound, value, case.problem.scale) > TOLERANCE
+    scale, broken = case.core.problem.scale, case.violation()
+    gap, undercut = relative_gap(value, bound, scale), relative_gap(bound, value, scale) > TOLERANCE
     proved = gap <= TOLERANCE and not undercut and broken <= ACTIVE
     if broken > ACTIVE or undercut:
         reason = f"not proved: the point violates its constraints (relative violation {broken:.1e})"
@@ -300,6 +297,6 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
         reason = f"not proved, relative gap {gap:.1e}: {how}"
     else:
         reason = f"not proved, no finite bound: {how}"
-    evidence = Evidence(case.core, minors, cuts, case.lam if linear is None else linear)
+    evidence = Multipliers(case.core, minors, cuts, case.lam if linear is None else linear)
     return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
                          () if proved else better)

@@ -26,21 +26,21 @@ class Lifted:
     """Constraints in the two forms a certificate understands.
 
     Attributes:
-        size: length of z.
         linear: the rows on z.
         cones: {block: rows C of ``C mu >= 0``}.
         directions: {block: rows B of ``B b >= 0``}.
         refused: name of the first constraint that has neither form, "" where all have.
     """
 
-    size: int
-    linear: Linear = field(init=False)
+    linear: Linear
     cones: dict[int, np.ndarray] = field(default_factory=dict)
     directions: dict[int, np.ndarray] = field(default_factory=dict)
     refused: str = ""
 
-    def __post_init__(self) -> None:
-        self.linear = Linear.none(self.size)
+    @property
+    def size(self) -> int:
+        """Length of z."""
+        return self.linear.rows.shape[1]
 
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
@@ -144,7 +144,7 @@ def places(program: Program, form: LeastSquaresStructure) -> Places:
 def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
     """Bring the user constraints of a programme into lifted form."""
     where = places(program, form)
-    lifted = Lifted(where.size)
+    lifted = Lifted(Linear.none(where.size))
     factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
     for name, group in program.user_constraints.items():
         for member in group:

@@ -89,7 +89,8 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
             stacked = cp.hstack([cp.vec(w, order="C") for w in pairs[i]])
             extra = extra - form @ stacked
             cut_value = cut_value + (form.T @ np.kron(z, z)) @ stacked
-    slope = objective.slope / unit + _times(z / unit, k) @ extra
+    square = cp.reshape(extra, (k, k), order="C")
+    slope = objective.slope / unit + square @ (z / unit)
     multipliers = None
     if len(linear.right):
         multipliers = cp.Variable(len(linear.right))
@@ -100,7 +101,7 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     level = cp.Variable()
     column = cp.reshape(slope, (k, 1), order="C")
     corner = cp.reshape(-level - cut_value / unit**2, (1, 1), order="C")
-    lifted = cp.bmat([[corner, column.T], [column, objective.gram + cp.reshape(extra, (k, k), order="C")]]) >> 0
+    lifted = cp.bmat([[corner, column.T], [column, objective.gram + square]]) >> 0
     problem = cp.Problem(cp.Maximize(level), [lifted, *constraints])
     try:
         with warnings.catch_warnings():
@@ -118,13 +119,6 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
         prices = np.asarray(multipliers.value, float)
         prices = np.where(linear.equality, prices, np.maximum(prices, 0.0))
     return minors, cuts, prices, _moments(np.asarray(lifted.dual_value), z, unit)
-
-
-def _times(z: Array, k: int) -> Any:
-    """Sparse (k, k^2) operator: row-stacked matrix -> matrix @ z."""
-    from scipy.sparse import csc_array, eye_array, kron
-
-    return csc_array(kron(eye_array(k), csc_array(z[None, :])))
 
 
 def _pair_weights(values: list[Array], rows: int, nb: int) -> Array:
