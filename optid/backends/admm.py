@@ -38,13 +38,9 @@ def run(program: Program, settings: Settings) -> Answer:
 
 
 def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: int = 20_000) -> Minimum:
-    """Minimise the objective for one weight: point (v, theta), dual point (r, q).
+    """Minimise the objective for one positive weight of the misfit: point (v, theta), dual point (r, q).
 
-    Args:
-        problem: the numbers.
-        weight: of the misfit, positive.
-        gap: relative duality gap at which to stop.
-        limit: number of iterations at most.
+    It stops at a relative duality gap, or at a number of iterations.
     """
     v, theta = problem.data, problem.explained(problem.hankel(problem.data))
     reached = problem.matrix(v, theta)

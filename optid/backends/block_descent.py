@@ -42,14 +42,9 @@ def run(program: Program, settings: Settings) -> Answer:
 
 def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,
              start: Array | None = None) -> Minimum:
-    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``: point a (p,), dual point (m,).
+    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖`` for a positive penalty: point a (p,), dual point (m,).
 
-    Args:
-        problem: the numbers.
-        penalty: lambda, positive.
-        gap: relative duality gap at which to stop.
-        limit: number of rounds at most.
-        start: (p,) a point to start from.
+    It stops at a relative duality gap, or at a number of rounds; a start (p,) shortens the way.
     """
     a = np.zeros(problem.design.shape[1]) if start is None else np.array(start, dtype=float)
     active = np.flatnonzero(problem.norms(a) > 0)

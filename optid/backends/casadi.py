@@ -36,10 +36,7 @@ STATUS = {
 
 
 def translate(form: Smooth) -> dict[str, Any]:
-    """Translate a smooth programme into CasADi's dictionary ``{"x", "p", "f", "g"}``.
-
-    Args:
-        form: the programme after CVXPY's smooth chain.
+    """Translate a programme after CVXPY's smooth chain into CasADi's dictionary ``{"x", "p", "f", "g"}``.
 
     Raises:
         StructureError: an atom without a translation, by name.
@@ -184,11 +181,7 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
 
 
 def options(name: str, settings: Settings) -> dict[str, Any]:
-    """Translate what is asked into a solver's own options; native options of the user come last.
-
-    Args:
-        name: "ipopt" or "fatrop".
-        settings: what is asked.
+    """Translate what is asked into options of "ipopt" or "fatrop"; native options of the user come last.
 
     Raises:
         StructureError: a Hessian that is not exact.
@@ -212,18 +205,10 @@ def options(name: str, settings: Settings) -> dict[str, Any]:
 
 
 def solve_with(name: str, program: Program, settings: Settings) -> Answer:
-    """Solve a smooth programme with one of CasADi's solvers.
+    """Solve an LP, QP or smooth nonconvex programme with "ipopt" or "fatrop".
 
     The translated programme and the compiled solver are kept with the CVXPY problem: only parameter values and the
-    start are new in the next solve.
-
-    Args:
-        name: "ipopt" or "fatrop".
-        program: an LP, QP or smooth nonconvex programme.
-        settings: what is asked.
-
-    Returns:
-        The solver's claim with values and multipliers in CVXPY's convention ``L = f + dual (lhs - rhs)``.
+    start are new in the next solve. Multipliers are in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
     clock = time.perf_counter()
     form = smooth(program.problem)

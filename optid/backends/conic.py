@@ -28,12 +28,7 @@ AMBIGUOUS = {"sdpa"}
 
 
 def tolerances(name: str, settings: Settings) -> dict[str, Any]:
-    """Translate one requested accuracy and time limit into a solver's own options.
-
-    Args:
-        name: lower-case solver name.
-        settings: what is asked.
-    """
+    """Translate one requested accuracy and time limit into a solver's own options; those of the user come last."""
     eps, limit = settings.accuracy, settings.time_limit
     table: dict[str, dict[str, Any]] = {
         "clarabel": {"tol_gap_abs": eps, "tol_gap_rel": eps, "tol_feas": eps, "max_iter": 500},
@@ -69,15 +64,9 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
 
 
 def solve_with(name: str, program: Program, settings: Settings) -> Answer:
-    """Solve a convex programme with one of CVXPY's solvers.
+    """Solve a convex programme with one of CVXPY's solvers, by its lower-case name.
 
-    Args:
-        name: lower-case solver name.
-        program: a convex programme.
-        settings: what is asked.
-
-    Returns:
-        The solver's claim; an exception inside the solver becomes ``Status.FAILED`` with its words.
+    An exception inside the solver becomes ``Status.FAILED`` with its words.
     """
     problem, options = program.problem, tolerances(name, settings)
     if name == "clarabel" and program.scale < 1:  # objectives are in units of the data; its relative gap is one to 1

@@ -28,11 +28,9 @@ POINT = {
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a smooth programme with Uno (options: ``preset``, default "filtersqp", and Uno's own).
+    """Solve an LP, QP or smooth nonconvex programme with Uno.
 
-    Args:
-        program: an LP, QP or smooth nonconvex programme.
-        settings: what is asked.
+    Options: ``preset``, default "filtersqp", and Uno's own.
     """
     unopy: Any = import_module("unopy")
     clock = time.perf_counter()

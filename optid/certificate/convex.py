@@ -39,13 +39,9 @@ REACH = 2.0
 
 
 def certify_convex(program: Program, values: Values, duals: Values, objective: float) -> Bound | None:
-    """Return the dual bound at a point; None where it cannot be formed (no multipliers, an objective with kinks).
+    """Return the dual bound at a point with this objective, from multipliers of which some may be missing.
 
-    Args:
-        program: a convex programme.
-        values: the point.
-        duals: {constraint: flat multipliers}; names may be missing.
-        objective: its value at the point.
+    None where it cannot be formed (no multipliers, an objective with kinks).
     """
     program.assign(values)
     form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None

@@ -67,13 +67,9 @@ class Lifted:
 
 def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
                      ) -> tuple[Bound, Values | None]:
-    """Certify a point of a rank-one programme under its user constraints.
+    """Certify a point of a rank-one programme under its user constraints, with multipliers of the certificate's own.
 
-    Args:
-        program: a programme with a `RankOneStructure`.
-        values: the point.
-        duals: multipliers by constraint; not needed, because the certificate computes its own.
-        max_size: number of multipliers above which the semidefinite relaxation is not attempted.
+    The semidefinite relaxation is not attempted above ``max_size`` multipliers.
 
     Returns:
         The bound, and values to restart from where the relaxation proposes a better point.
@@ -196,15 +192,9 @@ def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, val
                     ) -> tuple[Bound, None]:
     """Bound ``‖R z - s‖² + remainder + 2 sum tau_c ‖Theta_c‖_*`` under linear constraints by its own dual.
 
-    For any nu with ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
+    The tau_c are the heights (inputs,) times the programme's parameter "weight". For any nu with
+    ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
-
-    Args:
-        problem: R, s and the remainder.
-        heights: (inputs,) tau_c per unit of the programme's parameter "weight".
-        program: the programme.
-        values: the point.
-        duals: multipliers by constraint.
     """
     taus = heights * float(np.asarray(program.parameters["weight"].value))
     form = LeastSquaresStructure(problem, tuple(name for name in program.variables if name != "residual"))

@@ -34,10 +34,7 @@ def project_minors(matrix: Array, shape: tuple[int, int]) -> Array:
 def tangent_minors(gradient: Array, mu: Array, b: Array) -> Array:
     """The combination M of minors with ``M kron(b, mu) = vec(gradient)``, which needs nothing beyond the tangent data.
 
-    Args:
-        gradient: (P, nb) with gradient b = 0 and gradient^T mu = 0.
-        mu: (P,), not zero.
-        b: (nb,) of unit length.
+    The gradient (P, nb) has ``gradient b = 0`` and ``gradient^T mu = 0``; mu (P,) is not zero, b (nb,) of unit length.
     """
     size = float(mu @ mu)
     outer = np.outer(gradient.T.ravel(), np.outer(b, mu)) / size
@@ -97,12 +94,9 @@ class Lagrangian:
     def bound(self, minors: Array, cuts: Array | None = None) -> float:
         """Closed-form minimum over all z of objective + linear terms + z^T (minors - cuts) z; -inf unless H + M > 0.
 
-        Written around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far
-        below the roundoff of the objective itself is resolved.
-
-        Args:
-            minors: (k, k) combination of minors, zero at every rank-one point.
-            cuts: (k, k) form that is nonnegative at every feasible point.
+        The minors (k, k) are zero at every rank-one point, the cuts (k, k) nonnegative at every feasible one. Written
+        around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far below the
+        roundoff of the objective itself is resolved.
         """
         extra = minors if cuts is None else minors - cuts
         if not len(self.z):

@@ -58,13 +58,7 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
 
 def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Array],
           linear: Linear) -> tuple[Array, dict[int, Array], Array, Array] | None:
-    """Solve the relaxation around a point; None where the solver returns no multipliers.
-
-    Args:
-        objective: without linear terms, in whitened coordinates.
-        blocks: position and shape of every block.
-        cones: constraint matrices by block.
-        linear: constraints on the lifted vector.
+    """Solve the relaxation around a point, in whitened coordinates; None where the solver returns no multipliers.
 
     Returns:
         What the solver found, before any check: the combination (k, k) of minors; by block the weights (r, r, nb, nb),

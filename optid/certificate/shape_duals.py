@@ -101,13 +101,8 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
 def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:
     """Weights (r, r) of products of rows whose form Q = C^T weights C has ``Q mu = C^T nu / 2``.
 
-    Any second factor rho = C^T kappa with kappa >= 0 and rho^T mu = 1 will do; the one nearest to mu / ||mu||^2
-    disturbs the rest least.
-
-    Args:
-        nu: (r,) multipliers >= 0, zero where C mu > 0.
-        cone: (r, P).
-        mu: (P,).
+    The multipliers nu (r,) are >= 0, and zero where C mu > 0. Any second factor rho = C^T kappa with kappa >= 0 and
+    rho^T mu = 1 will do; the one nearest to mu / ||mu||^2 disturbs the rest least.
     """
     kappa = nnls(cone.T, mu)[0]
     reach = float(kappa @ (cone @ mu))
@@ -120,12 +115,8 @@ def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:
 def align_cuts(weights: Array, cone: Array, mu: Array, b: Array, nu: Array) -> Array:
     """Make the cut weights of a relaxation exact at a point: no value there, and the gradient of the multipliers nu.
 
-    Args:
-        weights: (r, r, nb, nb), positive semidefinite for every pair of rows.
-        cone: (r, P).
-        mu: (P,).
-        b: (nb,) of unit length.
-        nu: (r,) KKT multipliers.
+    The weights (r, r, nb, nb) are positive semidefinite for every pair of rows; cone (r, P), mu (P,), b (nb,) of unit
+    length, nu (r,).
     """
     values = cone @ mu
     active = np.abs(values) <= ACTIVE * (np.abs(cone) @ np.abs(mu))

@@ -182,11 +182,9 @@ def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, Any], np.
 
 
 def row_sizes(expression: cp.Expression, usual: Mapping[int, float]) -> np.ndarray:
-    """Return how much every entry of an expression changes when its variables have their usual size; never zero.
+    """Return the change of every entry of an affine or smooth expression by variables of usual size; never zero.
 
-    Args:
-        expression: affine or smooth.
-        usual: {id of a variable: usual size of its entries}; one where it is not named.
+    The usual size of the entries is given by the id of a variable; it is one where it is not.
     """
     rng = np.random.default_rng(0)
     with _values_kept(expression.variables()) as variables:

@@ -85,11 +85,8 @@ def measure_violation(program: Program) -> tuple[float, str]:
 def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
     """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
 
-    Every variable counts with its largest entry, so that the measure does not depend on units.
-
-    Args:
-        member: the constraint.
-        usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
+    Every variable counts with its largest entry, so that the measure does not depend on units, but not below its usual
+    size: at a point where it vanishes only roundoff is left of it.
     """
     expressions = [member.expr] if isinstance(member, EQUALITIES | INEQUALITIES) else member.args
     sizes = [_terms(expression, usual or {}) for expression in expressions]

@@ -83,10 +83,8 @@ def spans(group: Sequence[Constraint]) -> list[slice]:
 def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
     """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
-    Args:
-        limits: of the members of the constraint.
-        steps: what a small step of each is: bounds are compared by what such a step gains.
-        multipliers: of their rows as they are posed, flat over the members, per unit of the objective.
+    Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are posed,
+    flat over the members, per unit of the objective.
     """
     totals = {}
     for number, (limit, span) in enumerate(zip(limits, spans([limit.member for limit in limits]))):

@@ -75,12 +75,7 @@ class View(Mapping[str, cp.Expression]):
     def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> cp.Variable:
         """Return a new variable that a constraint needs for itself, such as the matrix of a Lyapunov inequality.
 
-        It becomes a variable of every programme in which the constraint stands.
-
-        Args:
-            name: its name.
-            shape: its shape.
-            attributes: CVXPY attributes, such as ``symmetric=True``.
+        It becomes a variable of every programme in which the constraint stands; the attributes are CVXPY's.
         """
         variable = cp.Variable(shape, name=name, **attributes)
         self._auxiliaries.add(variable.id)
@@ -205,11 +200,7 @@ class View(Mapping[str, cp.Expression]):
     def weights(self, channel: str | None, row: np.ndarray, output: str | None, direct: float = 1.0) -> np.ndarray:
         """Return w of one output with ``Theta w = (row B + direct D_output) of every function``, with A and C held.
 
-        Args:
-            channel: name of the input; its Theta is (functions, n) where it has no direct feedthrough.
-            row: (n,) weights of the states.
-            output: name of the output.
-            direct: weight of its feedthrough.
+        The row (n,) weighs the states. The Theta of an input without direct feedthrough is (functions, n).
         """
         a, c = self.reference["A"], self.reference["C"]
         found = np.concatenate([row, np.zeros(len(c))])

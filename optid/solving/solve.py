@@ -314,14 +314,9 @@ class Outcome:
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
-    """Solve a programme, or drive a procedure that yields programmes, with one solver.
+    """Solve a programme, or drive a procedure that yields programmes and returns the model, with settings of `solve`.
 
     The time that a procedure itself takes, between its programmes, counts as building.
-
-    Args:
-        problem: a `Program`, or a generator that yields programmes, receives their solutions and returns the model.
-        solver: as in `solve`.
-        settings: as in `solve`.
     """
     constrained: dict[str, tuple[Program, Solution]] = {}
     steps: list[tuple[str, Solution]] = []

@@ -37,13 +37,7 @@ class LocalSolution:
 
 
 def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array], list[Array]]]:
-    """Starting factors in whitened coordinates: the whitened SVD, the plain SVD split, further pairs, random ones.
-
-    Args:
-        core: the reduced problem.
-        count: how many.
-        seed: of the random directions b.
-    """
+    """Starting factors in whitened coordinates: the whitened SVD, the plain SVD split, further pairs, random ones."""
     if not core.shapes:  # linear least squares: nothing to start
         return [([], [])]
     estimates = matrices(core.least_squares, core.shapes)
@@ -215,12 +209,6 @@ def _normal_equations(design: Array, target: Array) -> Array:
 
 def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0) -> LocalSolution:
     """Best local minimiser over several starts, or the one reached from a given start.
-
-    Args:
-        problem: the least-squares problem.
-        start: descend from here only.
-        count: number of starts when none is given.
-        seed: of the random starts.
 
     Raises:
         RankError: the compressed regressor is singular.

@@ -98,12 +98,9 @@ class GroupProblem:
         return 0.5 * float(self.target @ self.target) - 0.5 * float(rest @ rest), point
 
     def certainly_zero(self, point: Array, gap: float, penalty: float) -> np.ndarray:
-        """Return which groups (G,) are zero in every minimiser.
+        """Return which groups (G,) are zero in every minimiser, from a feasible point (m,) of the dual.
 
-        Args:
-            point: (m,) a feasible point of the dual.
-            gap: a value of the primal less that of the dual at the point.
-            penalty: lambda.
+        The gap is a value of the primal less that of the dual at the point.
         """
         # the lengths and the gap are sums of about m rounded terms
         rounding = 1e-14 * float(self.target @ self.target)

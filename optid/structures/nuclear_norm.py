@@ -304,12 +304,9 @@ class Group:
 
 
 def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the first samples of the windows whose samples are all usable, in the stacked record.
+    """Return the first samples of the windows of some rows whose samples are all usable, in the stacked record.
 
-    Args:
-        lengths: samples of every experiment.
-        rows: samples of a window.
-        usable: (N,) per experiment.
+    Lengths are those of the experiments; usable is (N,) for each.
     """
     if sum(lengths) < rows:
         return np.zeros(0, dtype=int)

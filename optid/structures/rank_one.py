@@ -199,12 +199,8 @@ def _solve_upper(triangle: Array, right: Array) -> Array:
 def reduce(problem: RankOne, keep: tuple[int, ...] = (), keep_linear: bool = False) -> Core:
     """Eliminate what is linear and whiten the rest.
 
-    The Schur complement of leading columns is the trailing triangle of the root itself, so nothing is squared.
-
-    Args:
-        problem: the problem.
-        keep: blocks that stay in the core although they have one row or one column.
-        keep_linear: keep w, because constraints act on it.
+    Blocks with one row or one column stay in the core where they are to be kept, and w where constraints act on it. The
+    Schur complement of leading columns is the trailing triangle of the root itself, so nothing is squared.
     """
     return _reduced(problem, keep, keep_linear) if keep or keep_linear else problem.core
 

@@ -57,10 +57,7 @@ def invert_triangular(factor: Array, lower: bool = True) -> Array:
 def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
     """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
 
-    Args:
-        theta: (P, nb).
-        factor_mu: (P, P) lower triangular.
-        factor_b: (nb, nb) lower triangular.
+    Theta is (P, nb); the factors (P, P) and (nb, nb) are lower triangular.
     """
     left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
     return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
@@ -120,12 +117,9 @@ class Whitening:
 
 
 def whiten(root: Array, shapes: tuple[tuple[int, int], ...], linear: int = 0) -> Whitening:
-    """Choose the coordinates from the root of the Gram matrix.
+    """Choose the coordinates of blocks (P_i, nb_i) from the root (n, n) of the Gram matrix.
 
-    Args:
-        root: (n, n) upper triangular; its first ``linear`` columns belong to unknowns outside the blocks.
-        shapes: (P_i, nb_i) of every block, in the order of the columns.
-        linear: number of leading columns outside the blocks.
+    Its first ``linear`` columns belong to unknowns outside the blocks.
     """
     parts = [root[:, where] for where in block_slices(shapes, linear)]
     pairs = [kronecker_factors(part.T @ part, shape) for part, shape in zip(parts, shapes)]
