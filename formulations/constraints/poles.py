@@ -58,10 +58,6 @@ class Side:
         matrix = self.constant + z * self.linear + np.conj(z) * self.linear.T
         return float(np.min(np.linalg.eigvalsh(matrix)))
 
-    def inequality(self, p: Any, q: Any) -> Any:
-        """Return the CVXPY constraint on P and Q = A P, both (n, n)."""
-        return cp.kron(self.constant, p) + cp.kron(self.linear, q) + cp.kron(self.linear.T, q.T) >> 0
-
 
 def disc_side(radius: float, centre: float = 0.0) -> Side:
     """|z - centre| <= radius, by the Schur complement of ``radius² - |z - centre|²``."""
@@ -103,7 +99,8 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available")
-    return [side.inequality(*view.poles) for side in sides]
+    p, q = view.poles
+    return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
 
 
 def disc(centre: float, radius: float) -> Rule:

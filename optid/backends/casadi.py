@@ -224,11 +224,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
     statistics = solver.stats()
     word, status = _status(statistics)
-    iterations = int(statistics.get("iter_count", -1))
-    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations, compile=compiling)
-    values, duals = form.restore(program, np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
-    return Answer(status, word, values, duals, iterations, compiling)
+    return form.answer(program, status, word, np.asarray(found["x"]), np.asarray(found["lam_g"]),
+                       iterations=int(statistics.get("iter_count", -1)), compile=compiling)
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:

@@ -22,8 +22,10 @@ from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
 from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
+from optid.backends.back_end import Answer
 from optid.errors import StructureError
 from optid.program.program import Program
+from optid.program.solution import Status
 
 CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
@@ -100,18 +102,20 @@ class Smooth:
         self.attributes.update_parameters(self.original)
         return _flat([parameter.value for parameter in self.parameters])
 
-    def restore(self, program: Program, x: np.ndarray, multipliers: np.ndarray
-                ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Map a flat point and the flat multipliers of the rows back to the programme.
+    def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
+        """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
 
         Args:
-            program: whose problem this is.
+            program: the programme.
+            status: what the solver claims, in our words.
+            word: in its own.
             x: (unknowns,) point of the smooth problem.
             multipliers: (rows,) in the convention ``L = f + multipliers * row``; empty where there are none.
-
-        Returns:
-            ({variable: value}, {constraint: flat multipliers}); groups without multipliers are absent.
+            figures: further attributes of the answer.
         """
+        if status in (Status.INFEASIBLE, Status.UNBOUNDED):
+            return Answer(status, word, **figures)
+        x, multipliers = np.ravel(x), np.ravel(multipliers)
         primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, _split(
             x, [v.size for v in self.variables]))}
         dual = dict(zip((row.id for row in self.rows), _split(multipliers, [row.expression.size for row in self.rows]))
@@ -119,9 +123,9 @@ class Smooth:
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
         values, duals = solution.primal_vars, solution.dual_vars
-        return ({name: values[v.id] for name, v in program.variables.items() if v.id in values},
-                {name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-                 for name, group in program.constraints.items() if all(member.id in duals for member in group)})
+        return Answer(status, word, {name: values[v.id] for name, v in program.variables.items() if v.id in values}, {
+            name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
+            for name, group in program.constraints.items() if all(member.id in duals for member in group)}, **figures)
 
 
 def smooth(problem: cp.Problem) -> Smooth:

@@ -185,21 +185,6 @@ class StepQP:
         for row in self.rows:
             if row.lifted is not None and row.name in duals:
                 pull = pull + row.lifted[0].T @ duals[row.name][row.span] / 2
-        jacobian = problem.root @ lift
-        hessian = jacobian.T @ jacobian
-        diagonal = np.diag(hessian)
-        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), 1e-300)))
-        if second_order:
-            hessian = hessian + self.at.curvature(x, pull)
-        scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
-        factor = _cholesky(scaled, shift)
-        if factor is None:
-            factor = _definite(scaled, self._active(duals, x) / scale, shift)
-        upper = factor.T * (scale * self._scale)
-        self._unit = max(float(np.max(np.abs(upper))), 1e-300)
-        descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
-        self._model = upper / self._unit, (upper @ (x / self._scale) - descent) / self._unit
-        self._held = x[self._pins] / self._scale[self._pins]
         self.at.assign(x)
         for row in self.rows:
             if row.lifted is not None:
@@ -209,6 +194,21 @@ class StepQP:
             else:
                 continue
             row.level = value - row.slope @ x
+        jacobian = problem.root @ lift
+        hessian = jacobian.T @ jacobian
+        diagonal = np.diag(hessian)
+        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), 1e-300)))
+        if second_order:
+            hessian = hessian + self.at.curvature(x, pull)
+        scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
+        factor = _cholesky(scaled, shift)
+        if factor is None:
+            factor = _definite(scaled, self._active(duals) / scale, shift)
+        upper = factor.T * (scale * self._scale)
+        self._unit = max(float(np.max(np.abs(upper))), 1e-300)
+        descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
+        self._model = upper / self._unit, (upper @ (x / self._scale) - descent) / self._unit
+        self._held = x[self._pins] / self._scale[self._pins]
 
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
@@ -272,18 +272,12 @@ class StepQP:
         return Program("step", cp.Minimize(cp.sum_squares(r)), {name: tuple(group) for name, group in groups.items()},
                        {**stand_ins, "_r": r}, {}, dict, at.program.view), matrices
 
-    def _active(self, duals: Values, x: np.ndarray) -> np.ndarray:
-        """Gradients (r, size) of the equalities and of the inequalities with a multiplier, at x."""
-        self.at.assign(x)
-        found = [np.zeros((0, self.at.size))]
+    def _active(self, duals: Values) -> np.ndarray:
+        """Gradients (r, size) of the equalities and of the inequalities with a multiplier."""
         least = 1e-6 * max((float(np.max(np.abs(dual), initial=0.0)) for dual in duals.values()), default=0.0)
-        for name, group in self.at.program.constraints.items():
-            for member, span in zip(group, spans(group)) if name in duals else ():
-                if isinstance(member, EQUALITIES):
-                    found.append(self.slope(member.expr))
-                elif isinstance(member, INEQUALITIES):
-                    found.append(self.slope(member.expr)[duals[name][span] > least])
-        return np.vstack(found)
+        found = [row.slope if row.equality else row.slope[duals[row.name][row.span] > least]
+                 for row in self.rows if row.name in duals]
+        return np.vstack([np.zeros((0, self.at.size)), *found])
 
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""

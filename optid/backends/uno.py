@@ -44,12 +44,8 @@ def run(program: Program, settings: Settings) -> Answer:
     compiling = time.perf_counter() - clock
     result = solver.optimize(model)
     word, status = _status(str(result.optimization_status), str(result.solution_status))
-    iterations = int(result.number_iterations)
-    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations, compile=compiling)
-    values, duals = form.restore(program, np.array(list(result.primal_solution)),
-                                 np.array(list(result.constraint_dual_solution)))
-    return Answer(status, word, values, duals, iterations, compiling)
+    return form.answer(program, status, word, list(result.primal_solution), list(result.constraint_dual_solution),
+                       iterations=int(result.number_iterations), compile=compiling)
 
 
 def options(settings: Settings) -> dict[str, Any]:

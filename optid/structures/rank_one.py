@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, get_lapack_funcs
+from scipy.linalg import get_lapack_funcs
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
@@ -85,9 +85,17 @@ class Point:
 
     def tangent(self) -> Array:
         """Return the Jacobian of `lift` in [w; mu_1; b_1; mu_2; ...]."""
-        factors = [np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
-                   for mu, b in zip(self.mus, self.bs)]
-        return np.asarray(block_diag(np.eye(len(self.w)), *factors))
+        row = column = len(self.w)
+        found = np.zeros((row + sum(mu.size * b.size for mu, b in zip(self.mus, self.bs)),
+                          row + sum(mu.size + b.size for mu, b in zip(self.mus, self.bs))))
+        found[:row, :row] = np.eye(row)
+        for mu, b in zip(self.mus, self.bs):
+            p, q = mu.size, b.size
+            block = found[row : row + p * q, column : column + p + q].reshape(q, p, p + q)
+            block[:, :, :p] = b[:, None, None] * np.eye(p)
+            block[:, :, p:] = np.eye(q)[:, None, :] * mu[:, None]
+            row, column = row + p * q, column + p + q
+        return found
 
     def normalised(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""

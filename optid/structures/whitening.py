@@ -16,22 +16,19 @@ from optid.arrays import Array
 _trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 
 
-def kronecker_factors(gram: Array, shape: tuple[int, int], passes: int = 5) -> tuple[Array, Array]:
+def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)``.
 
     Flip-flop iteration, the maximum-likelihood fit of a separable covariance (Dutilleul, J. Stat. Comput. Simul. 64,
     1999): each factor in turn is the average of the other one's whitened blocks.
 
-    Args:
-        gram: (P nb, P nb) positive semidefinite.
-        shape: (P, nb).
-        passes: alternations; five are enough for coordinates.
+    The Gram matrix is (P nb, P nb), the shape (P, nb).
     """
     p, nb = shape
     paired = gram.reshape(nb, p, nb, p).transpose(0, 2, 1, 3).reshape(nb * nb, p * p)
     inverse_b = np.eye(nb)
     factor_mu, factor_b = np.eye(p), np.eye(nb)
-    for _ in range(passes):
+    for _ in range(5):  # enough for coordinates
         factor_mu, inverse_mu = _factor((inverse_b.ravel() @ paired).reshape(p, p) / nb)
         factor_b, inverse_b = _factor((paired @ inverse_mu.ravel()).reshape(nb, nb) / p)
     return factor_mu, factor_b
