@@ -15,8 +15,8 @@ import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
-from cvxpy.constraints.zero import Equality, Zero
+from cvxpy.constraints.nonpos import NonNeg
+from cvxpy.constraints.zero import Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
 from cvxpy.reductions.solution import Solution as ReducedSolution
@@ -24,6 +24,7 @@ from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.backends.back_end import Answer
 from optid.errors import StructureError
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -242,10 +243,8 @@ class _SmoothChain(Dnlp2Smooth):
 
 
 def _row(constraint: Constraint) -> Row:
-    if isinstance(constraint, Equality | Zero):
-        return Row(constraint.expr, True, constraint.id)
-    if isinstance(constraint, Inequality | NonPos):
-        return Row(constraint.expr, False, constraint.id)
+    if isinstance(constraint, EQUALITIES | INEQUALITIES):
+        return Row(constraint.expr, isinstance(constraint, EQUALITIES), constraint.id)
     if isinstance(constraint, NonNeg):
         return Row(-constraint.args[0], False, constraint.id)
     raise StructureError(

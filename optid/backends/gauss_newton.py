@@ -11,7 +11,6 @@ import numpy as np
 from optid.backends.back_end import Answer, Settings
 from optid.backends.choice import find
 from optid.backends.step_qp import Coordinates, StepQP
-from optid.certificate.infeasibility import satisfiable
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
@@ -99,10 +98,7 @@ class _Constrained:
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
-            if not satisfiable(self.program, list(self.program.user_constraints)):
-                return Answer(Status.INFEASIBLE, "the constraints contradict each other")
-            return Answer(Status.FAILED,
-                          "no start satisfies the constraints, although they do not contradict each other")
+            return Answer(Status.FAILED, "no start satisfies the constraints")
         tried.sort(key=lambda pair: pair[0])
         distinct: list[np.ndarray] = []
         for _, x in tried:

@@ -133,9 +133,7 @@ def _width(variable: cp.Variable) -> float:
 
 def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
     """By how much the gradient can lower the Lagrangian inside the box and the bounds that the variable carries."""
-    gradient = np.reshape(lagrangian.total[variable.id], variable.shape, order="F")
-    if variable.attributes["symmetric"]:
-        gradient = (gradient + gradient.T) / 2
+    gradient = lagrangian.gradient(variable)
     room = np.full(variable.shape, _width(variable))
     if (bounds := bounds_of(variable)) is not None:
         value = np.asarray(variable.value, dtype=float)

@@ -49,12 +49,10 @@ class Certification:
 
     Attributes:
         bound: lower bound on the global optimum.
-        gap: (F - D) / max(F, 1e-9 Y^T Y).
         better: candidates for a better point, to restart a local method from; only from the SDP.
     """
 
     bound: Bound
-    gap: float
     better: tuple[Point, ...] = ()
 
 
@@ -143,7 +141,7 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
         max_size: number of multipliers above which the SDP is not attempted.
 
     Returns:
-        The bound, its gap and, after an SDP that did not prove the point, points to restart from.
+        The bound and, after an SDP that did not prove the point, points to restart from.
 
     Raises:
         StructureError: constraints of a wrong shape, an unknown effort.
@@ -298,5 +296,5 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     else:
         reason = f"not proved, no finite bound: {how}"
     evidence = Multipliers(case.core, minors, cuts, case.lam if linear is None else linear)
-    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
+    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence),
                          () if proved else better)

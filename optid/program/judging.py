@@ -200,14 +200,17 @@ class Lagrangian:
             worst = max(worst, relative_gradient(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
         return worst
 
+    def gradient(self, variable: cp.Variable) -> np.ndarray:
+        """Return the gradient in the shape of a variable, symmetric where the variable is."""
+        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
+        return (gradient + gradient.T) / 2 if variable.attributes["symmetric"] else gradient
+
     def free_part(self, variable: cp.Variable) -> np.ndarray | None:
         """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
         flags = variable.attributes
         if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
             return None
-        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
-        if flags["symmetric"]:
-            gradient = (gradient + gradient.T) / 2
+        gradient = self.gradient(variable)
         if (bounds := bounds_of(variable)) is not None:
             value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
             held = ((value <= bounds[0] + margin) & (gradient > 0)) | ((value >= bounds[1] - margin) & (gradient < 0))

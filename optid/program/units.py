@@ -103,7 +103,8 @@ def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[s
         alone = word == "b" and "mu" + name[1:] not in expressions  # of an input that acts linearly
         factor = r if word in HEIGHTS or alone else 1.0
         if factor != 1.0 and word in ("mu", "Theta", "b", "static"):
-            factor /= units.u_scale[_position(channel.rstrip("]"), inputs)]
+            channel = channel.rstrip("]")
+            factor /= units.u_scale[inputs.index(channel) if channel in inputs else 0]
         found[name] = expression if factor == 1.0 else factor * expression
         if word in SIGNALS:
             level = np.array(units.y_offset)
@@ -111,10 +112,6 @@ def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[s
     if "offset" in found:
         found["offset"] = found["offset"] + _level(found, units, inputs, states)
     return found
-
-
-def _position(channel: str, inputs: Sequence[str]) -> int:
-    return list(inputs).index(channel) if channel in inputs else 0
 
 
 def _level(found: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> Any:

@@ -108,11 +108,7 @@ class View(Mapping[str, cp.Expression]):
         return "C" in self.reference and "C" not in self
 
     def basis(self, channel: str | None) -> Any:
-        """Return the basis of an input, of the only one where none is named.
-
-        Raises:
-            StructureError: several inputs and none named, or no such input.
-        """
+        """Return the basis of an input, of the only one where none is named; raises as `channel`."""
         return self.bases[self.channel(channel)]
 
     def channel(self, channel: str | None) -> str:
