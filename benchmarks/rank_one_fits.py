@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
-from optid.certificate import certify
-from optid.certificate.ladder import Certification
+from optid.certificate.ladder import Certification, certify
 from optid.errors import StructureError
 from optid.structures.bilinear import LocalSolution, best_of, descend, starts
 from optid.structures.rank_one import Array, Point, RankOne, matrices, reduce

@@ -238,11 +238,8 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (rows, levels, centre) such that every a with ``rows @ a >= levels`` has its roots in the disc.
 
-    Args:
-        reference: coefficients (na,) of the polynomial to centre on.
-        radius: of the disc.
-        keep: the reference itself has to lie inside, where its roots do: its centre is then pulled inwards no
-            further than that allows.
+    The region is centred on a reference polynomial (na,). With ``keep`` the centre is
+    pulled inwards no further than the reference, whose roots are inside, allows.
     """
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius

@@ -1,6 +1,5 @@
 """Every conic and QP solver that CVXPY knows, by name, with one requested accuracy translated per solver."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +7,7 @@ import cvxpy as cp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
+from optid.program.expressions import solve_quietly
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -73,10 +73,7 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
         options |= {key: options[key] * max(program.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
                     if key not in settings.options}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # inaccuracy is judged by our residuals, not by a warning
-            problem.solve(solver=name.upper(), verbose=settings.verbose, warm_start=settings.warm,
-                          **options)
+        solve_quietly(problem, name.upper(), verbose=settings.verbose, warm_start=settings.warm, **options)
     except Exception as error:  # a solver that crashes is an outcome
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
     status, statistics = STATUS.get(problem.status, Status.FAILED), problem.solver_stats
@@ -95,9 +92,7 @@ def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bo
     """Return whether the solver finds the constraints infeasible without an objective, where the dual is feasible."""
     bare = cp.Problem(cp.Minimize(0), problem.constraints)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            bare.solve(solver=name.upper(), **options)
+        solve_quietly(bare, name.upper(), **options)
     except Exception:  # no answer confirms nothing
         return False
     return STATUS.get(bare.status) is Status.INFEASIBLE

@@ -169,13 +169,9 @@ class StepQP:
         self.rows.append(_Rows(name, span, member, unit, slope, level))
 
     def set_model(self, x: np.ndarray, duals: Values, *, second_order: bool = True, damping: float = 0.0) -> None:
-        """Take the quadratic model of the Lagrangian at x, and the tangents there.
+        """Take the quadratic model of the Lagrangian at x, with the last step's multipliers, and the tangents there.
 
-        Args:
-            x: where.
-            duals: multipliers of the step before.
-            second_order: include the curvature of ``mu bᵀ``; not needed where b is pinned.
-            damping: added to the diagonal of the scaled Hessian.
+        The curvature of ``mu bᵀ`` is not needed where b is pinned; damping adds to the diagonal of the scaled Hessian.
         """
         problem = self.at.form.problem
         point = self.at.point(x)

@@ -1,13 +1,12 @@
 """Explain an infeasible set of constraints by a smallest conflicting subset, in the user's names."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import cvxpy as cp
 
 from optid.certificate.lifting import lift, places
-from optid.program.expressions import flat
+from optid.program.expressions import flat, solve_quietly
 from optid.program.gradients import flat_value, jacobians
 from optid.program.limits import EQUALITIES
 from optid.program.program import Program
@@ -24,8 +23,6 @@ def explain(program: Program) -> str:
     names = list(program.user_constraints)
     form = rank_one_of(program)
     stand_in = {} if form is None else places(program, form).stand_in
-    linearised = [name for name in names
-                  if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     conflict = conflicting_subset(program)
     if conflict is None:
         return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(names) or 'none'}) can be "
@@ -35,7 +32,8 @@ def explain(program: Program) -> str:
     else:
         text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
                 "relax or drop one of them (each subset without one of them can be satisfied)")
-    used = [name for name in linearised if name in conflict]
+    used = [name for name in conflict
+            if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")
 
 
@@ -77,10 +75,8 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     if not found:
         return True
     problem = cp.Problem(cp.Minimize(0), found)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate proof of a conflict is one as well
-        problem.solve(solver=cp.CLARABEL)
-    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+    solve_quietly(problem)
+    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)  # an inaccurate proof is one as well
 
 
 def _linearised(member: Any) -> Any:

@@ -7,7 +7,6 @@ is the Lagrangian dual written around a point z; its own dual is the moment rela
 where a better point may be. CVXPY poses it and Clarabel solves it; both are imported on first use.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -68,6 +67,8 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     import cvxpy as cp
     from scipy.sparse import csc_array, hstack
 
+    from optid.program.expressions import solve_quietly
+
     z = objective.z
     k = len(z)
     unit = float(np.linalg.norm(objective.slope)) or 1.0
@@ -98,9 +99,7 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     lifted = cp.bmat([[corner, column.T], [column, objective.gram + square]]) >> 0
     problem = cp.Problem(cp.Maximize(level), [lifted, *constraints])
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "may be inaccurate": whatever comes back is checked and repaired
-            problem.solve(solver=cp.CLARABEL)
+        solve_quietly(problem)  # whatever comes back is checked and repaired
     except cp.SolverError:
         return None
     if weights.value is None or lifted.dual_value is None:

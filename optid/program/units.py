@@ -89,13 +89,9 @@ def energy_unit(units: Transform) -> float:
 
 
 def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> dict[str, Any]:
-    """Return the named expressions of a programme in the units of the record.
+    """Return the named expressions of a programme in the units of the record, to which ``units`` leads.
 
-    Args:
-        expressions: by name, in the units of the programme.
-        units: from those of the programme to those of the record.
-        inputs: names of the inputs.
-        states: whether the constant is that of the output equation of a state-space model.
+    The constant of a state-space model (``states``) is that of its output equation.
     """
     r, found = units.y_scale[0], {}
     for name, expression in expressions.items():

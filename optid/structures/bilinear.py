@@ -221,8 +221,6 @@ def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, se
 
 def best_of(core: Core, count: int = 8, seed: int = 0, iterations: int = 1000, first: int = 0) -> LocalSolution:
     """Best local minimiser of a reduced problem over the starts ``first .. count - 1``."""
-    if not core.shapes:
-        return descend(core, [])
     found = [descend(core, bs, iterations, alternations=0 if k < 2 else 2)
              for k, (_, bs) in enumerate(starts(core, count, seed)) if k >= first]
     return min(found, key=lambda solution: solution.value)

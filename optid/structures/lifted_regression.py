@@ -70,10 +70,7 @@ def _square_root(matrix: Array) -> Array:
 def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) -> list[tuple[Array, Array]]:
     """Return the (mu, vec b) nearest to every Theta_c (P_c, nb_c l) (Luo, Algorithm 3.1; Bai, Automatica 34, 1998).
 
-    Args:
-        core: of the problem.
-        thetas: one matrix per block.
-        whitened: nearest in the Kronecker metric of the Gram matrix, not in the Frobenius norm.
+    Nearest is meant in the Kronecker metric of the core's Gram matrix, or in the Frobenius norm.
     """
     pairs = []
     for c, theta in enumerate(thetas):
