@@ -65,7 +65,11 @@ def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: i
         outside, moved = np.linalg.norm(reached - low_rank), np.linalg.norm(low_rank - before)
         sizes = np.linalg.norm(scaled) / max(float(np.linalg.norm(low_rank)), 1e-300)
         change = FIRST[1] if count <= FIRST[0] else FACTOR
-        factor = 1.0 if count > limit // 2 else _rebalanced(float(outside * np.sqrt(sizes)), float(moved), change)
+        # the step grows where the constraint lags behind, and shrinks where the matrix does; the measure lies between
+        # that of absolute and that of relative residuals, either of which circles for thousands of iterations
+        lag = outside * np.sqrt(sizes)
+        factor = change if lag > BALANCE * moved else 1.0 / change if moved > BALANCE * lag else 1.0
+        factor = 1.0 if count > limit // 2 else factor
         step, scaled = step * factor, scaled / factor
     assert best is not None
     return best
@@ -82,14 +86,3 @@ def shrunk(matrix: Array, threshold: float) -> Array:
     kept = values > threshold**2
     factors = 1.0 - threshold / np.sqrt(values[kept])
     return (vectors[:, kept] * factors) @ (vectors[:, kept].T @ matrix)
-
-
-def _rebalanced(outside: float, moved: float, change: float) -> float:
-    """Factor of the step size: up where the constraint lags behind, down where the matrix does.
-
-    Small factors, and a measure between that of absolute and that of relative residuals: either alone circles for
-    thousands of iterations on some weights of the CD player.
-    """
-    if outside > BALANCE * moved:
-        return change
-    return 1.0 / change if moved > BALANCE * outside else 1.0

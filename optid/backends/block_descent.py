@@ -77,8 +77,7 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
     """Improve the active groups: sweeps of block descent, then a Newton step on those that are not zero."""
     if not active.size:
         return a
-    columns = np.concatenate([np.arange(int(problem.edges[g]), int(problem.edges[g + 1])) for g in active])
-    edges = np.concatenate([[0], np.cumsum(np.diff(problem.edges)[active])])
+    columns, edges = _columns(problem.edges, active)
     part = problem.design[:, columns]
     gram, pull = part.T @ part, part.T @ problem.target
     own = a[columns].copy()
@@ -90,14 +89,19 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
     return result
 
 
+def _columns(edges: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns of some groups, and the edges of these groups among them."""
+    return (np.concatenate([np.arange(int(edges[g]), int(edges[g + 1])) for g in groups]),
+            np.concatenate([[0], np.cumsum(np.diff(edges)[groups])]))
+
+
 def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array) -> Array:
     """Take one Newton step on the groups that are not zero, where it descends; scalars that change sign become zero."""
     norms = np.sqrt(np.add.reduceat(a**2, edges[:-1]))
     kept = np.flatnonzero(norms > 0)
     if not kept.size:
         return a
-    columns = np.concatenate([np.arange(edges[g], edges[g + 1]) for g in kept])
-    inner = np.concatenate([[0], np.cumsum(np.diff(edges)[kept])])
+    columns, inner = _columns(edges, kept)
     x, H = a[columns], gram[np.ix_(columns, columns)].copy()
     gradient = H @ x - pull[columns]
     for g, (lo, hi) in zip(kept, zip(inner, inner[1:])):

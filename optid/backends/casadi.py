@@ -10,6 +10,8 @@ infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay
 
 import time
 from collections.abc import Callable
+from functools import reduce
+from operator import mul
 from typing import Any
 
 import casadi as ca
@@ -76,11 +78,7 @@ def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
     """Return a CasADi matrix of a number, array or sparse matrix, column by column, without its zeros."""
     if sp.issparse(value):
-        value = sp.csc_array(sp.csc_array(value).reshape(shape, order="F"))
-        value.sum_duplicates()
-        value.sort_indices()
-        pattern = ca.Sparsity(*shape, value.indptr.tolist(), value.indices.tolist())
-        return ca.DM(pattern, value.data)
+        return ca.DM(sp.csc_array(sp.csc_array(value).reshape(shape, order="F")))
     return ca.sparsify(ca.DM(np.reshape(np.asarray(value, dtype=float), shape, order="F")))
 
 
@@ -152,10 +150,7 @@ def _power(expr: Any, columns: list) -> Any:
 def _prod(expr: Any, columns: list) -> Any:
     if expr.axis is not None:
         raise StructureError(f"{expr}: a product along an axis has no translation for CasADi's solvers")
-    result = columns[0][0]
-    for i in range(1, expr.args[0].size):
-        result = result * columns[0][i]
-    return result
+    return reduce(mul, ca.vertsplit(columns[0]))
 
 
 def _of_one(function: str) -> Callable[[Any, list], Any]:

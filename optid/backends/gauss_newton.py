@@ -23,7 +23,7 @@ from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
 from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.multipliers import fit_multipliers
-from optid.structures.rank_one import Point, reduce
+from optid.structures.rank_one import Point
 
 STEPS = 100
 DIRECTIONS = 4  # different directions b that are tried, each with both signs, before the full steps
@@ -120,7 +120,7 @@ class _Constrained:
 
     def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
-        core = reduce(self.problem)
+        core = self.problem.core
         points = [self.form.point(self.program.start)] if self.program.start else []
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
             points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import numpy as np
 
-from optid.certificate.minors import Block, Lagrangian, ascend, free_mask, project_minors, rotation, tangent_minors
+from optid.certificate.minors import Block, Quadratic, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
 from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_constraints, kkt_multipliers, sign_free_cut
 from optid.errors import StructureError
@@ -75,7 +75,7 @@ class Case:
     core: Core
     mus: list[Array]
     bs: list[Array]
-    objective: Lagrangian
+    objective: Quadratic
     cones: dict[int, Array]
     nu: dict[int, Array]
     lam: Array
@@ -109,15 +109,15 @@ class Case:
         found.append(np.where(self.linear.equality, np.abs(slack), -slack) / np.maximum(terms, np.finfo(float).tiny))
         return float(np.concatenate(found).max())
 
-    def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
+    def lagrangian(self, multipliers: Array | None = None) -> Quadratic:
         """The objective with the linear terms, at the KKT multipliers or others."""
         chosen = self.lam if multipliers is None else multipliers
-        return self.objective.with_linear(self.linear.rows, self.linear.slack(self.objective.z)[0], chosen)
+        slope = self.objective.slope + chosen @ self.linear.rows / 2
+        return replace(self.objective, slope=slope, linear_terms=-float(
+            chosen @ self.linear.slack(self.objective.z)[0]))
 
-    def cut_form(self, cuts: dict[int, Array]) -> Array | None:
+    def cut_form(self, cuts: dict[int, Array]) -> Array:
         """The (k, k) form of the weights ``cuts[i]`` (r, r, nb, nb) of products of cone rows."""
-        if not cuts:
-            return None
         form = np.zeros_like(self.objective.gram)
         for i, weights in cuts.items():
             cone, where = self.cones[i], self.blocks[i][0]
@@ -178,7 +178,8 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
     began = perf_counter()
     keep_linear = bool(linear.rows[:, :problem.linear].any())
-    core = reduce(problem, tuple(range(len(problem.blocks)) if len(linear.right) else cones), keep_linear)
+    keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
+    core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
     w, mus, bs = core.factors(point)
     white = {core.kept.index(i): core.whitening.cone(core.kept.index(i), cone) for i, cone in cones.items()}
     for i, cone in white.items():
@@ -193,7 +194,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     else:
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
+    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear, began)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
@@ -204,10 +205,7 @@ def instant_cuts(case: Case) -> dict[int, Array]:
 
 def tangent(case: Case, cuts: dict[int, Array]) -> Array:
     """Minors that cancel the rest of the gradient at the point, block by block; none for a block that is zero."""
-    slope = case.lagrangian().slope
-    form = case.cut_form(cuts)
-    if form is not None:
-        slope = slope - form @ case.objective.z
+    slope = case.lagrangian().slope - case.cut_form(cuts) @ case.objective.z
     minors = np.zeros_like(case.objective.gram)
     gradients = matrices(slope[case.core.linear:], case.core.shapes)
     for (where, _), mu, b, vanishes, gradient in zip(case.blocks, case.mus, case.bs, case.vanishing, gradients):
@@ -220,8 +218,7 @@ def tangent(case: Case, cuts: dict[int, Array]) -> Array:
 
 def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple[Array | None, int]:
     """Ascent from given multipliers that cancel the gradient; improved minors, or None, and the steps taken."""
-    form = case.cut_form(cuts)
-    matrix = case.objective.gram + minors - (0.0 if form is None else form)
+    matrix = case.objective.gram + minors - case.cut_form(cuts)
     turn = rotation(case.core.linear, case.mus, case.bs)
     free, taken = ascend(turn.T @ matrix @ turn, case.blocks, case.masks, steps)
     return (None if free is None else minors + onto_minors(case, turn @ free @ turn.T)), taken

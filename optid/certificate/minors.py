@@ -69,7 +69,7 @@ def cholesky(matrix: Array) -> Any | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Lagrangian:
+class Quadratic:
     """The objective around a feasible point, with the terms of constraints linear in z already added.
 
     Attributes:
@@ -86,27 +86,21 @@ class Lagrangian:
     value: float
     linear_terms: float = 0.0
 
-    def with_linear(self, rows: Array, slack: Array, multipliers: Array) -> "Lagrangian":
-        """Add ``multipliers @ (rows z - right)``; slack is right - rows z at the point."""
-        slope = self.slope + multipliers @ rows / 2
-        return Lagrangian(self.gram, self.z, slope, self.value, self.linear_terms - float(multipliers @ slack))
-
-    def bound(self, minors: Array, cuts: Array | None = None) -> float:
+    def bound(self, minors: Array, cuts: Array) -> float:
         """Closed-form minimum over all z of objective + linear terms + z^T (minors - cuts) z; -inf unless H + M > 0.
 
         The minors (k, k) are zero at every rank-one point, the cuts (k, k) nonnegative at every feasible one. Written
         around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far below the
         roundoff of the objective itself is resolved.
         """
-        extra = minors if cuts is None else minors - cuts
         if not len(self.z):
             return self.value
+        extra = minors - cuts
         factor = cholesky(self.gram + extra)
         if factor is None:
             return -np.inf
         half, _ = _trtrs(factor, self.slope + extra @ self.z, trans=1)
-        at_point = self.linear_terms - (0.0 if cuts is None else float(self.z @ cuts @ self.z))
-        return self.value + at_point - float(half @ half)
+        return self.value + self.linear_terms - float(self.z @ cuts @ self.z) - float(half @ half)
 
 
 def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:

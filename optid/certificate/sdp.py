@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.certificate.minors import Block, Lagrangian
+from optid.certificate.minors import Block, Quadratic
 from optid.certificate.shape_duals import Linear
 from optid.structures.rank_one import Array
 
@@ -55,7 +55,7 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
     return csc_array((values, (rows, columns)), shape=(size**2, len(first) * nb**2))
 
 
-def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Array],
+def relax(objective: Quadratic, blocks: Sequence[Block], cones: Mapping[int, Array],
           linear: Linear) -> tuple[Array, dict[int, Array], Array, Array] | None:
     """Solve the relaxation around a point, in whitened coordinates; None where the solver returns no multipliers.
 

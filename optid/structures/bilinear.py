@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
+from optid.structures.rank_one import Array, Core, Point, RankOne, matrices
 from optid.structures.whitening import block_slices
 
 _posv, _trtrs = get_lapack_funcs(("posv", "trtrs"), dtype=float)
@@ -213,7 +213,7 @@ def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, se
     Raises:
         RankError: the compressed regressor is singular.
     """
-    core = reduce(problem)
+    core = problem.core
     if start is not None:
         return descend(core, core.factors(start)[2])
     return best_of(core, count, seed)

@@ -63,7 +63,7 @@ class RankOne:
     @cached_property
     def core(self) -> "Core":
         """The reduction that keeps nothing in the core (`reduce`): start, solver and proof share it."""
-        return _reduced(self, (), False)
+        return reduce(self)
 
     def value(self, z: Array) -> float:
         """Objective at the lifted vector z (n,)."""
@@ -210,10 +210,6 @@ def reduce(problem: RankOne, keep: tuple[int, ...] = (), keep_linear: bool = Fal
     Blocks with one row or one column stay in the core where they are to be kept, and w where constraints act on it. The
     Schur complement of leading columns is the trailing triangle of the root itself, so nothing is squared.
     """
-    return _reduced(problem, keep, keep_linear) if keep or keep_linear else problem.core
-
-
-def _reduced(problem: RankOne, keep: tuple[int, ...], keep_linear: bool) -> Core:
     slices = problem.slices
     kept = tuple(i for i, shape in enumerate(problem.blocks) if min(shape) > 1 or i in keep)
     chunks = [slices[i] for i in range(len(slices)) if i not in kept]
