@@ -22,6 +22,7 @@ from optid.program.gradients import flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
+from optid.program.structure import variable_size
 from optid.structures.least_squares import LeastSquaresStructure
 from optid.structures.multipliers import least_distance
 
@@ -127,8 +128,7 @@ def _hessian(program: Program) -> Array:
 
 
 def _width(variable: cp.Variable) -> float:
-    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
-    return REACH * (size or 1.0)
+    return REACH * variable_size(flat_value(variable), None)
 
 
 def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:

@@ -112,13 +112,10 @@ def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
 
 def ascend(matrix: Array, blocks: Sequence[Block], masks: Sequence[np.ndarray],
            steps: int) -> tuple[Array | None, int]:
-    """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken.
+    """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken, an eigenvalue decomposition each.
 
-    Args:
-        matrix: (k, k) H + M_tangent (- cuts) in rotated coordinates.
-        blocks: position and shape of every block.
-        masks: entries, as (P nb, P nb), of the minors that are free.
-        steps: eigenvalue decompositions at most.
+    The matrix (k, k) is H + M_tangent (- cuts) in rotated coordinates; masks, as (P nb, P nb), tell which entries of
+    the minors of a block are free.
     """
     current, memory = matrix, np.zeros_like(matrix)
     aim = 0.1 * float(np.trace(matrix)) / len(matrix)  # inside the cone: its boundary is reached only in the limit

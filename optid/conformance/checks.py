@@ -84,10 +84,7 @@ def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
 def check_formulation(formulation: str | Callable[..., Any], data: Data, **arguments: Any) -> None:
     """Pose a formulation on a record, on damaged copies of it, and on what it must refuse.
 
-    Args:
-        formulation: registered name, or the function itself.
-        data: a record that the model should describe, with at least 100 samples.
-        arguments: of the formulation.
+    The record is one that the model should describe, with at least 100 samples; the arguments are the formulation's.
 
     Raises:
         ConformanceError: lists all complaints.

@@ -21,15 +21,10 @@ KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNu
 
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
-    """Measure a point: objective, violation, stationarity and complementarity.
+    """Measure a point: recomputed objective, violation, stationarity and complementarity.
 
-    Args:
-        program: the programme.
-        values: {variable: array}; derived variables are recomputed from the others first.
-        duals: {constraint: flat multipliers}; names may be missing.
-
-    Returns:
-        The recomputed objective and the residuals; see `Residuals` for where they are ``nan``.
+    Derived variables are recomputed from the others first. The duals are flat multipliers by constraint, of which some
+    may be missing; see `Residuals` for where the measurements are ``nan``.
     """
     program.assign(values)
     violation, worst = measure_violation(program)

@@ -17,11 +17,9 @@ from optid.program.view import Values, View
 
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
-    """Bring what a constraint builder returned into the form {name: (limit, ...)}.
+    """Bring what a builder returned, CVXPY constraints or `Limit` objects, into the form {name: (limit, ...)}.
 
-    Args:
-        built: a CVXPY constraint or a `Limit`, a list of them, or a dictionary of either.
-        default: name used where the builder gave none.
+    It returns one of them, a list, or a dictionary of either; the default is the name where it gave none.
 
     Raises:
         StructureError: when something in it is not a CVXPY constraint.

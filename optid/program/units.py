@@ -25,12 +25,9 @@ HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", 
 def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> Transform:
     """Return the units in which outputs, and inputs that act linearly, have mean zero and variance one.
 
-    Of a stream the first chunk with samples decides; any fixed choice near the record serves.
-
-    Args:
-        data: the record, a `Data` or a `Stream`.
-        linear: whether each input acts linearly; the others keep their units, which their bases take care of.
-        centred: subtract the means; False for a model without a constant.
+    Inputs that do not act linearly keep their units, which their bases take care of. The means of a model without a
+    constant stay (not ``centred``). Of a stream the first chunk with samples decides; any fixed choice near the record
+    serves.
     """
     experiments = getattr(data, "experiments", None)
     arrays = [(e.u, e.y) for e in experiments] if experiments else [data.first_chunk()]

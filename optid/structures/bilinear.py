@@ -68,13 +68,8 @@ def descend(core: Core, bs: list[Array], iterations: int = 1000, alternations: i
 
     The mu are eliminated at every step (variable projection, Golub and Pereyra 1973), so that a valley along which
     large mu of correlated inputs cancel, however narrow, is no obstacle. A step d b_i is measured in units of
-    ||mu_i||; directions of negative curvature are followed downwards.
-
-    Args:
-        core: the reduced problem; without blocks the answer is exact least squares.
-        bs: whitened starting b_i.
-        iterations: at most.
-        alternations: alternating half-steps for mu and b before Newton starts, for starts far away.
+    ||mu_i||; directions of negative curvature are followed downwards. For whitened starts b_i far away, alternating
+    half-steps for mu and b come first. Without blocks the answer is exact least squares.
     """
     if not core.shapes:
         point = core.point([], [])

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.linalg import pinvh
 
 from optid.arrays import Array
 from optid.program.structure import Structure
@@ -69,9 +70,7 @@ class Predictor:
     @cached_property
     def inverse(self) -> Array:
         """Pseudo-inverse of the Gram matrix of the coefficients of one output."""
-        values, vectors = np.linalg.eigh(self.gram)
-        kept = values > RANK * max(float(values[-1]), np.finfo(float).tiny)
-        return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+        return np.asarray(pinvh(self.gram, rtol=RANK))
 
     @cached_property
     def gram(self) -> Array:
