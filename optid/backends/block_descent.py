@@ -138,15 +138,10 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
 @njit(cache=True)
 def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.ndarray, slope: np.ndarray,
            a: np.ndarray) -> None:
-    """Minimise over one group at a time, in place.
+    """Minimise over one group at a time, in place: the coefficients a (q,) and the slope M'(r - M a) (q,).
 
-    Args:
-        gram: (q, q) Gram matrix of the active columns.
-        edges: (g + 1,) of the groups.
-        squares: (g,) squared length of the columns of a group.
-        levels: (g,) lambda times the weight of a group.
-        slope: (q,) M'(r - M a), kept up to date.
-        a: (q,) coefficients.
+    Gram matrix (q, q) and edges (g + 1,) are those of the active columns; for every group (g,) there are the squared
+    length of its columns and lambda times its weight.
     """
     for _ in range(SWEEPS):
         moved = False

@@ -43,18 +43,13 @@ def run(program: Program, settings: Settings) -> Answer:
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
     if not program.user_constraints:
-        return _unconstrained(program, form, count, seed)
+        found = _minimum(program, form, count, seed)
+        r = form.problem.root @ found.point.lift() - form.problem.target
+        status, word = (Status.LOCAL, "stationary") if found.converged else (Status.LIMIT, "iteration limit")
+        return Answer(status, word, to_values(program, form, found.point),
+                      {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}, found.iterations)
     whole = _Constrained(program, form, settings, str(options.get("inner", "clarabel")))
     return whole.solve(count, seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
-
-
-def _unconstrained(program: Program, form: RankOneStructure, count: int, seed: int) -> Answer:
-    found = _minimum(program, form, count, seed)
-    values = to_values(program, form, found.point)
-    r = form.problem.root @ found.point.lift() - form.problem.target
-    duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
-    return Answer(Status.LOCAL if found.converged else Status.LIMIT,
-                  "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
 
 
 def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:

@@ -37,11 +37,6 @@ class Lifted:
     directions: dict[int, np.ndarray] = field(default_factory=dict)
     refused: str = ""
 
-    @property
-    def size(self) -> int:
-        """Length of z."""
-        return self.linear.rows.shape[1]
-
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
         old = self.linear
@@ -59,7 +54,7 @@ class Lifted:
                 alone.append(i)
                 continue
             cone = self.cones[i]  # it stays: the products alone also hold where b has no component along them
-            products = np.zeros((len(rows) * len(cone), self.size))
+            products = np.zeros((len(rows) * len(cone), len(problem.target)))
             products[:, problem.slices[i]] = np.kron(-rows, cone)
             self.add(products, np.zeros(len(products)), False)
         return alone
@@ -93,7 +88,7 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
     transposed = lifted.add_products(problem)
     if not transposed:
         return problem, point, False
-    order, blocks = np.arange(lifted.size), list(problem.blocks)
+    order, blocks = np.arange(len(problem.target)), list(problem.blocks)
     mus, bs = list(point.mus), list(point.bs)
     for i in transposed:
         (p, q), span = blocks[i], problem.slices[i]
@@ -102,7 +97,7 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
         lifted.cones[i] = lifted.directions[i]
     lifted.linear = replace(lifted.linear, rows=lifted.linear.rows[:, order])
     triangle = np.triu(np.linalg.qr(np.column_stack([problem.root[:, order], problem.target]), mode="r"))
-    turned = RankOne(triangle[: lifted.size, :-1], triangle[: lifted.size, -1], problem.remainder, tuple(blocks),
+    turned = RankOne(triangle[: len(order), :-1], triangle[: len(order), -1], problem.remainder, tuple(blocks),
                      problem.linear, problem.scale)
     return turned, Point(point.w, tuple(mus), tuple(bs)), True
 
@@ -182,7 +177,7 @@ def _lift_factor(lifted: Lifted, form: LeastSquaresStructure, i: int, of_mu: boo
         return False
     # S mu = 0 means S Theta = 0; with b_0 = 1 the first column of Theta is mu itself
     products = np.kron(np.eye(q)[: q if homogeneous else 1], rows) if of_mu else np.kron(rows, np.eye(p))
-    wide = np.zeros((len(products), lifted.size))
+    wide = np.zeros((len(products), len(form.problem.target)))
     wide[:, form.problem.slices[i]] = products
     lifted.add(wide, np.resize(right, len(wide)), equal)
     return True

@@ -178,10 +178,7 @@ class Program:
         """Return the programme with some variables held at values, as parameters that may be changed later.
 
         Freezing ``b`` (or ``mu``) of a bilinear programme leaves a convex one. Structural constraints in which
-        nothing is left to choose are dropped.
-
-        Args:
-            values: variable name (brackets allowed through ``**{"mu[u1]": value}``) -> array of its shape.
+        nothing is left to choose are dropped. Names with brackets are passed as ``**{"mu[u1]": value}``.
 
         Raises:
             StructureError: unknown name or wrong shape.
