@@ -79,9 +79,6 @@ def wedge_side(angle: float, level: float) -> Side:
 def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
     """Return a rule that keeps all poles in the intersection of several sides, which are shrunk by `MARGIN` already."""
 
-    def build(view: View) -> Any:
-        return lmi(view, sides, name)
-
     def verify(model: Any) -> str:
         poles = np.atleast_1d(model.poles)
         slack = [min(side.slack(z) for side in sides) for z in poles]
@@ -91,7 +88,7 @@ def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
         shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
         return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
-    return Rule(name, build, verify, frozenset({"poles"}))
+    return Rule(name, lambda view: lmi(view, sides, name), verify, frozenset({"poles"}))
 
 
 def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:

@@ -116,19 +116,15 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
         return float(smooth + levels[kept] @ np.sqrt(np.add.reduceat(y**2, inner[:-1])))
 
     single = np.repeat(np.diff(inner) == 1, np.diff(inner))
-    now, lengths = value(x), [1.0]
-    crossing = single & (x * (x + step) < 0)
+    crossing, trials, lengths = single & (x * (x + step) < 0), [], [1.0, 0.5, 0.1]
     if crossing.any():  # up to the first kink, which the step then ends on
         lengths = [float(np.min(-x[crossing] / step[crossing])), 1.0]
-    else:
-        lengths += [0.5, 0.1]
-    trials = []
     for length in lengths:
         y = x + length * step
         y[single & (x * y <= 1e-14 * x**2)] = 0.0
         trials.append((value(y), y))
     reached, y = min(trials, key=lambda pair: pair[0])
-    if reached > now:
+    if reached > value(x):
         return a
     result = a.copy()
     result[columns] = y

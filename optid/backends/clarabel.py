@@ -20,6 +20,7 @@ STATUS = {
     "AlmostDualInfeasible": Status.UNBOUNDED, "MaxIterations": Status.LIMIT, "MaxTime": Status.LIMIT,
 }
 
+
 def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[Side], below: Sequence[Side],
                         settings: Settings) -> Answer:
     """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``, matrix (k, n).

@@ -59,8 +59,7 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
     options = dict(table.get(name, {}))
     if limit is not None and name in clock:
         options[clock[name]] = float(limit)
-    options.update(settings.options)
-    return options
+    return {**options, **settings.options}
 
 
 def solve_with(name: str, program: Program, settings: Settings) -> Answer:

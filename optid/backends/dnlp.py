@@ -106,21 +106,16 @@ class Smooth:
     def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
         """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
 
-        Args:
-            program: the programme.
-            status: what the solver claims, in our words.
-            word: in its own.
-            x: (unknowns,) point of the smooth problem.
-            multipliers: (rows,) in the convention ``L = f + multipliers * row``; empty where there are none.
-            figures: further attributes of the answer.
+        Status and word are the claim in our words and in the solver's; x (unknowns,) is a point of the smooth problem.
+        The multipliers (rows,) are in the convention ``L = f + multipliers * row``; empty where there are none.
         """
         if status in (Status.INFEASIBLE, Status.UNBOUNDED):
             return Answer(status, word, **figures)
         x, multipliers = np.ravel(x), np.ravel(multipliers)
-        primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, _split(
-            x, [v.size for v in self.variables]))}
-        dual = dict(zip((row.id for row in self.rows), _split(multipliers, [row.expression.size for row in self.rows]))
-                    ) if multipliers.size else {}
+        parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
+        primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, parts)}
+        parts = np.split(multipliers, np.cumsum([row.expression.size for row in self.rows])[:-1])
+        dual = {row.id: part for row, part in zip(self.rows, parts)} if multipliers.size else {}
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
         values, duals = solution.primal_vars, solution.dual_vars
@@ -185,8 +180,10 @@ class Derivatives:
 
 
 def derivatives(form: Smooth) -> Derivatives:
-    """Return the compiled derivatives of a smooth problem; made once and kept with the problem."""
-    return kept(form.original, "derivatives", lambda: Derivatives(form))
+    """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
+    found = kept(form.original, "derivatives", lambda: Derivatives(form))
+    found.update()
+    return found
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -256,7 +253,3 @@ def _flat(arrays: list) -> np.ndarray:
     parts = [np.ravel(np.asarray(array.toarray() if hasattr(array, "toarray") else array, dtype=float), order="F")
              for array in arrays]
     return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def _split(x: np.ndarray, sizes: list[int]) -> list[np.ndarray]:
-    return np.split(x, np.cumsum(sizes)[:-1])

@@ -277,9 +277,7 @@ class StepQP:
 
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
-        if not expression.is_affine():
-            return side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
-        if expression.id not in self._slopes:
+        if expression.id not in self._slopes or not expression.is_affine():
             self._slopes[expression.id] = side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
         return self._slopes[expression.id]
 

@@ -62,7 +62,6 @@ def options(settings: Settings) -> dict[str, Any]:
 def _model(unopy: Any, form: Smooth) -> Any:
     start, _ = form.start(), form.parameter_values()
     engine = derivatives(form)
-    engine.update()
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:

@@ -47,9 +47,7 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
     program.assign(values)
     form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
     if form is None:
-        value = _tangent_bound(program, duals, objective)
-        found = None if value is None else (value, f"tangent of the Lagrangian, within {REACH:g} times the solution")
-        method = TANGENT
+        found, method = _tangent_bound(program, duals, objective), TANGENT
     else:
         found, method = _least_squares_bound(program, form, duals, objective), "convex dual"
     if found is None or not np.isfinite(found[0]):
@@ -89,7 +87,7 @@ def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Value
     return objective + lagrangian.value - float(step @ step) / 4 - loose
 
 
-def _tangent_bound(program: Program, duals: Values, objective: float) -> float | None:
+def _tangent_bound(program: Program, duals: Values, objective: float) -> tuple[float, str] | None:
     lagrangian, variables = Lagrangian.of(program, duals, program.constraints), list(program.variables.values())
     if lagrangian is None or not lagrangian.add(program.objective.expr, np.ones(1)) or any(
             lagrangian.free_part(variable) is None for variable in variables):
@@ -103,7 +101,7 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> float |
         along = directions.T @ gradient
         caught = float(np.sum(along[curved] ** 2 / sizes[curved])) / 2
         plain = min(plain, caught + float(np.abs(directions[:, ~curved] @ along[~curved]) @ widths))
-    return objective + lagrangian.value - plain
+    return objective + lagrangian.value - plain, f"tangent of the Lagrangian, within {REACH:g} times the solution"
 
 
 def _hessian(program: Program) -> Array:

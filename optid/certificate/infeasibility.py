@@ -20,18 +20,17 @@ def explain(program: Program) -> str:
     and Dravnieks 1991). Constraints that are neither convex nor linear in ``mu bᵀ`` take part through their
     linearisation at the start, and the sentence says so.
     """
-    names = list(program.user_constraints)
-    form = rank_one_of(program)
-    stand_in = {} if form is None else places(program, form).stand_in
     conflict = conflicting_subset(program)
     if conflict is None:
-        return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(names) or 'none'}) can be "
+        return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(program.user_constraints) or 'none'}) can be "
                 "satisfied together; try another solver (optid solvers)")
     if len(conflict) == 1:
         text = f"constraint {conflict[0]!r} cannot be satisfied by any model of this structure; relax it or drop it"
     else:
         text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
                 "relax or drop one of them (each subset without one of them can be satisfied)")
+    form = rank_one_of(program)
+    stand_in = {} if form is None else places(program, form).stand_in
     used = [name for name in conflict
             if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")

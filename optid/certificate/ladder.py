@@ -18,7 +18,7 @@ from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_cons
 from optid.errors import StructureError
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
-from optid.structures.whitening import block_slices
+from optid.structures.whitening import block_slices, invert_triangular
 
 TOLERANCE = 1e-8
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
@@ -181,7 +181,8 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
     core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
     w, mus, bs = core.factors(point)
-    white = {core.kept.index(i): core.whitening.cone(core.kept.index(i), cone) for i, cone in cones.items()}
+    places = {core.kept.index(i): cone for i, cone in cones.items()}
+    white = {i: cone @ invert_triangular(core.whitening.factors_mu[i]).T for i, cone in places.items()}
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]

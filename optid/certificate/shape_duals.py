@@ -63,8 +63,8 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
                     ) -> tuple[dict[int, Array], Array]:
     """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 
-    All is meant in the coordinates of the core: half the gradient of the objective (k,), blocks (P_i, nb_i) behind the
-    ``offset`` unknowns outside them, mu (P_i,) and b (nb_i,) of unit length, and the lifted point z (k,).
+    All is meant in the coordinates of the core: half the gradient of the objective (k,), blocks (P_i, nb_i) behind
+    ``offset`` other unknowns, mu (P_i,) and b (nb_i,) of unit length, and the lifted point z (k,).
     """
     if not cones and not len(linear.right):
         return {}, np.zeros(0)

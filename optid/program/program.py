@@ -202,10 +202,9 @@ class Program:
         view = replace(self.view, inner={name: inner.tree_copy(swap) for name, inner in self.view.inner.items()})
         limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}
         left = {name: v for name, v in self.variables.items() if name not in values}
-        held = {name: parameters[name] for name in values}
 
         def recover(found: Values) -> Any:
-            return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
+            return self.recover({**found, **{name: np.asarray(parameters[name].value) for name in values}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, limits=limits,
@@ -214,11 +213,9 @@ class Program:
                        start={name: v for name, v in self.start.items() if name in left})
 
     def soften(self, name: str, weight: float) -> "Program":
-        """Return the programme with one constraint turned into a quadratic penalty on its violation.
+        """Return the programme with a user's equality or inequality turned into a quadratic penalty on its violation.
 
-        Args:
-            name: a user's constraint (equality or inequality).
-            weight: penalty per squared unit of violation.
+        The weight is the penalty per squared unit of violation.
 
         Raises:
             StructureError: unknown name, or a constraint that is neither an equality nor an inequality.

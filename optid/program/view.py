@@ -93,8 +93,6 @@ class View(Mapping[str, cp.Expression]):
             raise StructureError(f"{name!r} needs a channel: there are several inputs ({', '.join(self.channels)})")
         return f"{name}[{channel}]"
 
-    # -- what constraints are stated in -----------------------------------------------------------------------------
-
     @property
     def poles(self) -> tuple[cp.Expression, cp.Expression] | cp.Expression | None:
         """What determines the poles: (P, Q = A P), or the coefficients a of a polynomial; None without poles."""

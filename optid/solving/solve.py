@@ -62,7 +62,6 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     if refusal:
         raise SolverRefused(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
-
     separate = (time_limit is not None) if isolate is None else isolate
 
     def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
@@ -241,15 +240,12 @@ def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Setti
     answer = _attempt(replace(program, start=start), back_end, settings, separate)
     if answer.values and program.certify is not None:
         again = _judged(program, answer, point)
+        assert again.residuals is not None and point.residuals is not None
         lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-        if lower and _violation(again) <= max(_violation(point), 1e-9):
+        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
             point, bound = again, program.certify(program, again.values, again.duals)[0]
     program.assign(point.values)
     return point, bound
-
-
-def _violation(point: Solution) -> float:
-    return float("inf") if point.residuals is None else point.residuals.violation
 
 
 @dataclass(frozen=True)

@@ -240,12 +240,8 @@ class NuclearProblem:
     def dual(self, multipliers: Array, weight: float) -> tuple[float, Array]:
         """Return a lower bound on the objective in closed form, and the dual point it is taken at.
 
-        The multipliers are projected on what the free variables demand, then scaled into the unit ball of the spectral
-        norm: what comes out is feasible whatever came in.
-
-        Args:
-            multipliers: (r, q) anything; those of ``X = matrix(v, theta)`` give a tight bound.
-            weight: of the misfit.
+        The multipliers (r, q) are projected on what the free variables demand, then scaled into the unit ball of the
+        spectral norm: what comes out is feasible whatever came in. Those of ``X = matrix(v, theta)`` give a tight one.
         """
         point = self.projected(multipliers)
         for group in self.groups:

@@ -164,8 +164,7 @@ class Core:
     @cached_property
     def least_squares(self) -> Array:
         """Unrestricted minimiser (k,) in the original coordinates of the core."""
-        part = self.triangle[self.eliminated:, self.eliminated:]
-        return _solve_upper(part, self.target)
+        return _solve_upper(self.triangle[self.eliminated:, self.eliminated:], self.target)
 
     def factors(self, point: Point) -> tuple[Array, list[Array], list[Array]]:
         """Whitened (w, mus, bs) of a point, balanced so that every b has unit length."""

@@ -98,10 +98,6 @@ class Whitening:
             new[:, where] = np.matmul(invert_triangular(factor_b), block.reshape(-1, nb, p)).reshape(-1, p * nb)
         return new
 
-    def cone(self, block: int, rows: Array) -> Array:
-        """Rows (r, P) that act on mu of a block, written for the new coordinates."""
-        return rows @ invert_triangular(self.factors_mu[block]).T
-
     def forward(self, mus: tuple[Array, ...], bs: tuple[Array, ...]) -> tuple[list[Array], list[Array]]:
         """Factors (mu_i, b_i) in the new coordinates."""
         return ([factor.T @ mu for factor, mu in zip(self.factors_mu, mus)],
