@@ -22,7 +22,8 @@ def explain(program: Program) -> str:
     """
     conflict = conflicting_subset(program)
     if conflict is None:
-        return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(program.user_constraints) or 'none'}) can be "
+        names = ", ".join(program.user_constraints) or "none"
+        return (f"{program.name!r} was reported infeasible, but its constraints ({names}) can be "
                 "satisfied together; try another solver (optid solvers)")
     if len(conflict) == 1:
         text = f"constraint {conflict[0]!r} cannot be satisfied by any model of this structure; relax it or drop it"
