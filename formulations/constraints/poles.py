@@ -283,8 +283,5 @@ def _real(a: Any, na: int, radius: float, points: np.ndarray) -> list[Any]:
         raise StructureError(f"real= needs {na - 1} separating points in decreasing order inside {radius:.3g}; "
                              f"got {points.tolist()}")
     where = np.concatenate([[radius], points, [-radius]])
-    constraints = []
-    for position, z in enumerate(where):
-        value = z**na + (z ** np.arange(na - 1.0, -1, -1)) @ a if z else a[na - 1]
-        constraints.append(value >= 0 if position % 2 == 0 else value <= 0)
-    return constraints
+    values = [z**na + (z ** np.arange(na - 1.0, -1, -1)) @ a if z else a[na - 1] for z in where]
+    return [value >= 0 if position % 2 == 0 else value <= 0 for position, value in enumerate(values)]

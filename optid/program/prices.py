@@ -72,8 +72,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     found, usual = [], program.usual_sizes()
     for name, group in program.user_constraints.items():
         limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
-        active = rows = 0
-        slack = np.inf
+        active, rows, slack = 0, 0, np.inf
         for limit in limits:
             gaps = _slacks(limit.member)
             rows += gaps.size
