@@ -182,7 +182,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
     w, mus, bs = core.factors(point)
     places = {core.kept.index(i): cone for i, cone in cones.items()}
-    white = {i: cone @ invert_triangular(core.whitening.factors_mu[i]).T for i, cone in places.items()}
+    white: dict[int, Array] = {i: cone @ invert_triangular(core.whitening.factors_mu[i]).T for i, cone in places.items()}
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]

@@ -10,9 +10,10 @@ import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
 from optid.errors import StructureError, nearest
+from optid.program.compressed import Compressed
 from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
 from optid.program.solution import Bound
-from optid.program.structure import Compressed, Structure
+from optid.program.structure import Structure
 from optid.program.view import Values, View
 
 

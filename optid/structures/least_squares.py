@@ -19,7 +19,7 @@ class LeastSquaresStructure(Structure):
     The structural constraints of its programme only fix directions that do not change F.
 
     Attributes:
-        problem: the numbers, see `optid.program.structure.Compressed`.
+        problem: the numbers, see `optid.program.compressed.Compressed`.
         linear: names of the linear variables in the order of z (each flattened column by column).
         blocks: (mu name, b name) of every rank-one block; none without products.
         gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".

@@ -194,13 +194,15 @@ class NuclearProblem:
         """
         samples, j, first = len(self.y), len(self.starts), self.starts[0]
         outputs = 1 if self.left is None else self.l
-        outer = np.eye(j) if self.right is None else self.right @ self.right.T
         inner = np.eye(self.rows) if self.left is None else self.left.T @ self.left
         inner = inner.reshape(self.rows, outputs, self.rows, outputs)
+        outer = 1.0 if self.right is None else self.right @ self.right.T
         whole = np.zeros((outputs, outputs, samples, samples))
         for i, o, ii, oo in zip(*np.nonzero(inner)):
             where: Any = np.ix_(self.starts + i, self.starts + ii)
-            if self.starts[-1] - first == j - 1:  # without gaps: slices instead of copies
+            if self.right is None:
+                where = self.starts + i, self.starts + ii
+            elif self.starts[-1] - first == j - 1:  # without gaps: slices instead of copies
                 where = slice(first + i, first + i + j), slice(first + ii, first + ii + j)
             whole[o, oo][where] += inner[i, o, ii, oo] * outer
         whole = whole.transpose(2, 0, 3, 1).reshape(samples * outputs, samples * outputs)
