@@ -181,8 +181,9 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
     core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
     w, mus, bs = core.factors(point)
-    places = {core.kept.index(i): cone for i, cone in cones.items()}
-    white: dict[int, Array] = {i: cone @ invert_triangular(core.whitening.factors_mu[i]).T for i, cone in places.items()}
+    white: dict[int, Array] = {}
+    for i, cone in zip(map(core.kept.index, cones), cones.values()):
+        white[i] = cone @ invert_triangular(core.whitening.factors_mu[i]).T
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]
