@@ -20,7 +20,7 @@ from rank_one_fits import minimise_in_cones, solve_certified
 from scipy.signal import lfilter
 from scipy.special import ndtr
 
-from optid.certificate import certify
+from optid.certificate.ladder import certify
 from optid.program.solution import relative_gap
 from optid.structures.bilinear import best_of
 from optid.structures.rank_one import RankOne, reduce

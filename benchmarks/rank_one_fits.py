@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
-from optid.certificate import certify
-from optid.certificate.ladder import Certification
+from optid.certificate.ladder import Certification, certify
 from optid.errors import StructureError
 from optid.structures.bilinear import LocalSolution, best_of, descend, starts
 from optid.structures.rank_one import Array, Point, RankOne, matrices, reduce
@@ -147,7 +146,7 @@ def _finish(problem: RankOne, point: Point, signed: tuple[int, ...]) -> LocalSol
     face = change_basis(problem, faces)
     start = Point(point.w, tuple(faces[i].T @ mu if i in faces else mu for i, mu in enumerate(point.mus)), point.bs)
     core = reduce(face, keep=tuple(range(len(face.blocks))))
-    found = descend(core, *core.factors(start)[1:])
+    found = descend(core, core.factors(start)[2])
     mus, bs = [], []
     feasible = found.value <= problem.value(point.lift()) * (1 + 1e-12) + 1e-24 * problem.scale
     for i, (mu, b) in enumerate(zip(found.point.mus, found.point.bs)):
@@ -204,9 +203,9 @@ def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, 
     """
     core = reduce(problem)
     if not core.shapes:
-        best = descend(core, [], [])
+        best = descend(core, [])
         return Certified(best, certify(problem, best.point), 1)
-    best = descend(core, *starts(core, 1, seed)[0])
+    best = descend(core, starts(core, 1, seed)[0][1])
     proof = certify(problem, best.point, effort="instant")
     if proof.bound.proved:
         return Certified(best, proof, 1)
@@ -217,7 +216,7 @@ def solve_certified(problem: RankOne, *, effort: str = "sdp", steps: int = 100, 
         if proof.bound.proved or effort == "instant":
             break
         if proof.better:
-            again = [descend(core, *core.factors(point)[1:], alternations=1) for point in proof.better]
+            again = [descend(core, core.factors(point)[2], alternations=1) for point in proof.better]
         else:
             again = [best_of(core, 4 * count, seed + 1 + round_, first=4)]
         tried += len(proof.better) or 4 * (count - 1)

@@ -27,7 +27,6 @@ from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.bilinear import starts
 from optid.structures.least_squares import RankOneStructure
-from optid.structures.rank_one import reduce
 
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -92,7 +91,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> P
 
 def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str) -> dict[str, np.ndarray]:
     """Return the best rank-one start without the constraints, in the gauge."""
-    core = reduce(problem.problem)
+    core = problem.problem.core
     point = core.point(*starts(core, count=1)[0])
     start = problem.linear_part(point.w)
     for c, (names, channel) in enumerate(zip(pairs, problem.layout.inputs)):

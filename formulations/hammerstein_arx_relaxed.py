@@ -27,7 +27,7 @@ from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.least_squares import LeastSquaresStructure
 from optid.structures.lifted_regression import leading_pairs
-from optid.structures.rank_one import Core, reduce
+from optid.structures.rank_one import Core
 
 
 def nuclear(  # noqa: D417 - the other arguments by reference
@@ -105,7 +105,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str, weig
     name = "overparametrised" if weight is None else "nuclear"
     return Program(
         f"hammerstein_arx.{name}", objective, constraints, {**linear, **theta, "residual": r}, {},
-        partial(_rank_one_model, problem, reduce(problem.problem), gauge, svd),
+        partial(_rank_one_model, problem, problem.problem.core, gauge, svd),
         problem.view({**linear, **theta}), structural=frozenset(constraints), derived={"residual": residual},
         scale=problem.problem.scale, unit=problem.unit, compressed=problem, **form).subject_to(*builders)
 

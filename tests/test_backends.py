@@ -8,6 +8,7 @@ from cvxpy.atoms.elementwise.hyperbolic import asinh, sinh, tanh
 from cvxpy.atoms.elementwise.trig import cos, sin, tan
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar, nnls
 from zoo import CASES, case, pose
 
 from optid.backends import BackEnd, Settings, back_ends
@@ -16,6 +17,7 @@ from optid.backends.catalogue import CONIC
 from optid.backends.conic import tolerances
 from optid.backends.dnlp import smooth
 from optid.conformance.checks import SUCCESS, ConformanceError, check_back_end, run_case, value_error
+from optid.conformance.zoo import planted_fit
 from optid.errors import StructureError
 from optid.program.solution import Status
 from optid.solving.solve import solve
@@ -259,3 +261,27 @@ def test_alternating_keeps_its_half_steps_compiled(monkeypatch):
     solve(case("rank_one_fit").build(), "alternating")
     assert len(compiled) > 6
     assert None not in compiled and len({id(form) for form in compiled}) == 2
+
+
+@pytest.mark.parametrize("name, convex", [("rank_one_fit", False), ("rank_one_convex", True)])
+def test_the_known_values_of_the_bilinear_cases_are_those_of_a_search(name, convex):
+    assert case(name).value == pytest.approx(search_angle(*planted_fit(), convex=convex), rel=1e-9)
+
+
+def search_angle(matrix, y, *, convex):
+    """Minimise over the direction of b, a single angle; for each angle the rest is (constrained) least squares."""
+    levels = (matrix.shape[1] - 1) // 2
+    # mu = free line + kinks with coefficients >= 0 is exactly "convex"; without the constraint kinks of either sign
+    ramps = np.maximum(np.subtract.outer(np.arange(levels), np.arange(levels)), 0.0)
+    line, kinks = np.column_stack([np.ones(levels), ramps[:, 0]]), ramps[:, 1:-1]
+    shapes = np.column_stack([line, -line, kinks] if convex else [line, -line, kinks, -kinks])
+
+    def value(angle):
+        b = np.array([np.cos(angle), np.sin(angle)])
+        wide = matrix[:, 1:].reshape(-1, levels, 2, order="F") @ b
+        return nnls(np.column_stack([matrix[:, 0], -matrix[:, 0], wide @ shapes]), y)[1] ** 2
+
+    grid = np.linspace(0.0, 2 * np.pi, 721)
+    best = float(min(grid, key=value))
+    found = minimize_scalar(value, bounds=(best - 0.01, best + 0.01), method="bounded", options={"xatol": 1e-10})
+    return float(found.fun)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scripts import benchmark
 
-from optid.certificate import certify
+from optid.certificate.ladder import certify
 from optid.certificate.minors import basis_from, cholesky, free_mask, project_minors, tangent_minors
 from optid.certificate.shape_duals import Linear, sign_free_cut
 from optid.errors import StructureError

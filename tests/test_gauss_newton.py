@@ -118,7 +118,7 @@ def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
 
     h = 1e-4 * np.eye(at.size)
     slope = np.array([(value(x + e) - value(x - e)) / 2e-4 for e in h])
-    assert np.allclose(at.slope_of_lift(x).T @ pull, slope, atol=1e-7)
+    assert np.allclose(at.point(x).tangent().T @ pull, slope, atol=1e-7)
     second = np.array([[(value(x + e + d) - value(x + e - d) - value(x - e + d) + value(x - e - d)) / 4e-8 for e in h]
                        for d in h])
     curved = at.curvature(x, pull)

@@ -32,13 +32,13 @@ def test_the_gap_closes_and_the_conditions_hold(seed, share):
     penalty = share * p.largest()
     found = minimise(p, penalty, gap=1e-9)
     assert found.gap <= 1e-9
-    slopes = p.norms(p.design.T @ (p.target - p.design @ found.a))
+    slopes = p.norms(p.design.T @ (p.target - p.design @ found.point))
     # the gap of 1e-9 in the value leaves the square root of it in the slopes
     slack = np.sqrt(2e-9 * found.value) * p.lengths + 1e-9
     assert np.all(slopes <= penalty * p.weights + slack)
-    assert np.any(p.norms(found.a) > 0) == (share < 1)
-    zero = p.certainly_zero(found.point, found.value - found.bound, penalty)
-    assert np.all(p.norms(found.a)[zero] * p.lengths[zero] <= 1e-3 * np.sqrt(found.value))
+    assert np.any(p.norms(found.point) > 0) == (share < 1)
+    zero = p.certainly_zero(found.dual, found.value - found.bound, penalty)
+    assert np.all(p.norms(found.point)[zero] * p.lengths[zero] <= 1e-3 * np.sqrt(found.value))
 
 
 @given(st.integers(0, 10_000), st.floats(0.05, 2.0), st.integers(0, 100))
@@ -55,11 +55,11 @@ def test_weak_duality_at_any_point(seed, penalty, other):
 def test_scalars_against_coordinate_search_and_warm_starts():
     p = problem(3)
     cold = minimise(p, 0.1 * p.largest(), gap=1e-10)
-    warm = minimise(p, 0.1 * p.largest(), gap=1e-10, start=cold.a)
-    assert warm.rounds <= 1 and warm.value == pytest.approx(cold.value, rel=1e-10)
+    warm = minimise(p, 0.1 * p.largest(), gap=1e-10, start=cold.point)
+    assert warm.iterations <= 1 and warm.value == pytest.approx(cold.value, rel=1e-10)
     rng = np.random.default_rng(0)
     for _ in range(200):
-        near = cold.a + 1e-3 * rng.standard_normal(cold.a.size) * (rng.random(cold.a.size) < 0.2)
+        near = cold.point + 1e-3 * rng.standard_normal(cold.point.size) * (rng.random(cold.point.size) < 0.2)
         assert p.value(near, 0.1 * p.largest()) >= cold.value * (1 - 1e-10)
 
 
@@ -69,13 +69,13 @@ def test_two_equal_columns_and_a_zero_column_are_no_trouble():
     design = np.hstack([column, column, np.zeros((20, 1)), rng.standard_normal((20, 1))])
     p = GroupProblem(design, 3 * column[:, 0] + rng.standard_normal(20), np.arange(5), np.ones(4))
     found = minimise(p, 0.3 * p.largest(), gap=1e-10)
-    assert found.gap <= 1e-9 and found.a[2] == 0
+    assert found.gap <= 1e-9 and found.point[2] == 0
 
 
 def test_a_limit_is_reported_as_it_is():
     p = problem(5)
     found = minimise(p, 1e-3 * p.largest(), gap=1e-15, limit=1)
-    assert found.gap > 1e-15 and found.rounds <= 1 and found.bound <= found.value
+    assert found.gap > 1e-15 and found.iterations <= 1 and found.bound <= found.value
 
 
 def test_bad_numbers():

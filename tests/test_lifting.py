@@ -7,7 +7,7 @@ from problems import BASIS, record, search
 
 import optid
 from formulations.constraints import shape
-from optid.certificate.lifting import lift_exact, places
+from optid.certificate.lifting import lift, places
 from optid.registry import formulation
 
 SETS = {
@@ -68,7 +68,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     """At random points of the factored problem both readings have the same left-hand sides."""
     rules = [shape.slope(0.5, 2.0), shape.dead_zone(-0.3, 0.3), lambda v: {"a": 2 * v["a"][0] - v["a"][1] <= 3}]
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS, constraints=rules, gauge=gauge)
-    lifted = lift_exact(program, program.structure)
+    lifted = lift(program, program.structure)
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     rng = np.random.default_rng(1)
@@ -88,7 +88,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
 def test_products_of_two_cones():
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS,
                                                       constraints=[shape.monotone(), shape.sign("b")])
-    lifted = lift_exact(program, program.structure)
+    lifted = lift(program, program.structure)
     assert set(lifted.cones) == set(lifted.directions) == {0}
     assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality

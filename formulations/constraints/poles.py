@@ -58,10 +58,6 @@ class Side:
         matrix = self.constant + z * self.linear + np.conj(z) * self.linear.T
         return float(np.min(np.linalg.eigvalsh(matrix)))
 
-    def inequality(self, p: Any, q: Any) -> Any:
-        """Return the CVXPY constraint on P and Q = A P, both (n, n)."""
-        return cp.kron(self.constant, p) + cp.kron(self.linear, q) + cp.kron(self.linear.T, q.T) >> 0
-
 
 def disc_side(radius: float, centre: float = 0.0) -> Side:
     """|z - centre| <= radius, by the Schur complement of ``radius² - |z - centre|²``."""
@@ -83,9 +79,6 @@ def wedge_side(angle: float, level: float) -> Side:
 def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
     """Return a rule that keeps all poles in the intersection of several sides, which are shrunk by `MARGIN` already."""
 
-    def build(view: View) -> Any:
-        return lmi(view, sides, name)
-
     def verify(model: Any) -> str:
         poles = np.atleast_1d(model.poles)
         slack = [min(side.slack(z) for side in sides) for z in poles]
@@ -95,7 +88,7 @@ def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
         shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
         return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
-    return Rule(name, build, verify, frozenset({"poles"}))
+    return Rule(name, lambda view: lmi(view, sides, name), verify, frozenset({"poles"}))
 
 
 def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
@@ -103,7 +96,8 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available")
-    return [side.inequality(*view.poles) for side in sides]
+    p, q = view.poles
+    return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
 
 
 def disc(centre: float, radius: float) -> Rule:
@@ -241,11 +235,8 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (rows, levels, centre) such that every a with ``rows @ a >= levels`` has its roots in the disc.
 
-    Args:
-        reference: coefficients (na,) of the polynomial to centre on.
-        radius: of the disc.
-        keep: the reference itself has to lie inside, where its roots do: its centre is then pulled inwards no
-            further than that allows.
+    The region is centred on a reference polynomial (na,). With ``keep`` the centre is
+    pulled inwards no further than the reference, whose roots are inside, allows.
     """
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius
@@ -292,8 +283,5 @@ def _real(a: Any, na: int, radius: float, points: np.ndarray) -> list[Any]:
         raise StructureError(f"real= needs {na - 1} separating points in decreasing order inside {radius:.3g}; "
                              f"got {points.tolist()}")
     where = np.concatenate([[radius], points, [-radius]])
-    constraints = []
-    for position, z in enumerate(where):
-        value = z**na + (z ** np.arange(na - 1.0, -1, -1)) @ a if z else a[na - 1]
-        constraints.append(value >= 0 if position % 2 == 0 else value <= 0)
-    return constraints
+    values = [z**na + (z ** np.arange(na - 1.0, -1, -1)) @ a if z else a[na - 1] for z in where]
+    return [value >= 0 if position % 2 == 0 else value <= 0 for position, value in enumerate(values)]

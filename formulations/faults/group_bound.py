@@ -12,6 +12,7 @@ import numpy as np
 
 from optid.program.gradients import flat_value, jacobians
 from optid.program.judging import multiplier_terms
+from optid.program.limits import spans
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
 from optid.structures.group_sparse import GroupSparseStructure
@@ -57,12 +58,10 @@ def _lagrangian(program: Program, form: GroupSparseStructure, duals: Values) -> 
     """Return c (p,) and k of the user's affine constraints; one that is no help counts with multiplier zero."""
     slope, constant = np.zeros(problem_size(form)), 0.0
     for name, group in program.user_constraints.items():
-        position = 0
-        for member in group:
-            length = sum(d.size for d in member.dual_variables)
-            given = np.ravel(duals[name])[position : position + length] if name in duals else np.zeros(0)
-            position += length
-            terms = multiplier_terms(member, given) if given.size == length and np.isfinite(given).all() else None
+        for member, span in zip(group, spans(group)):
+            given = np.ravel(duals[name])[span] if name in duals else np.zeros(0)
+            usable = given.size == span.stop - span.start and np.isfinite(given).all()
+            terms = multiplier_terms(member, given) if usable else None
             part = None if terms is None else _affine(terms, program.variables, form)
             if part is not None:
                 slope, constant = slope + part[0], constant + part[1]

@@ -5,12 +5,10 @@ the eigenvectors of a Gram matrix that is decomposed once. It stops by the duali
 is feasible by construction and its value is a bound.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from optid.arrays import Array
-from optid.backends.back_end import Answer, Settings
+from optid.backends.back_end import Answer, Minimum, Settings
 from optid.program.program import Program
 from optid.program.solution import Status, tolerance
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
@@ -33,49 +31,16 @@ def run(program: Program, settings: Settings) -> Answer:
     weight = float(np.asarray(program.parameters[form.weight].value))
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, weight, allowed, int(dict(settings.options).get("limit", 20_000)))
-    values = {"yhat": found.v} | ({"T": found.theta} if form.problem.parameters else {})
-    misfit = (found.v - form.problem.data)[form.problem.known]
-    duals = {"structure": -np.ravel(found.multipliers, order="F"), "residual": -2.0 * weight * misfit}
-    if found.gap <= allowed:
-        return Answer(Status.LOCAL, "duality gap closed", values, duals, found.iterations)
-    return Answer(Status.LIMIT, f"iteration limit at a relative gap of {found.gap:.1e}", values, duals,
-                  found.iterations)
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where the iteration stopped.
-
-    Attributes:
-        v: (T, l) outputs.
-        theta: (parameters, l) coefficients of the predictor.
-        multipliers: (r, q) dual point, feasible.
-        value: objective at (v, theta).
-        bound: value of the dual at the multipliers.
-        iterations: number of them.
-    """
-
-    v: Array
-    theta: Array
-    multipliers: Array
-    value: float
-    bound: float
-    iterations: int
-
-    @property
-    def gap(self) -> float:
-        """Relative duality gap."""
-        return (self.value - self.bound) / max(abs(self.value), np.finfo(float).tiny)
+    v, theta = found.point
+    misfit = (v - form.problem.data)[form.problem.known]
+    duals = {"structure": -np.ravel(found.dual, order="F"), "residual": -2.0 * weight * misfit}
+    return found.answer(allowed, {"yhat": v} | ({"T": theta} if form.problem.parameters else {}), duals)
 
 
 def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: int = 20_000) -> Minimum:
-    """Minimise the objective for one weight.
+    """Minimise the objective for one positive weight of the misfit: point (v, theta), dual point (r, q).
 
-    Args:
-        problem: the numbers.
-        weight: of the misfit, positive.
-        gap: relative duality gap at which to stop.
-        limit: number of iterations at most.
+    It stops at a relative duality gap, or at a number of iterations.
     """
     v, theta = problem.data, problem.explained(problem.hankel(problem.data))
     reached = problem.matrix(v, theta)
@@ -92,7 +57,7 @@ def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: i
         if count % CHECK and count < limit:
             continue
         bound, multipliers = problem.dual(scaled * step, weight)
-        found = Minimum(v, theta, multipliers, problem.value(v, theta, weight), bound, count)
+        found = Minimum((v, theta), multipliers, problem.value(v, theta, weight), bound, count)
         if best is None or found.gap < best.gap:
             best = found
         if found.gap <= gap or count == limit:
@@ -100,7 +65,11 @@ def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: i
         outside, moved = np.linalg.norm(reached - low_rank), np.linalg.norm(low_rank - before)
         sizes = np.linalg.norm(scaled) / max(float(np.linalg.norm(low_rank)), 1e-300)
         change = FIRST[1] if count <= FIRST[0] else FACTOR
-        factor = 1.0 if count > limit // 2 else _rebalanced(float(outside * np.sqrt(sizes)), float(moved), change)
+        # the step grows where the constraint lags behind, and shrinks where the matrix does; the measure lies between
+        # that of absolute and that of relative residuals, either of which circles for thousands of iterations
+        lag = outside * np.sqrt(sizes)
+        factor = change if lag > BALANCE * moved else 1.0 / change if moved > BALANCE * lag else 1.0
+        factor = 1.0 if count > limit // 2 else factor
         step, scaled = step * factor, scaled / factor
     assert best is not None
     return best
@@ -117,14 +86,3 @@ def shrunk(matrix: Array, threshold: float) -> Array:
     kept = values > threshold**2
     factors = 1.0 - threshold / np.sqrt(values[kept])
     return (vectors[:, kept] * factors) @ (vectors[:, kept].T @ matrix)
-
-
-def _rebalanced(outside: float, moved: float, change: float) -> float:
-    """Factor of the step size: up where the constraint lags behind, down where the matrix does.
-
-    Small factors, and a measure between that of absolute and that of relative residuals: either alone circles for
-    thousands of iterations on some weights of the CD player.
-    """
-    if outside > BALANCE * moved:
-        return change
-    return 1.0 / change if moved > BALANCE * outside else 1.0

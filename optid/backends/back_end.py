@@ -56,6 +56,37 @@ class Answer:
     compile: float = float("nan")
 
 
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a method that closes a duality gap stopped.
+
+    Attributes:
+        point: of the primal problem.
+        dual: of the dual problem, feasible.
+        value: objective at the point.
+        bound: value of the dual problem at its point.
+        iterations: number of them.
+    """
+
+    point: Any
+    dual: np.ndarray
+    value: float
+    bound: float
+    iterations: int
+
+    @property
+    def gap(self) -> float:
+        """Duality gap relative to the value."""
+        return max(self.value - self.bound, 0.0) / max(self.value, np.finfo(float).tiny)
+
+    def answer(self, allowed: float, values: Mapping[str, np.ndarray], duals: Mapping[str, np.ndarray]) -> Answer:
+        """Return the claim that this is the minimum, where the gap is at most the allowed one."""
+        if self.gap <= allowed:
+            return Answer(Status.LOCAL, "duality gap closed", values, duals, self.iterations)
+        return Answer(Status.LIMIT, f"iteration limit at a relative gap of {self.gap:.1e}", values, duals,
+                      self.iterations)
+
+
 @dataclass(frozen=True)
 class BackEnd:
     """One solver under one word.

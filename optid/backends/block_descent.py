@@ -5,13 +5,11 @@ zero the objective is smooth, so that a Newton step from there ends the crawl; g
 the optimality conditions. The iteration stops by the duality gap, whose dual point is feasible by construction.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 
 from optid.arrays import Array
-from optid.backends.back_end import Answer, Settings
+from optid.backends.back_end import Answer, Minimum, Settings
 from optid.program.program import Program
 from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
@@ -39,47 +37,14 @@ def run(program: Program, settings: Settings) -> Answer:
         return Answer(Status.FAILED, f"the penalty is {penalty}; this method needs a positive one")
     start = form.flat(program.start) if settings.warm and program.start else None
     found = minimise(form.problem, penalty, settings.accuracy, int(dict(settings.options).get("limit", 2000)), start)
-    values = form.shaped(found.a)
-    duals = {form.residual: -found.point}
-    if found.gap <= tolerance(settings.accuracy):
-        return Answer(Status.LOCAL, "duality gap closed", values, duals, found.rounds)
-    return Answer(Status.LIMIT, f"stopped at a relative gap of {found.gap:.1e}", values, duals, found.rounds)
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where the iteration stopped.
-
-    Attributes:
-        a: (p,) coefficients.
-        point: (m,) feasible point of the dual.
-        value: objective at a.
-        bound: value of the dual at the point.
-        rounds: number of rounds of descent and Newton step.
-    """
-
-    a: Array
-    point: Array
-    value: float
-    bound: float
-    rounds: int
-
-    @property
-    def gap(self) -> float:
-        """Duality gap relative to the value."""
-        return max(self.value - self.bound, 0.0) / max(self.value, np.finfo(float).tiny)
+    return found.answer(tolerance(settings.accuracy), form.shaped(found.point), {form.residual: -found.dual})
 
 
 def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,
              start: Array | None = None) -> Minimum:
-    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``.
+    """Minimise ``1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖`` for a positive penalty: point a (p,), dual point (m,).
 
-    Args:
-        problem: the numbers.
-        penalty: lambda, positive.
-        gap: relative duality gap at which to stop.
-        limit: number of rounds at most.
-        start: (p,) a point to start from.
+    It stops at a relative duality gap, or at a number of rounds; a start (p,) shortens the way.
     """
     a = np.zeros(problem.design.shape[1]) if start is None else np.array(start, dtype=float)
     active = np.flatnonzero(problem.norms(a) > 0)
@@ -112,8 +77,7 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
     """Improve the active groups: sweeps of block descent, then a Newton step on those that are not zero."""
     if not active.size:
         return a
-    columns = np.concatenate([np.arange(int(problem.edges[g]), int(problem.edges[g + 1])) for g in active])
-    edges = np.concatenate([[0], np.cumsum(np.diff(problem.edges)[active])])
+    columns, edges = _columns(problem.edges, active)
     part = problem.design[:, columns]
     gram, pull = part.T @ part, part.T @ problem.target
     own = a[columns].copy()
@@ -125,14 +89,19 @@ def _descended(problem: GroupProblem, a: Array, penalty: float, active: np.ndarr
     return result
 
 
+def _columns(edges: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns of some groups, and the edges of these groups among them."""
+    return (np.concatenate([np.arange(int(edges[g]), int(edges[g + 1])) for g in groups]),
+            np.concatenate([[0], np.cumsum(np.diff(edges)[groups])]))
+
+
 def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array) -> Array:
     """Take one Newton step on the groups that are not zero, where it descends; scalars that change sign become zero."""
     norms = np.sqrt(np.add.reduceat(a**2, edges[:-1]))
     kept = np.flatnonzero(norms > 0)
     if not kept.size:
         return a
-    columns = np.concatenate([np.arange(edges[g], edges[g + 1]) for g in kept])
-    inner = np.concatenate([[0], np.cumsum(np.diff(edges)[kept])])
+    columns, inner = _columns(edges, kept)
     x, H = a[columns], gram[np.ix_(columns, columns)].copy()
     gradient = H @ x - pull[columns]
     for g, (lo, hi) in zip(kept, zip(inner, inner[1:])):
@@ -147,19 +116,15 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
         return float(smooth + levels[kept] @ np.sqrt(np.add.reduceat(y**2, inner[:-1])))
 
     single = np.repeat(np.diff(inner) == 1, np.diff(inner))
-    now, lengths = value(x), [1.0]
-    crossing = single & (x * (x + step) < 0)
+    crossing, trials, lengths = single & (x * (x + step) < 0), [], [1.0, 0.5, 0.1]
     if crossing.any():  # up to the first kink, which the step then ends on
         lengths = [float(np.min(-x[crossing] / step[crossing])), 1.0]
-    else:
-        lengths += [0.5, 0.1]
-    trials = []
     for length in lengths:
         y = x + length * step
         y[single & (x * y <= 1e-14 * x**2)] = 0.0
         trials.append((value(y), y))
     reached, y = min(trials, key=lambda pair: pair[0])
-    if reached > now:
+    if reached > value(x):
         return a
     result = a.copy()
     result[columns] = y
@@ -169,15 +134,10 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
 @njit(cache=True)
 def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.ndarray, slope: np.ndarray,
            a: np.ndarray) -> None:
-    """Minimise over one group at a time, in place.
+    """Minimise over one group at a time, in place: the coefficients a (q,) and the slope M'(r - M a) (q,).
 
-    Args:
-        gram: (q, q) Gram matrix of the active columns.
-        edges: (g + 1,) of the groups.
-        squares: (g,) squared length of the columns of a group.
-        levels: (g,) lambda times the weight of a group.
-        slope: (q,) M'(r - M a), kept up to date.
-        a: (q,) coefficients.
+    Gram matrix (q, q) and edges (g + 1,) are those of the active columns; for every group (g,) there are the squared
+    length of its columns and lambda times its weight.
     """
     for _ in range(SWEEPS):
         moved = False

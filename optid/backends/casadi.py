@@ -10,6 +10,8 @@ infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay
 
 import time
 from collections.abc import Callable
+from functools import reduce
+from operator import mul
 from typing import Any
 
 import casadi as ca
@@ -36,10 +38,7 @@ STATUS = {
 
 
 def translate(form: Smooth) -> dict[str, Any]:
-    """Translate a smooth programme into CasADi's dictionary ``{"x", "p", "f", "g"}``.
-
-    Args:
-        form: the programme after CVXPY's smooth chain.
+    """Translate a programme after CVXPY's smooth chain into CasADi's dictionary ``{"x", "p", "f", "g"}``.
 
     Raises:
         StructureError: an atom without a translation, by name.
@@ -79,11 +78,7 @@ def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
     """Return a CasADi matrix of a number, array or sparse matrix, column by column, without its zeros."""
     if sp.issparse(value):
-        value = sp.csc_array(sp.csc_array(value).reshape(shape, order="F"))
-        value.sum_duplicates()
-        value.sort_indices()
-        pattern = ca.Sparsity(*shape, value.indptr.tolist(), value.indices.tolist())
-        return ca.DM(pattern, value.data)
+        return ca.DM(sp.csc_array(sp.csc_array(value).reshape(shape, order="F")))
     return ca.sparsify(ca.DM(np.reshape(np.asarray(value, dtype=float), shape, order="F")))
 
 
@@ -155,10 +150,7 @@ def _power(expr: Any, columns: list) -> Any:
 def _prod(expr: Any, columns: list) -> Any:
     if expr.axis is not None:
         raise StructureError(f"{expr}: a product along an axis has no translation for CasADi's solvers")
-    result = columns[0][0]
-    for i in range(1, expr.args[0].size):
-        result = result * columns[0][i]
-    return result
+    return reduce(mul, ca.vertsplit(columns[0]))
 
 
 def _of_one(function: str) -> Callable[[Any, list], Any]:
@@ -184,11 +176,7 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
 
 
 def options(name: str, settings: Settings) -> dict[str, Any]:
-    """Translate what is asked into a solver's own options; native options of the user come last.
-
-    Args:
-        name: "ipopt" or "fatrop".
-        settings: what is asked.
+    """Translate what is asked into options of "ipopt" or "fatrop"; native options of the user come last.
 
     Raises:
         StructureError: a Hessian that is not exact.
@@ -212,18 +200,10 @@ def options(name: str, settings: Settings) -> dict[str, Any]:
 
 
 def solve_with(name: str, program: Program, settings: Settings) -> Answer:
-    """Solve a smooth programme with one of CasADi's solvers.
+    """Solve an LP, QP or smooth nonconvex programme with "ipopt" or "fatrop".
 
     The translated programme and the compiled solver are kept with the CVXPY problem: only parameter values and the
-    start are new in the next solve.
-
-    Args:
-        name: "ipopt" or "fatrop".
-        program: an LP, QP or smooth nonconvex programme.
-        settings: what is asked.
-
-    Returns:
-        The solver's claim with values and multipliers in CVXPY's convention ``L = f + dual (lhs - rhs)``.
+    start are new in the next solve. Multipliers are in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
     clock = time.perf_counter()
     form = smooth(program.problem)
@@ -239,11 +219,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
     statistics = solver.stats()
     word, status = _status(statistics)
-    iterations = int(statistics.get("iter_count", -1))
-    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations, compile=compiling)
-    values, duals = form.restore(program, np.asarray(found["x"]).ravel(), np.asarray(found["lam_g"]).ravel())
-    return Answer(status, word, values, duals, iterations, compiling)
+    return form.answer(program, status, word, np.asarray(found["x"]), np.asarray(found["lam_g"]),
+                       iterations=int(statistics.get("iter_count", -1)), compile=compiling)
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:

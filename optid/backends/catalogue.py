@@ -63,12 +63,10 @@ def back_ends() -> list[BackEnd]:
                   installed=_is_installed(package), pip=pip, duals=name not in WITHOUT_DUALS,
                   warm=name in WARM, about="through CVXPY")
           for name, (classes, package, pip) in CONIC.items()),
-        BackEnd("ipopt", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", "ipopt"),
-                installed=_is_installed("casadi"), pip="casadi", warm=True,
-                about="interior point with exact Hessians, through CasADi; large sparse programmes"),
-        BackEnd("fatrop", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", "fatrop"),
-                installed=_is_installed("casadi"), pip="casadi", warm=True,
-                about="interior point with exact Hessians, through CasADi; blind to infeasibility"),
+        *(BackEnd(name, frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", name),
+                  installed=_is_installed("casadi"), pip="casadi", warm=True,
+                  about=f"interior point with exact Hessians, through CasADi; {more}")
+          for name, more in (("ipopt", "large sparse programmes"), ("fatrop", "blind to infeasibility"))),
         BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.uno:run"),
                 installed=_is_installed("unopy") and _is_installed("sparsediffpy"), pip="unopy sparsediffpy", warm=True,
                 about="SQP through CVXPY's derivative engine; small dense programmes"),

@@ -20,18 +20,12 @@ STATUS = {
     "AlmostDualInfeasible": Status.UNBOUNDED, "MaxIterations": Status.LIMIT, "MaxTime": Status.LIMIT,
 }
 
+
 def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[Side], below: Sequence[Side],
                         settings: Settings) -> Answer:
-    """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``.
+    """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``, matrix (k, n).
 
     The residuals are variables, so that the matrix is not squared.
-
-    Args:
-        matrix: (k, n).
-        target: (k,).
-        equal: equalities.
-        below: inequalities.
-        settings: accuracy, time limit and native options.
 
     Returns:
         "x" (n,), where there is a usable point; "rows": multipliers of the equalities, then of the inequalities, for

@@ -1,6 +1,5 @@
 """Every conic and QP solver that CVXPY knows, by name, with one requested accuracy translated per solver."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +7,7 @@ import cvxpy as cp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
+from optid.program.expressions import solve_quietly
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -28,12 +28,7 @@ AMBIGUOUS = {"sdpa"}
 
 
 def tolerances(name: str, settings: Settings) -> dict[str, Any]:
-    """Translate one requested accuracy and time limit into a solver's own options.
-
-    Args:
-        name: lower-case solver name.
-        settings: what is asked.
-    """
+    """Translate one requested accuracy and time limit into a solver's own options; those of the user come last."""
     eps, limit = settings.accuracy, settings.time_limit
     table: dict[str, dict[str, Any]] = {
         "clarabel": {"tol_gap_abs": eps, "tol_gap_rel": eps, "tol_feas": eps, "max_iter": 500},
@@ -64,30 +59,20 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
     options = dict(table.get(name, {}))
     if limit is not None and name in clock:
         options[clock[name]] = float(limit)
-    options.update(settings.options)
-    return options
+    return {**options, **settings.options}
 
 
 def solve_with(name: str, program: Program, settings: Settings) -> Answer:
-    """Solve a convex programme with one of CVXPY's solvers.
+    """Solve a convex programme with one of CVXPY's solvers, by its lower-case name.
 
-    Args:
-        name: lower-case solver name.
-        program: a convex programme.
-        settings: what is asked.
-
-    Returns:
-        The solver's claim; an exception inside the solver becomes ``Status.FAILED`` with its words.
+    An exception inside the solver becomes ``Status.FAILED`` with its words.
     """
     problem, options = program.problem, tolerances(name, settings)
     if name == "clarabel" and program.scale < 1:  # objectives are in units of the data; its relative gap is one to 1
         options |= {key: options[key] * max(program.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
                     if key not in settings.options}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # inaccuracy is judged by our residuals, not by a warning
-            problem.solve(solver=name.upper(), verbose=settings.verbose, warm_start=settings.warm,
-                          **options)
+        solve_quietly(problem, name.upper(), verbose=settings.verbose, warm_start=settings.warm, **options)
     except Exception as error:  # a solver that crashes is an outcome
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
     status, statistics = STATUS.get(problem.status, Status.FAILED), problem.solver_stats
@@ -106,9 +91,7 @@ def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bo
     """Return whether the solver finds the constraints infeasible without an objective, where the dual is feasible."""
     bare = cp.Problem(cp.Minimize(0), problem.constraints)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            bare.solve(solver=name.upper(), **options)
+        solve_quietly(bare, name.upper(), **options)
     except Exception:  # no answer confirms nothing
         return False
     return STATUS.get(bare.status) is Status.INFEASIBLE

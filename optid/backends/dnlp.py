@@ -15,15 +15,18 @@ import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
-from cvxpy.constraints.zero import Equality, Zero
+from cvxpy.constraints.nonpos import NonNeg
+from cvxpy.constraints.zero import Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
 from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
+from optid.backends.back_end import Answer
 from optid.errors import StructureError
+from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program
+from optid.program.solution import Status
 
 CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
@@ -100,28 +103,25 @@ class Smooth:
         self.attributes.update_parameters(self.original)
         return _flat([parameter.value for parameter in self.parameters])
 
-    def restore(self, program: Program, x: np.ndarray, multipliers: np.ndarray
-                ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Map a flat point and the flat multipliers of the rows back to the programme.
+    def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
+        """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
 
-        Args:
-            program: whose problem this is.
-            x: (unknowns,) point of the smooth problem.
-            multipliers: (rows,) in the convention ``L = f + multipliers * row``; empty where there are none.
-
-        Returns:
-            ({variable: value}, {constraint: flat multipliers}); groups without multipliers are absent.
+        Status and word are the claim in our words and in the solver's; x (unknowns,) is a point of the smooth problem.
+        The multipliers (rows,) are in the convention ``L = f + multipliers * row``; empty where there are none.
         """
-        primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, _split(
-            x, [v.size for v in self.variables]))}
-        dual = dict(zip((row.id for row in self.rows), _split(multipliers, [row.expression.size for row in self.rows]))
-                    ) if multipliers.size else {}
+        if status in (Status.INFEASIBLE, Status.UNBOUNDED):
+            return Answer(status, word, **figures)
+        x, multipliers = np.ravel(x), np.ravel(multipliers)
+        parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
+        primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, parts)}
+        parts = np.split(multipliers, np.cumsum([row.expression.size for row in self.rows])[:-1])
+        dual = {row.id: part for row, part in zip(self.rows, parts)} if multipliers.size else {}
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
         values, duals = solution.primal_vars, solution.dual_vars
-        return ({name: values[v.id] for name, v in program.variables.items() if v.id in values},
-                {name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-                 for name, group in program.constraints.items() if all(member.id in duals for member in group)})
+        return Answer(status, word, {name: values[v.id] for name, v in program.variables.items() if v.id in values}, {
+            name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
+            for name, group in program.constraints.items() if all(member.id in duals for member in group)}, **figures)
 
 
 def smooth(problem: cp.Problem) -> Smooth:
@@ -180,8 +180,10 @@ class Derivatives:
 
 
 def derivatives(form: Smooth) -> Derivatives:
-    """Return the compiled derivatives of a smooth problem; made once and kept with the problem."""
-    return kept(form.original, "derivatives", lambda: Derivatives(form))
+    """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
+    found = kept(form.original, "derivatives", lambda: Derivatives(form))
+    found.update()
+    return found
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -238,10 +240,8 @@ class _SmoothChain(Dnlp2Smooth):
 
 
 def _row(constraint: Constraint) -> Row:
-    if isinstance(constraint, Equality | Zero):
-        return Row(constraint.expr, True, constraint.id)
-    if isinstance(constraint, Inequality | NonPos):
-        return Row(constraint.expr, False, constraint.id)
+    if isinstance(constraint, EQUALITIES | INEQUALITIES):
+        return Row(constraint.expr, isinstance(constraint, EQUALITIES), constraint.id)
     if isinstance(constraint, NonNeg):
         return Row(-constraint.args[0], False, constraint.id)
     raise StructureError(
@@ -253,7 +253,3 @@ def _flat(arrays: list) -> np.ndarray:
     parts = [np.ravel(np.asarray(array.toarray() if hasattr(array, "toarray") else array, dtype=float), order="F")
              for array in arrays]
     return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def _split(x: np.ndarray, sizes: list[int]) -> list[np.ndarray]:
-    return np.split(x, np.cumsum(sizes)[:-1])

@@ -11,20 +11,19 @@ import numpy as np
 from optid.backends.back_end import Answer, Settings
 from optid.backends.choice import find
 from optid.backends.step_qp import Coordinates, StepQP
-from optid.certificate.infeasibility import satisfiable
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
 from optid.program.gradients import flat_value
 from optid.program.judging import measure_violation, term_size
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
 from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.multipliers import fit_multipliers
-from optid.structures.rank_one import Point, reduce
+from optid.structures.rank_one import Point
 
 STEPS = 100
 DIRECTIONS = 4  # different directions b that are tried, each with both signs, before the full steps
@@ -44,18 +43,13 @@ def run(program: Program, settings: Settings) -> Answer:
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
     if not program.user_constraints:
-        return _unconstrained(program, form, count, seed)
+        found = _minimum(program, form, count, seed)
+        r = form.problem.root @ found.point.lift() - form.problem.target
+        status, word = (Status.LOCAL, "stationary") if found.converged else (Status.LIMIT, "iteration limit")
+        return Answer(status, word, to_values(program, form, found.point),
+                      {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}, found.iterations)
     whole = _Constrained(program, form, settings, str(options.get("inner", "clarabel")))
     return whole.solve(count, seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
-
-
-def _unconstrained(program: Program, form: RankOneStructure, count: int, seed: int) -> Answer:
-    found = _minimum(program, form, count, seed)
-    values = to_values(program, form, found.point)
-    r = form.problem.root @ found.point.lift() - form.problem.target
-    duals = {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}
-    return Answer(Status.LOCAL if found.converged else Status.LIMIT,
-                  "stationary" if found.converged else "iteration limit", values, duals, found.iterations)
 
 
 def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:
@@ -99,10 +93,7 @@ class _Constrained:
         if not tried:  # none of these directions is allowed: start from the nearest ones that are
             tried = [t for t in map(self._settle, self._allowed(points)) if t is not None]
         if not tried:
-            if not satisfiable(self.program, list(self.program.user_constraints)):
-                return Answer(Status.INFEASIBLE, "the constraints contradict each other")
-            return Answer(Status.FAILED,
-                          "no start satisfies the constraints, although they do not contradict each other")
+            return Answer(Status.FAILED, "no start satisfies the constraints")
         tried.sort(key=lambda pair: pair[0])
         distinct: list[np.ndarray] = []
         for _, x in tried:
@@ -124,7 +115,7 @@ class _Constrained:
 
     def _candidates(self, free: Point, seed: int, most: int) -> list[Point]:
         """Points with different directions of b, each with every pattern of signs."""
-        core = reduce(self.problem)
+        core = self.problem.core
         points = [self.form.point(self.program.start)] if self.program.start else []
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
             points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
@@ -145,7 +136,7 @@ class _Constrained:
                 continue
             self.program.assign(self.at.unpack(x))
             if measure_violation(self.program)[0] <= 1e-14:
-                duals = {name: np.zeros(sum(d.size for c in group for d in c.dual_variables))
+                duals = {name: np.zeros(max((span.stop for span in spans(group)), default=0))
                          for name, group in self.program.constraints.items()}
                 return Answer(Status.LOCAL, "stationary; no constraint is active", self.at.unpack(x),
                               {**duals, "residual": -2.0 * self._residual(x)}, 0)
@@ -182,7 +173,7 @@ class _Constrained:
         # with b fixed the residual is affine, so that one linearisation is exact
         self.half.set_model(x, {}, second_order=False)
         answer = self.half.run(self.inner, self.settings)
-        found = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+        found = self._in_gauge(self.form.point(answer.values)) if answer.values else None
         return None if found is None else (self._merit(found, 0.0), found)
 
     def _in_gauge(self, point: Point) -> np.ndarray | None:
@@ -213,7 +204,7 @@ class _Constrained:
             count += 1
             self.full.set_model(x, multipliers, damping=damping)
             answer = self.full.run(self.inner, self.settings)
-            new = self._in_gauge(self.at.point(self.at.pack(answer.values))) if answer.values else None
+            new = self._in_gauge(self.form.point(answer.values)) if answer.values else None
             size, before, after, rises = np.inf, 0.0, np.inf, True
             if new is not None:
                 multipliers = answer.duals
@@ -245,7 +236,7 @@ class _Constrained:
         A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
         """
         self.at.assign(x)
-        tangent, usual = self.at.slope_of_lift(x), self.program.usual_sizes()
+        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes()
         slope = 2.0 * tangent.T @ (self.problem.root.T @ self._residual(x))
         units = 1.0 / np.maximum(np.linalg.norm(self.problem.root @ tangent, axis=0), 1e-12)
         rows, given, equal, touched, sizes = [], [], [], [], {}

@@ -18,7 +18,7 @@ from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
 from optid.program.expressions import flat
 from optid.program.gradients import affine_parts, flat_value, jacobians, side_by_side
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.least_squares import RankOneStructure
@@ -37,12 +37,12 @@ class Coordinates:
     program: Program
     form: RankOneStructure
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """Names of the variables in the order of x."""
         return [*self.form.linear, *(name for pair in self.form.blocks for name in pair)]
 
-    @property
+    @cached_property
     def variables(self) -> list[cp.Variable]:
         """The variables in the order of x."""
         return [self.program.variables[name] for name in self.names]
@@ -58,8 +58,7 @@ class Coordinates:
 
     def unpack(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return named values for x."""
-        parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
-        return {name: np.reshape(part, v.shape, order="F") for name, v, part in zip(self.names, self.variables, parts)}
+        return self.form.named(self.point(x), self.program.variables)
 
     def assign(self, x: np.ndarray) -> None:
         """Write x into the CVXPY variables."""
@@ -86,19 +85,9 @@ class Coordinates:
         Solvers stop at absolute tolerances, so the QPs are written in these units and not in those of the data.
         """
         problem = self.form.problem
-        energy = np.linalg.norm(problem.root @ self.slope_of_lift(x), axis=0)
+        energy = np.linalg.norm(problem.root @ self.point(x).tangent(), axis=0)
         reach, largest = float(np.sqrt(problem.scale)), {n: float(np.max(e)) for n, e in self.unpack(energy).items()}
         return {name: reach / one if one > 0 and reach > 0 else 1.0 for name, one in largest.items()}
-
-    def slope_of_lift(self, x: np.ndarray) -> np.ndarray:
-        """Jacobian (n, size) of the lifted vector z(x)."""
-        linear = self.form.problem.linear
-        found = np.zeros((len(self.form.problem.target), self.size))
-        found[:linear, :linear] = np.eye(linear)
-        for where, mu, b in self.blocks:
-            found[where, mu] = np.kron(x[b][:, None], np.eye(x[mu].size))
-            found[where, b] = np.kron(np.eye(x[b].size), x[mu][:, None])
-        return found
 
     def curvature(self, x: np.ndarray, pull: np.ndarray) -> np.ndarray:
         """Second derivatives of ``pullᵀ z(x)``, made definite along the scale between mu and b."""
@@ -162,8 +151,9 @@ class StepQP:
         self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
             if name != "residual" and not (pinned and name == "gauge"):
-                for member, span in zip(group, _spans(group)):
+                for member, span in zip(group, spans(group)):
                     self._add(name, member, span)
+        self.rows.sort(key=lambda row: not row.equality)  # stable
 
     def _add(self, name: str, member: cp.Constraint, span: slice) -> None:
         if isinstance(member, EQUALITIES | INEQUALITIES) and not member.is_dcp():
@@ -179,36 +169,18 @@ class StepQP:
         self.rows.append(_Rows(name, span, member, unit, slope, level))
 
     def set_model(self, x: np.ndarray, duals: Values, *, second_order: bool = True, damping: float = 0.0) -> None:
-        """Take the quadratic model of the Lagrangian at x, and the tangents there.
+        """Take the quadratic model of the Lagrangian at x, with the last step's multipliers, and the tangents there.
 
-        Args:
-            x: where.
-            duals: multipliers of the step before.
-            second_order: include the curvature of ``mu bᵀ``; not needed where b is pinned.
-            damping: added to the diagonal of the scaled Hessian.
+        The curvature of ``mu bᵀ`` is not needed where b is pinned; damping adds to the diagonal of the scaled Hessian.
         """
         problem = self.at.form.problem
-        z, lift = self.at.point(x).lift(), self.at.slope_of_lift(x)
+        point = self.at.point(x)
+        z, lift = point.lift(), point.tangent()
         residual = problem.root @ z - problem.target
         pull = problem.root.T @ residual
         for row in self.rows:
             if row.lifted is not None and row.name in duals:
                 pull = pull + row.lifted[0].T @ duals[row.name][row.span] / 2
-        jacobian = problem.root @ lift
-        hessian = jacobian.T @ jacobian
-        diagonal = np.diag(hessian)
-        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), 1e-300)))
-        if second_order:
-            hessian = hessian + self.at.curvature(x, pull)
-        scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
-        factor = _cholesky(scaled, shift)
-        if factor is None:
-            factor = _definite(scaled, self._active(duals, x) / scale, shift)
-        upper = factor.T * (scale * self._scale)
-        self._unit = max(float(np.max(np.abs(upper))), 1e-300)
-        descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
-        self._model = upper / self._unit, (upper @ (x / self._scale) - descent) / self._unit
-        self._held = x[self._pins] / self._scale[self._pins]
         self.at.assign(x)
         for row in self.rows:
             if row.lifted is not None:
@@ -218,6 +190,21 @@ class StepQP:
             else:
                 continue
             row.level = value - row.slope @ x
+        jacobian = problem.root @ lift
+        hessian = jacobian.T @ jacobian
+        diagonal = np.diag(hessian)
+        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), 1e-300)))
+        if second_order:
+            hessian = hessian + self.at.curvature(x, pull)
+        scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
+        factor = _cholesky(scaled, shift)
+        if factor is None:
+            factor = _definite(scaled, self._active(duals) / scale, shift)
+        upper = factor.T * (scale * self._scale)
+        self._unit = max(float(np.max(np.abs(upper))), 1e-300)
+        descent = np.linalg.solve(factor, jacobian.T @ residual / scale)
+        self._model = upper / self._unit, (upper @ (x / self._scale) - descent) / self._unit
+        self._held = x[self._pins] / self._scale[self._pins]
 
     def run(self, back_end: BackEnd, settings: Settings) -> Answer:
         """Solve; the multipliers are those of the objective of the programme itself."""
@@ -238,20 +225,18 @@ class StepQP:
         return replace(answer, values=values if usable else {}, duals=duals)
 
     def _directly(self, settings: Settings) -> Answer:
-        matrix, target, held, *sides = self._matrices()
+        matrix, target, held, *parts = self._matrices()
         pins = np.eye(self.at.size)[self._pins]
-        pairs = list(zip(self.rows, sides[::2], sides[1::2]))
-        equal = [(slope, -level) for row, slope, level in pairs if row.equality]
-        below = [(slope, -level) for row, slope, level in pairs if not row.equality]
-        found = solve_least_squares(matrix, target, [(pins, held), *equal], below, settings)
+        sides = [(slope, -level) for slope, level in zip(parts[::2], parts[1::2])]
+        equal = sum(row.equality for row in self.rows)
+        found = solve_least_squares(matrix, target, [(pins, held), *sides[:equal]], sides[equal:], settings)
         if not found.values:
             return found
-        duals, position = {}, len(pins)
-        for row in sorted(self.rows, key=lambda row: not row.equality):  # as they were given: a stable order
-            size = row.span.stop - row.span.start
-            total = max(other.span.stop for other in self.rows if other.name == row.name)
-            duals.setdefault(row.name, np.zeros(total))[row.span] = found.duals["rows"][position : position + size]
-            position += size
+        edges = np.cumsum([len(pins), *(right.size for _, right in sides)])
+        duals = {name: np.zeros(max(row.span.stop for row in self.rows if row.name == name))
+                 for name in dict.fromkeys(row.name for row in self.rows)}
+        for row, start, stop in zip(self.rows, edges, edges[1:]):
+            duals[row.name][row.span] = found.duals["rows"][start:stop]
         return replace(found, values=self.at.unpack(found.values["x"]), duals=duals)
 
     def _matrices(self) -> list[np.ndarray]:
@@ -283,32 +268,18 @@ class StepQP:
         return Program("step", cp.Minimize(cp.sum_squares(r)), {name: tuple(group) for name, group in groups.items()},
                        {**stand_ins, "_r": r}, {}, dict, at.program.view), matrices
 
-    def _active(self, duals: Values, x: np.ndarray) -> np.ndarray:
-        """Gradients (r, size) of the equalities and of the inequalities with a multiplier, at x."""
-        self.at.assign(x)
-        found = [np.zeros((0, self.at.size))]
+    def _active(self, duals: Values) -> np.ndarray:
+        """Gradients (r, size) of the equalities and of the inequalities with a multiplier."""
         least = 1e-6 * max((float(np.max(np.abs(dual), initial=0.0)) for dual in duals.values()), default=0.0)
-        for name, group in self.at.program.constraints.items():
-            for member, span in zip(group, _spans(group)) if name in duals else ():
-                if isinstance(member, EQUALITIES):
-                    found.append(self.slope(member.expr))
-                elif isinstance(member, INEQUALITIES):
-                    found.append(self.slope(member.expr)[duals[name][span] > least])
-        return np.vstack(found)
+        found = [row.slope if row.equality else row.slope[duals[row.name][row.span] > least]
+                 for row in self.rows if row.name in duals]
+        return np.vstack([np.zeros((0, self.at.size)), *found])
 
     def slope(self, expression: Any) -> np.ndarray:
         """Jacobian (r, size) of an expression at the assigned point; formed once where it is constant."""
-        if not expression.is_affine():
-            return side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
-        if expression.id not in self._slopes:
+        if expression.id not in self._slopes or not expression.is_affine():
             self._slopes[expression.id] = side_by_side(jacobians(expression) or {}, self.at.variables, expression.size)
         return self._slopes[expression.id]
-
-
-def _spans(group: tuple[cp.Constraint, ...]) -> list[slice]:
-    """Rows of every member in the multipliers of its group."""
-    edges = np.cumsum([0, *(sum(dual.size for dual in member.dual_variables) for member in group)])
-    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:])]
 
 
 def _cholesky(matrix: np.ndarray, shift: float) -> np.ndarray | None:

@@ -28,11 +28,9 @@ POINT = {
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a smooth programme with Uno (options: ``preset``, default "filtersqp", and Uno's own).
+    """Solve an LP, QP or smooth nonconvex programme with Uno.
 
-    Args:
-        program: an LP, QP or smooth nonconvex programme.
-        settings: what is asked.
+    Options: ``preset``, default "filtersqp", and Uno's own.
     """
     unopy: Any = import_module("unopy")
     clock = time.perf_counter()
@@ -46,12 +44,8 @@ def run(program: Program, settings: Settings) -> Answer:
     compiling = time.perf_counter() - clock
     result = solver.optimize(model)
     word, status = _status(str(result.optimization_status), str(result.solution_status))
-    iterations = int(result.number_iterations)
-    if status in (Status.INFEASIBLE, Status.UNBOUNDED):
-        return Answer(status, word, iterations=iterations, compile=compiling)
-    values, duals = form.restore(program, np.array(list(result.primal_solution)),
-                                 np.array(list(result.constraint_dual_solution)))
-    return Answer(status, word, values, duals, iterations, compiling)
+    return form.answer(program, status, word, list(result.primal_solution), list(result.constraint_dual_solution),
+                       iterations=int(result.number_iterations), compile=compiling)
 
 
 def options(settings: Settings) -> dict[str, Any]:
@@ -68,7 +62,6 @@ def options(settings: Settings) -> dict[str, Any]:
 def _model(unopy: Any, form: Smooth) -> Any:
     start, _ = form.start(), form.parameter_values()
     engine = derivatives(form)
-    engine.update()
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:

@@ -17,11 +17,12 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
-from optid.certificate.lifting import lift_linear
+from optid.certificate.lifting import lift
 from optid.program.gradients import flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
+from optid.program.structure import variable_size
 from optid.structures.least_squares import LeastSquaresStructure
 from optid.structures.multipliers import least_distance
 
@@ -39,20 +40,14 @@ REACH = 2.0
 
 
 def certify_convex(program: Program, values: Values, duals: Values, objective: float) -> Bound | None:
-    """Return the dual bound at a point; None where it cannot be formed (no multipliers, an objective with kinks).
+    """Return the dual bound at a point with this objective, from multipliers of which some may be missing.
 
-    Args:
-        program: a convex programme.
-        values: the point.
-        duals: {constraint: flat multipliers}; names may be missing.
-        objective: its value at the point.
+    None where it cannot be formed (no multipliers, an objective with kinks).
     """
     program.assign(values)
     form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
     if form is None:
-        value = _tangent_bound(program, duals, objective)
-        found = None if value is None else (value, f"tangent of the Lagrangian, within {REACH:g} times the solution")
-        method = TANGENT
+        found, method = _tangent_bound(program, duals, objective), TANGENT
     else:
         found, method = _least_squares_bound(program, form, duals, objective), "convex dual"
     if found is None or not np.isfinite(found[0]):
@@ -92,7 +87,7 @@ def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Value
     return objective + lagrangian.value - float(step @ step) / 4 - loose
 
 
-def _tangent_bound(program: Program, duals: Values, objective: float) -> float | None:
+def _tangent_bound(program: Program, duals: Values, objective: float) -> tuple[float, str] | None:
     lagrangian, variables = Lagrangian.of(program, duals, program.constraints), list(program.variables.values())
     if lagrangian is None or not lagrangian.add(program.objective.expr, np.ones(1)) or any(
             lagrangian.free_part(variable) is None for variable in variables):
@@ -106,7 +101,7 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> float |
         along = directions.T @ gradient
         caught = float(np.sum(along[curved] ** 2 / sizes[curved])) / 2
         plain = min(plain, caught + float(np.abs(directions[:, ~curved] @ along[~curved]) @ widths))
-    return objective + lagrangian.value - plain
+    return objective + lagrangian.value - plain, f"tangent of the Lagrangian, within {REACH:g} times the solution"
 
 
 def _hessian(program: Program) -> Array:
@@ -131,15 +126,12 @@ def _hessian(program: Program) -> Array:
 
 
 def _width(variable: cp.Variable) -> float:
-    size = float(np.max(np.abs(flat_value(variable)), initial=0.0))
-    return REACH * (size or 1.0)
+    return REACH * variable_size(flat_value(variable), None)
 
 
 def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
     """By how much the gradient can lower the Lagrangian inside the box and the bounds that the variable carries."""
-    gradient = np.reshape(lagrangian.total[variable.id], variable.shape, order="F")
-    if variable.attributes["symmetric"]:
-        gradient = (gradient + gradient.T) / 2
+    gradient = lagrangian.gradient(variable)
     room = np.full(variable.shape, _width(variable))
     if (bounds := bounds_of(variable)) is not None:
         value = np.asarray(variable.value, dtype=float)
@@ -149,8 +141,7 @@ def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
 
 def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
-    problem = form.problem
-    lifted = lift_linear(program, form.linear, len(problem.target))
+    problem, lifted = form.problem, lift(program, form)
     linear = lifted.linear
     if lifted.refused or not len(linear.right):
         return None

@@ -33,7 +33,7 @@ class HankelBounds:
     Attributes:
         block_rows: the alphas that were tried.
         values: (len(block_rows), orders) squared error, in squared units of the (weighted) outputs; column n is for
-            models of order n; NaN where alpha is too small to say anything about n.
+            models of order n; zero where alpha is too small to say anything about n.
         energy: squared norm of the weighted outputs over the samples in complete windows, the yardstick.
     """
 
@@ -49,16 +49,8 @@ class HankelBounds:
         """
         if not 0 <= n < self.values.shape[1]:
             raise StructureError(f"bounds exist for the orders 0 to {self.values.shape[1] - 1}; got {n!r}")
-        column = self.values[:, n]
-        if np.all(np.isnan(column)):
-            return 0.0, self.block_rows[-1]
-        best = int(np.nanargmax(column))
-        return float(column[best]), self.block_rows[best]
-
-    def smallest_order(self, error: float) -> int:
-        """Return the least order that the bounds allow for a squared error, or one more than they examine."""
-        allowed = [n for n in range(self.values.shape[1]) if self.value(n)[0] <= error]
-        return allowed[0] if allowed else self.values.shape[1]
+        best = int(np.argmax(self.values[:, n]))
+        return float(self.values[best, n]), self.block_rows[best]
 
     def bound(self, n: int, error: float) -> Bound:
         """Return the certificate of a fit of order n with a squared simulation error, in the units of the bound.
@@ -70,9 +62,8 @@ class HankelBounds:
         if error < value * (1 - 1e-9) - 1e-12 * self.energy:
             raise StructureError(f"an error of {error:.6g} lies below the bound {value:.6g} for order {n}: it was not "
                                  "measured by the simulator with measured feedback on this record and these functions")
-        need = self.smallest_order(error)
         reason = f"no model of order {n} with these functions simulates with a squared error below {value:.4g}"
-        if need == n and n:
+        if n and self.value(n - 1)[0] > error >= value:
             reason += f"; order {n - 1} cannot reach what order {n} reached"
         return Bound(value, False, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
 
@@ -103,7 +94,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
     if not tried or tried[0] < 2:
         raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
     scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
-    values, energy = np.full((len(tried), largest + 1), np.nan), 0.0
+    values, energy = np.zeros((len(tried), largest + 1)), -1.0
     for position, alpha in enumerate(tried):
         statistics = hankel_statistics(records, alpha, expand, centre="mean")
         known = np.concatenate([[0], statistics.at(inputs), statistics.at(feedback, range(alpha - 1))]).astype(int)
@@ -116,9 +107,8 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         slack = ROUNDING[statistics.method] * (statistics.condition**2 if statistics.method == "gram" else 1.0)
         tails = np.concatenate([np.cumsum(left[::-1])[::-1], np.zeros(largest + 1)])[: largest + 1] / alpha
         values[position] = np.maximum(tails - slack * max(statistics.windows, 1) ** 0.5 * whole, 0.0)
-        values[position, left.size :] = np.nan
         energy = max(energy, whole)
-    if np.all(np.isnan(values)):
+    if energy < 0:
         raise RankError(f"the record has too few complete windows for a bound with {tried[0]} block rows of "
                         f"{len(inputs) + len(outputs) + len(feedback)} signals; use a longer record or fewer functions")
     return HankelBounds(tried, values, energy)

@@ -1,13 +1,12 @@
 """Explain an infeasible set of constraints by a smallest conflicting subset, in the user's names."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import cvxpy as cp
 
-from optid.certificate.lifting import lift_exact, places
-from optid.program.expressions import flat
+from optid.certificate.lifting import lift, places
+from optid.program.expressions import flat, solve_quietly
 from optid.program.gradients import flat_value, jacobians
 from optid.program.limits import EQUALITIES
 from optid.program.program import Program
@@ -21,21 +20,20 @@ def explain(program: Program) -> str:
     and Dravnieks 1991). Constraints that are neither convex nor linear in ``mu bᵀ`` take part through their
     linearisation at the start, and the sentence says so.
     """
-    names = list(program.user_constraints)
-    form = rank_one_of(program)
-    stand_in = {} if form is None else places(program, form).stand_in
-    linearised = [name for name in names
-                  if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     conflict = conflicting_subset(program)
     if conflict is None:
-        return (f"{program.name!r} was reported infeasible, but its constraints ({', '.join(names) or 'none'}) can be "
+        names = ", ".join(program.user_constraints) or "none"
+        return (f"{program.name!r} was reported infeasible, but its constraints ({names}) can be "
                 "satisfied together; try another solver (optid solvers)")
     if len(conflict) == 1:
         text = f"constraint {conflict[0]!r} cannot be satisfied by any model of this structure; relax it or drop it"
     else:
         text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
                 "relax or drop one of them (each subset without one of them can be satisfied)")
-    used = [name for name in linearised if name in conflict]
+    form = rank_one_of(program)
+    stand_in = {} if form is None else places(program, form).stand_in
+    used = [name for name in conflict
+            if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
     return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")
 
 
@@ -67,7 +65,7 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
         copy = member if where is None else member.tree_copy(where.stand_in)
         found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
     if form is not None and where is not None:
-        lifted = lift_exact(program.without(*(set(program.user_constraints) - set(names))), form)
+        lifted = lift(program.without(*(set(program.user_constraints) - set(names))), form)
         count = len(lifted.linear.right)  # these are there already
         lifted.add_products(form.problem)
         rows = lifted.linear.rows[count:]
@@ -77,10 +75,8 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     if not found:
         return True
     problem = cp.Problem(cp.Minimize(0), found)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate proof of a conflict is one as well
-        problem.solve(solver=cp.CLARABEL)
-    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+    solve_quietly(problem)
+    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)  # an inaccurate proof is one as well
 
 
 def _linearised(member: Any) -> Any:

@@ -12,13 +12,13 @@ from time import perf_counter
 
 import numpy as np
 
-from optid.certificate.minors import Block, Lagrangian, ascend, free_mask, project_minors, rotation, tangent_minors
+from optid.certificate.minors import Block, Quadratic, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
 from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_constraints, kkt_multipliers, sign_free_cut
 from optid.errors import StructureError
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
-from optid.structures.whitening import block_slices
+from optid.structures.whitening import block_slices, invert_triangular
 
 TOLERANCE = 1e-8
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
@@ -27,8 +27,8 @@ EFFORTS = ("instant", "ascent", "sdp")
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Multipliers of a bound, in the whitened coordinates of ``core``.
+class Multipliers:
+    """What a bound can be recomputed from, in the whitened coordinates of ``core``.
 
     Attributes:
         core: coordinates; ``core.whitening.columns`` is the change of coordinates.
@@ -49,12 +49,10 @@ class Certification:
 
     Attributes:
         bound: lower bound on the global optimum.
-        gap: (F - D) / max(F, 1e-9 Y^T Y).
         better: candidates for a better point, to restart a local method from; only from the SDP.
     """
 
     bound: Bound
-    gap: float
     better: tuple[Point, ...] = ()
 
 
@@ -63,8 +61,7 @@ class Case:
     """What the stages share, in whitened coordinates; block indices are those of the core.
 
     Attributes:
-        problem: the problem.
-        core: its reduction.
+        core: reduction of the problem.
         mus: (P_i,) each, oriented so that C mu >= 0.
         bs: (nb_i,) each, of unit length.
         objective: the objective around the point.
@@ -75,11 +72,10 @@ class Case:
         began: clock at the start.
     """
 
-    problem: RankOne
     core: Core
     mus: list[Array]
     bs: list[Array]
-    objective: Lagrangian
+    objective: Quadratic
     cones: dict[int, Array]
     nu: dict[int, Array]
     lam: Array
@@ -113,15 +109,15 @@ class Case:
         found.append(np.where(self.linear.equality, np.abs(slack), -slack) / np.maximum(terms, np.finfo(float).tiny))
         return float(np.concatenate(found).max())
 
-    def lagrangian(self, multipliers: Array | None = None) -> Lagrangian:
+    def lagrangian(self, multipliers: Array | None = None) -> Quadratic:
         """The objective with the linear terms, at the KKT multipliers or others."""
         chosen = self.lam if multipliers is None else multipliers
-        return self.objective.with_linear(self.linear.rows, self.linear.slack(self.objective.z)[0], chosen)
+        slope = self.objective.slope + chosen @ self.linear.rows / 2
+        return replace(self.objective, slope=slope, linear_terms=-float(
+            chosen @ self.linear.slack(self.objective.z)[0]))
 
-    def cut_form(self, cuts: dict[int, Array]) -> Array | None:
+    def cut_form(self, cuts: dict[int, Array]) -> Array:
         """The (k, k) form of the weights ``cuts[i]`` (r, r, nb, nb) of products of cone rows."""
-        if not cuts:
-            return None
         form = np.zeros_like(self.objective.gram)
         for i, weights in cuts.items():
             cone, where = self.cones[i], self.blocks[i][0]
@@ -145,7 +141,7 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
         max_size: number of multipliers above which the SDP is not attempted.
 
     Returns:
-        The bound, its gap and, after an SDP that did not prove the point, points to restart from.
+        The bound and, after an SDP that did not prove the point, points to restart from.
 
     Raises:
         StructureError: constraints of a wrong shape, an unknown effort.
@@ -182,9 +178,12 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
     began = perf_counter()
     keep_linear = bool(linear.rows[:, :problem.linear].any())
-    core = reduce(problem, tuple(range(len(problem.blocks)) if len(linear.right) else cones), keep_linear)
+    keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
+    core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
     w, mus, bs = core.factors(point)
-    white = {core.kept.index(i): core.whitening.cone(core.kept.index(i), cone) for i, cone in cones.items()}
+    white: dict[int, Array] = {}
+    for i, cone in zip(map(core.kept.index, cones), cones.values()):
+        white[i] = cone @ invert_triangular(core.whitening.factors_mu[i]).T
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]
@@ -197,7 +196,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     else:
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(problem, core, mus, bs, Lagrangian(core.gram, z, slope, value), white, nu, lam, linear, began)
+    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear, began)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
@@ -208,10 +207,7 @@ def instant_cuts(case: Case) -> dict[int, Array]:
 
 def tangent(case: Case, cuts: dict[int, Array]) -> Array:
     """Minors that cancel the rest of the gradient at the point, block by block; none for a block that is zero."""
-    slope = case.lagrangian().slope
-    form = case.cut_form(cuts)
-    if form is not None:
-        slope = slope - form @ case.objective.z
+    slope = case.lagrangian().slope - case.cut_form(cuts) @ case.objective.z
     minors = np.zeros_like(case.objective.gram)
     gradients = matrices(slope[case.core.linear:], case.core.shapes)
     for (where, _), mu, b, vanishes, gradient in zip(case.blocks, case.mus, case.bs, case.vanishing, gradients):
@@ -224,8 +220,7 @@ def tangent(case: Case, cuts: dict[int, Array]) -> Array:
 
 def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple[Array | None, int]:
     """Ascent from given multipliers that cancel the gradient; improved minors, or None, and the steps taken."""
-    form = case.cut_form(cuts)
-    matrix = case.objective.gram + minors - (0.0 if form is None else form)
+    matrix = case.objective.gram + minors - case.cut_form(cuts)
     turn = rotation(case.core.linear, case.mus, case.bs)
     free, taken = ascend(turn.T @ matrix @ turn, case.blocks, case.masks, steps)
     return (None if free is None else minors + onto_minors(case, turn @ free @ turn.T)), taken
@@ -288,9 +283,8 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     """Recompute the bound from its multipliers and say what it proves."""
     value = case.objective.value
     bound = float(case.lagrangian(linear).bound(minors, case.cut_form(cuts)))
-    gap = relative_gap(value, bound, case.problem.scale)
-    broken = case.violation()
-    undercut = relative_gap(bound, value, case.problem.scale) > TOLERANCE
+    scale, broken = case.core.problem.scale, case.violation()
+    gap, undercut = relative_gap(value, bound, scale), relative_gap(bound, value, scale) > TOLERANCE
     proved = gap <= TOLERANCE and not undercut and broken <= ACTIVE
     if broken > ACTIVE or undercut:
         reason = f"not proved: the point violates its constraints (relative violation {broken:.1e})"
@@ -300,6 +294,6 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
         reason = f"not proved, relative gap {gap:.1e}: {how}"
     else:
         reason = f"not proved, no finite bound: {how}"
-    evidence = Evidence(case.core, minors, cuts, case.lam if linear is None else linear)
-    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence), gap,
+    evidence = Multipliers(case.core, minors, cuts, case.lam if linear is None else linear)
+    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence),
                          () if proved else better)

@@ -4,7 +4,7 @@ A certificate needs every constraint in one of two forms: linear in z, or a cone
 carries. Anything else leaves the fit without a proof, and the reason names the constraint.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import cvxpy as cp
@@ -17,7 +17,7 @@ from optid.program.gradients import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
-from optid.structures.least_squares import RankOneStructure, rank_one_of
+from optid.structures.least_squares import LeastSquaresStructure, rank_one_of
 from optid.structures.rank_one import Point, RankOne
 
 
@@ -26,21 +26,16 @@ class Lifted:
     """Constraints in the two forms a certificate understands.
 
     Attributes:
-        size: length of z.
         linear: the rows on z.
         cones: {block: rows C of ``C mu >= 0``}.
         directions: {block: rows B of ``B b >= 0``}.
         refused: name of the first constraint that has neither form, "" where all have.
     """
 
-    size: int
-    linear: Linear = field(init=False)
+    linear: Linear
     cones: dict[int, np.ndarray] = field(default_factory=dict)
     directions: dict[int, np.ndarray] = field(default_factory=dict)
     refused: str = ""
-
-    def __post_init__(self) -> None:
-        self.linear = Linear.none(self.size)
 
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
@@ -59,7 +54,7 @@ class Lifted:
                 alone.append(i)
                 continue
             cone = self.cones[i]  # it stays: the products alone also hold where b has no component along them
-            products = np.zeros((len(rows) * len(cone), self.size))
+            products = np.zeros((len(rows) * len(cone), len(problem.target)))
             products[:, problem.slices[i]] = np.kron(-rows, cone)
             self.add(products, np.zeros(len(products)), False)
         return alone
@@ -67,13 +62,9 @@ class Lifted:
 
 def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
                      ) -> tuple[Bound, Values | None]:
-    """Certify a point of a rank-one programme under its user constraints.
+    """Certify a point of a rank-one programme under its user constraints, with multipliers of the certificate's own.
 
-    Args:
-        program: a programme with a `RankOneStructure`.
-        values: the point.
-        duals: multipliers by constraint; not needed, because the certificate computes its own.
-        max_size: number of multipliers above which the semidefinite relaxation is not attempted.
+    The semidefinite relaxation is not attempted above ``max_size`` multipliers.
 
     Returns:
         The bound, and values to restart from where the relaxation proposes a better point.
@@ -81,7 +72,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     form = rank_one_of(program)
     if form is None:
         return Bound.none(f"no proof: {program.name!r} has no rank-one structure left"), None
-    lifted = lift_exact(program, form)
+    lifted = lift(program, form)
     if lifted.refused:
         return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, offset) and not a cone "
                           "on mu"), None
@@ -97,7 +88,7 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
     transposed = lifted.add_products(problem)
     if not transposed:
         return problem, point, False
-    order, blocks = np.arange(lifted.size), list(problem.blocks)
+    order, blocks = np.arange(len(problem.target)), list(problem.blocks)
     mus, bs = list(point.mus), list(point.bs)
     for i in transposed:
         (p, q), span = blocks[i], problem.slices[i]
@@ -106,33 +97,14 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
         lifted.cones[i] = lifted.directions[i]
     lifted.linear = replace(lifted.linear, rows=lifted.linear.rows[:, order])
     triangle = np.triu(np.linalg.qr(np.column_stack([problem.root[:, order], problem.target]), mode="r"))
-    turned = RankOne(triangle[: lifted.size, :-1], triangle[: lifted.size, -1], problem.remainder, tuple(blocks),
+    turned = RankOne(triangle[: len(order), :-1], triangle[: len(order), -1], problem.remainder, tuple(blocks),
                      problem.linear, problem.scale)
     return turned, Point(point.w, tuple(mus), tuple(bs)), True
 
 
-def _columns(program: Program, names: Sequence[str]) -> dict[int, int]:
-    """First column of every named variable, by id, where they follow one another from column 0."""
-    variables = [program.variables[name] for name in names]
-    return dict(zip((v.id for v in variables), np.cumsum([0, *(v.size for v in variables)]).tolist()))
-
-
-def lift_linear(program: Program, names: Sequence[str], size: int) -> Lifted:
-    """Bring the user constraints of a programme in which no product is left into rows on the named variables."""
-    lifted, columns = Lifted(size), _columns(program, names)
-    for name, group in program.user_constraints.items():
-        for member in group:
-            found = _rows(member, columns, size) if isinstance(member, EQUALITIES | INEQUALITIES) else None
-            if found is None:
-                lifted.refused = lifted.refused or name
-            else:
-                lifted.add(*found, isinstance(member, EQUALITIES))
-    return lifted
-
-
 @dataclass(frozen=True)
 class Places:
-    """Where the variables of a bilinear programme stand in the lifted vector z.
+    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z.
 
     Attributes:
         size: length of z.
@@ -146,44 +118,36 @@ class Places:
 
     def rows(self, member: Constraint) -> tuple[np.ndarray, np.ndarray] | None:
         """Return (E, f) of a constraint that reads ``E z <= f`` or ``E z = f``, or None where it does not."""
-        return _rows(member.tree_copy(self.stand_in), self.columns, self.size)
+        return _rows(member.tree_copy(self.stand_in) if self.stand_in else member, self.columns, self.size)
 
 
-def places(program: Program, form: RankOneStructure) -> Places:
+def places(program: Program, form: LeastSquaresStructure) -> Places:
     """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
-    problem = form.problem
-    columns, stand_in = _columns(program, form.linear), {}
-    for shape, where, (mu, _) in zip(problem.blocks, problem.slices, form.blocks):
-        theta = cp.Variable(shape)
+    variables, stand_in = [program.variables[name] for name in form.linear], {}
+    columns = dict(zip((v.id for v in variables), np.cumsum([0, *(v.size for v in variables)]).tolist()))
+    for i, (mu, _) in enumerate(form.blocks):
+        theta = cp.Variable(form.problem.blocks[i])
         stand_in[id(program.view.inner["Theta" + mu[len("mu"):]])] = theta
-        columns[theta.id] = where.start
-    return Places(len(problem.target), columns, stand_in)
+        columns[theta.id] = form.problem.slices[i].start
+    return Places(len(form.problem.target), columns, stand_in)
 
 
-def lift_exact(program: Program, form: RankOneStructure) -> Lifted:
-    """Bring the user constraints of a bilinear programme into lifted form."""
-    problem = form.problem
-    lifted, where = Lifted(len(problem.target)), places(program, form)
-    mus = {program.variables[mu].id: i for i, (mu, _) in enumerate(form.blocks)}
-    bs = {program.variables[b].id: i for i, (_, b) in enumerate(form.blocks)}
+def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
+    """Bring the user constraints of a programme into lifted form."""
+    where = places(program, form)
+    lifted = Lifted(Linear.none(where.size))
+    factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
     for name, group in program.user_constraints.items():
         for member in group:
-            if not isinstance(member, EQUALITIES | INEQUALITIES):
-                lifted.refused = lifted.refused or name
-                continue
-            equal = isinstance(member, EQUALITIES)
-            ids, affine = {v.id for v in member.variables()}, member.expr.is_affine()
-            only = next(iter(ids)) if len(ids) == 1 else None
-            if affine and (only in mus or only in bs):
-                variable = member.variables()[0]
-                found = _rows(member, {variable.id: 0}, variable.size)
-                lift, i = (_lift_mu, mus[only]) if only in mus else (_lift_b, bs[only])
-                fits = found is not None and lift(lifted, form, i, *found, equal)
-            else:
-                found = where.rows(member)
-                fits = found is not None
-                if found is not None:
+            fits, equal = False, isinstance(member, EQUALITIES)
+            if isinstance(member, EQUALITIES | INEQUALITIES):
+                variables = member.variables()
+                if len(variables) == 1 and variables[0].id in factors and member.expr.is_affine():
+                    found = _rows(member, {variables[0].id: 0}, variables[0].size)
+                    fits = found is not None and _lift_factor(lifted, form, *factors[variables[0].id], *found, equal)
+                elif (found := where.rows(member)) is not None:
                     lifted.add(*found, equal)
+                    fits = True
             if not fits:
                 lifted.refused = lifted.refused or name
     return lifted
@@ -200,32 +164,22 @@ def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np
     return rows, -constant
 
 
-def _lift_mu(lifted: Lifted, form: RankOneStructure, i: int, rows: np.ndarray, right: np.ndarray, equal: bool) -> bool:
+def _lift_factor(lifted: Lifted, form: LeastSquaresStructure, i: int, of_mu: bool, rows: np.ndarray, right: np.ndarray,
+                 equal: bool) -> bool:
+    """Lift rows on one factor of a block, mu or b; False where they have no lifted form."""
     p, q = form.problem.blocks[i]
     homogeneous = not np.any(right)
     if homogeneous and not equal:
-        lifted.cones[i] = np.vstack([lifted.cones.get(i, np.zeros((0, p))), -rows])
+        cones = lifted.cones if of_mu else lifted.directions
+        cones[i] = np.vstack([cones.get(i, np.zeros((0, rows.shape[1]))), -rows])
         return True
-    if not homogeneous and form.gauge != "b0":
+    if not homogeneous and not (of_mu and form.gauge == "b0"):
         return False
     # S mu = 0 means S Theta = 0; with b_0 = 1 the first column of Theta is mu itself
-    for lag in np.eye(q)[: q if homogeneous else 1]:
-        wide = np.zeros((len(rows), lifted.size))
-        wide[:, form.problem.slices[i]] = np.kron(lag, rows)
-        lifted.add(wide, right, equal)
-    return True
-
-
-def _lift_b(lifted: Lifted, form: RankOneStructure, i: int, rows: np.ndarray, right: np.ndarray, equal: bool) -> bool:
-    p, q = form.problem.blocks[i]
-    if np.any(right):
-        return False
-    if not equal:
-        lifted.directions[i] = np.vstack([lifted.directions.get(i, np.zeros((0, q))), -rows])
-        return True
-    wide = np.zeros((len(rows) * p, lifted.size))
-    wide[:, form.problem.slices[i]] = np.kron(rows, np.eye(p))
-    lifted.add(wide, np.zeros(len(wide)), True)
+    products = np.kron(np.eye(q)[: q if homogeneous else 1], rows) if of_mu else np.kron(rows, np.eye(p))
+    wide = np.zeros((len(products), len(form.problem.target)))
+    wide[:, form.problem.slices[i]] = products
+    lifted.add(wide, np.resize(right, len(wide)), equal)
     return True
 
 
@@ -233,28 +187,21 @@ def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, val
                     ) -> tuple[Bound, None]:
     """Bound ``‖R z - s‖² + remainder + 2 sum tau_c ‖Theta_c‖_*`` under linear constraints by its own dual.
 
-    For any nu with ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
+    The tau_c are the heights (inputs,) times the programme's parameter "weight". For any nu with
+    ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
-
-    Args:
-        problem: R, s and the remainder.
-        heights: (inputs,) tau_c per unit of the programme's parameter "weight".
-        program: the programme.
-        values: the point.
-        duals: multipliers by constraint.
     """
     taus = heights * float(np.asarray(program.parameters["weight"].value))
-    names = [name for name in program.variables if name != "residual"]
-    lifted = lift_linear(program, names, len(problem.target))
+    form = LeastSquaresStructure(problem, tuple(name for name in program.variables if name != "residual"))
+    lifted = lift(program, form)
     if lifted.refused:
         return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear"), None
     for name in program.user_constraints:
         if name not in duals:
             return Bound.none(f"no proof: the solver gave no multiplier of {name!r}"), None
-    multipliers = [duals[name] for name in program.user_constraints]
-    z = np.concatenate([np.ravel(values[name], order="F") for name in names])
+    z = form.flat(values)
     nu = 2.0 * (problem.root @ z - problem.target)
-    lam = np.concatenate([np.zeros(0), *multipliers])
+    lam = np.concatenate([np.zeros(0), *(duals[name] for name in program.user_constraints)])
     lam = np.where(lifted.linear.equality, lam, np.maximum(lam, 0.0))
     pull, cost = lifted.linear.rows.T @ lam, float(lam @ lifted.linear.right)
     free = len(z) if not np.any(taus) else problem.linear
@@ -264,7 +211,7 @@ def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, val
     shrink = min([1.0, *(2.0 * tau / max(float(np.linalg.norm(part, 2)), 1e-300) for part, tau in zip(parts, taus))]
                  ) if np.any(taus) else 1.0
     bound = problem.remainder - shrink * float(nu @ problem.target) - shrink**2 * float(nu @ nu) / 4 - shrink * cost
-    matrices = [values[name] for name in names if name.startswith("Theta")]
+    matrices = [values[name] for name in form.linear if name.startswith("Theta")]
     value = problem.value(z) + 2.0 * sum(tau * float(np.linalg.norm(matrix, "nuc"))
                                          for tau, matrix in zip(taus, matrices))
     gap = relative_gap(value, bound, problem.scale)

@@ -34,10 +34,7 @@ def project_minors(matrix: Array, shape: tuple[int, int]) -> Array:
 def tangent_minors(gradient: Array, mu: Array, b: Array) -> Array:
     """The combination M of minors with ``M kron(b, mu) = vec(gradient)``, which needs nothing beyond the tangent data.
 
-    Args:
-        gradient: (P, nb) with gradient b = 0 and gradient^T mu = 0.
-        mu: (P,), not zero.
-        b: (nb,) of unit length.
+    The gradient (P, nb) has ``gradient b = 0`` and ``gradient^T mu = 0``; mu (P,) is not zero, b (nb,) of unit length.
     """
     size = float(mu @ mu)
     outer = np.outer(gradient.T.ravel(), np.outer(b, mu)) / size
@@ -72,7 +69,7 @@ def cholesky(matrix: Array) -> Any | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Lagrangian:
+class Quadratic:
     """The objective around a feasible point, with the terms of constraints linear in z already added.
 
     Attributes:
@@ -89,30 +86,21 @@ class Lagrangian:
     value: float
     linear_terms: float = 0.0
 
-    def with_linear(self, rows: Array, slack: Array, multipliers: Array) -> "Lagrangian":
-        """Add ``multipliers @ (rows z - right)``; slack is right - rows z at the point."""
-        slope = self.slope + multipliers @ rows / 2
-        return Lagrangian(self.gram, self.z, slope, self.value, self.linear_terms - float(multipliers @ slack))
-
-    def bound(self, minors: Array, cuts: Array | None = None) -> float:
+    def bound(self, minors: Array, cuts: Array) -> float:
         """Closed-form minimum over all z of objective + linear terms + z^T (minors - cuts) z; -inf unless H + M > 0.
 
-        Written around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far
-        below the roundoff of the objective itself is resolved.
-
-        Args:
-            minors: (k, k) combination of minors, zero at every rank-one point.
-            cuts: (k, k) form that is nonnegative at every feasible point.
+        The minors (k, k) are zero at every rank-one point, the cuts (k, k) nonnegative at every feasible one. Written
+        around the point, D = L(z) - q^T S^-1 q with q half the gradient of L: nothing cancels, so a gap far below the
+        roundoff of the objective itself is resolved.
         """
-        extra = minors if cuts is None else minors - cuts
         if not len(self.z):
             return self.value
+        extra = minors - cuts
         factor = cholesky(self.gram + extra)
         if factor is None:
             return -np.inf
         half, _ = _trtrs(factor, self.slope + extra @ self.z, trans=1)
-        at_point = self.linear_terms - (0.0 if cuts is None else float(self.z @ cuts @ self.z))
-        return self.value + at_point - float(half @ half)
+        return self.value + self.linear_terms - float(self.z @ cuts @ self.z) - float(half @ half)
 
 
 def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
@@ -124,13 +112,10 @@ def rotation(linear: int, mus: Sequence[Array], bs: Sequence[Array]) -> Any:
 
 def ascend(matrix: Array, blocks: Sequence[Block], masks: Sequence[np.ndarray],
            steps: int) -> tuple[Array | None, int]:
-    """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken.
+    """Return free minors N with ``matrix + N > 0`` (or None) and the steps taken, an eigenvalue decomposition each.
 
-    Args:
-        matrix: (k, k) H + M_tangent (- cuts) in rotated coordinates.
-        blocks: position and shape of every block.
-        masks: entries, as (P nb, P nb), of the minors that are free.
-        steps: eigenvalue decompositions at most.
+    The matrix (k, k) is H + M_tangent (- cuts) in rotated coordinates; masks, as (P nb, P nb), tell which entries of
+    the minors of a block are free.
     """
     current, memory = matrix, np.zeros_like(matrix)
     aim = 0.1 * float(np.trace(matrix)) / len(matrix)  # inside the cone: its boundary is reached only in the limit

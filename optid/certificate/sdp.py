@@ -7,13 +7,12 @@ is the Lagrangian dual written around a point z; its own dual is the moment rela
 where a better point may be. CVXPY poses it and Clarabel solves it; both are imported on first use.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from optid.certificate.minors import Block, Lagrangian
+from optid.certificate.minors import Block, Quadratic
 from optid.certificate.shape_duals import Linear
 from optid.structures.rank_one import Array
 
@@ -56,15 +55,9 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
     return csc_array((values, (rows, columns)), shape=(size**2, len(first) * nb**2))
 
 
-def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Array],
+def relax(objective: Quadratic, blocks: Sequence[Block], cones: Mapping[int, Array],
           linear: Linear) -> tuple[Array, dict[int, Array], Array, Array] | None:
-    """Solve the relaxation around a point; None where the solver returns no multipliers.
-
-    Args:
-        objective: without linear terms, in whitened coordinates.
-        blocks: position and shape of every block.
-        cones: constraint matrices by block.
-        linear: constraints on the lifted vector.
+    """Solve the relaxation around a point, in whitened coordinates; None where the solver returns no multipliers.
 
     Returns:
         What the solver found, before any check: the combination (k, k) of minors; by block the weights (r, r, nb, nb),
@@ -73,6 +66,8 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     """
     import cvxpy as cp
     from scipy.sparse import csc_array, hstack
+
+    from optid.program.expressions import solve_quietly
 
     z = objective.z
     k = len(z)
@@ -89,7 +84,8 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
             stacked = cp.hstack([cp.vec(w, order="C") for w in pairs[i]])
             extra = extra - form @ stacked
             cut_value = cut_value + (form.T @ np.kron(z, z)) @ stacked
-    slope = objective.slope / unit + _times(z / unit, k) @ extra
+    square = cp.reshape(extra, (k, k), order="C")
+    slope = objective.slope / unit + square @ (z / unit)
     multipliers = None
     if len(linear.right):
         multipliers = cp.Variable(len(linear.right))
@@ -100,12 +96,10 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
     level = cp.Variable()
     column = cp.reshape(slope, (k, 1), order="C")
     corner = cp.reshape(-level - cut_value / unit**2, (1, 1), order="C")
-    lifted = cp.bmat([[corner, column.T], [column, objective.gram + cp.reshape(extra, (k, k), order="C")]]) >> 0
+    lifted = cp.bmat([[corner, column.T], [column, objective.gram + square]]) >> 0
     problem = cp.Problem(cp.Maximize(level), [lifted, *constraints])
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "may be inaccurate": whatever comes back is checked and repaired
-            problem.solve(solver=cp.CLARABEL)
+        solve_quietly(problem)  # whatever comes back is checked and repaired
     except cp.SolverError:
         return None
     if weights.value is None or lifted.dual_value is None:
@@ -118,13 +112,6 @@ def relax(objective: Lagrangian, blocks: Sequence[Block], cones: Mapping[int, Ar
         prices = np.asarray(multipliers.value, float)
         prices = np.where(linear.equality, prices, np.maximum(prices, 0.0))
     return minors, cuts, prices, _moments(np.asarray(lifted.dual_value), z, unit)
-
-
-def _times(z: Array, k: int) -> Any:
-    """Sparse (k, k^2) operator: row-stacked matrix -> matrix @ z."""
-    from scipy.sparse import csc_array, eye_array, kron
-
-    return csc_array(kron(eye_array(k), csc_array(z[None, :])))
 
 
 def _pair_weights(values: list[Array], rows: int, nb: int) -> Array:

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
 from optid.errors import StructureError
 from optid.structures.multipliers import fit_multipliers
-from optid.structures.rank_one import Array, RankOne
+from optid.structures.rank_one import Array, Point, RankOne
 
 ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of the size of its terms
 
@@ -37,7 +36,6 @@ class Linear:
     def slack(self, z: Array) -> tuple[Array, Array]:
         """(slack, size of the terms), each (r,)."""
         return self.right - self.rows @ z, np.abs(self.rows) @ np.abs(z) + np.abs(self.right)
-
 
     @classmethod
     def none(cls, n: int) -> "Linear":
@@ -65,22 +63,13 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
                     ) -> tuple[dict[int, Array], Array]:
     """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 
-    Args:
-        slope: (k,) half the gradient of the objective, in the coordinates of all the rest.
-        shapes: (P_i, nb_i).
-        offset: leading unknowns outside the blocks.
-        mus: (P_i,) each.
-        bs: (nb_i,) each, of unit length.
-        cones: constraint matrices by block.
-        linear: constraints on the lifted vector (k,).
-        z: the lifted point (k,).
+    All is meant in the coordinates of the core: half the gradient of the objective (k,), blocks (P_i, nb_i) behind
+    ``offset`` other unknowns, mu (P_i,) and b (nb_i,) of unit length, and the lifted point z (k,).
     """
     if not cones and not len(linear.right):
         return {}, np.zeros(0)
     units = [mu / (np.linalg.norm(mu) or 1.0) for mu in mus]
-    jacobian = np.asarray(block_diag(np.eye(offset), *(
-        np.hstack([np.kron(b[:, None], np.eye(len(mu))), np.kron(np.eye(len(b)), mu[:, None])])
-        for mu, b in zip(units, bs))))
+    jacobian = Point(np.zeros(offset), tuple(units), tuple(bs)).tangent()
     firsts = np.cumsum([offset, *(p + nb for p, nb in shapes)])  # of every mu in the tangent coordinates
     active, parts = {}, []
     for i, cone in cones.items():
@@ -105,13 +94,8 @@ def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int
 def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:
     """Weights (r, r) of products of rows whose form Q = C^T weights C has ``Q mu = C^T nu / 2``.
 
-    Any second factor rho = C^T kappa with kappa >= 0 and rho^T mu = 1 will do; the one nearest to mu / ||mu||^2
-    disturbs the rest least.
-
-    Args:
-        nu: (r,) multipliers >= 0, zero where C mu > 0.
-        cone: (r, P).
-        mu: (P,).
+    The multipliers nu (r,) are >= 0, and zero where C mu > 0. Any second factor rho = C^T kappa with kappa >= 0 and
+    rho^T mu = 1 will do; the one nearest to mu / ||mu||^2 disturbs the rest least.
     """
     kappa = nnls(cone.T, mu)[0]
     reach = float(kappa @ (cone @ mu))
@@ -124,12 +108,8 @@ def sign_free_cut(nu: Array, cone: Array, mu: Array) -> Array:
 def align_cuts(weights: Array, cone: Array, mu: Array, b: Array, nu: Array) -> Array:
     """Make the cut weights of a relaxation exact at a point: no value there, and the gradient of the multipliers nu.
 
-    Args:
-        weights: (r, r, nb, nb), positive semidefinite for every pair of rows.
-        cone: (r, P).
-        mu: (P,).
-        b: (nb,) of unit length.
-        nu: (r,) KKT multipliers.
+    The weights (r, r, nb, nb) are positive semidefinite for every pair of rows; cone (r, P), mu (P,), b (nb,) of unit
+    length, nu (r,).
     """
     values = cone @ mu
     active = np.abs(values) <= ACTIVE * (np.abs(cone) @ np.abs(mu))

@@ -60,13 +60,7 @@ def accepted_cases(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
 
 
 def run_case(back_end: BackEnd, case: Case, **settings) -> Row:
-    """Solve one case and compare the outcome with what is known.
-
-    Args:
-        back_end: the solver.
-        case: an entry of the zoo.
-        settings: as in `optid.solve`.
-    """
+    """Solve a case of the zoo, with settings of `optid.solve`, and compare the outcome with what is known."""
     clock = time.perf_counter()
     program = case.build()
     solution = solve(program, back_end, **settings)
@@ -75,14 +69,7 @@ def run_case(back_end: BackEnd, case: Case, **settings) -> Row:
 
 
 def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list[Row]:
-    """Run a back end over every case of its classes.
-
-    Args:
-        back_end: the solver.
-        zoo: cases to use instead of the shipped ones.
-
-    Returns:
-        One row per case.
+    """Run a back end over every case of its classes, of the shipped zoo or another; return one row per case.
 
     Raises:
         ConformanceError: lists all complaints.
@@ -97,10 +84,7 @@ def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
 def check_formulation(formulation: str | Callable[..., Any], data: Data, **arguments: Any) -> None:
     """Pose a formulation on a record, on damaged copies of it, and on what it must refuse.
 
-    Args:
-        formulation: registered name, or the function itself.
-        data: a record that the model should describe, with at least 100 samples.
-        arguments: of the formulation.
+    The record is one that the model should describe, with at least 100 samples; the arguments are the formulation's.
 
     Raises:
         ConformanceError: lists all complaints.

@@ -56,14 +56,7 @@ def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: S
          **parts: Any) -> Program:
     """Make a programme of plain parts: named constraints (or lists of them), variables under their own names.
 
-    Args:
-        name: name of the programme.
-        objective: what is minimised.
-        constraints: {name: constraint or list of constraints}.
-        variables: the variables, each with its own name.
-        start: {variable: value}.
-        expressions: further named expressions that constraints may speak about.
-        parts: further attributes of `Program`.
+    Constraints may speak about further named expressions; the other parts are attributes of `Program`.
     """
     groups = {key: tuple(group) if isinstance(group, list | tuple) else (group,) for key, group in constraints.items()}
     named = {variable.name(): variable for variable in variables}
@@ -73,14 +66,9 @@ def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: S
 
 def _case(name: str, shapes: Mapping[str, Any], statement: Callable[..., tuple], start: Mapping[str, Any] | None = None,
           **known: Any) -> Case:
-    """State a case.
+    """State a case: variables by name and shape (or arguments of `cp.Variable`), and what is known, as in `Case`.
 
-    Args:
-        name: its name.
-        shapes: {variable: shape, or the arguments of `cp.Variable`}.
-        statement: variables -> (objective, constraints), and further arguments of `pose` where there are any.
-        start: as in `pose`.
-        known: what is known about it, as in `Case`.
+    The statement makes objective and constraints of the variables, and further arguments of `pose` where there are any.
     """
     def build() -> Program:
         variables = [cp.Variable(name=key, **(shape if isinstance(shape, dict) else {"shape": shape}))
@@ -217,7 +205,7 @@ def _rank_one() -> list[Case]:
     structure = RankOneStructure(RankOne(root, target, remainder, ((4, 2),), 1, scale), ("a",), (("mu", "b"),))
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
-    def bilinear(name: str, sign: float, convex: bool) -> Case:
+    def bilinear(name: str, sign: float, convex: bool, value: float) -> Case:
         def statement(a: Any, mu: Any, b: Any, r: Any) -> tuple:
             theta = cp.outer(mu, b)
             residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
@@ -228,10 +216,11 @@ def _rank_one() -> list[Case]:
                 "expressions": {"Theta": theta}, "scale": scale}
 
         start = {"a": np.zeros(1), **{key: sign * value for key, value in rising.items()}}
-        return _case(name, {"a": 1, "mu": 4, "b": 2, "r": len(root)}, statement, start,
-                     value=_search(matrix, y, convex=convex))
+        return _case(name, {"a": 1, "mu": 4, "b": 2, "r": len(root)}, statement, start, value=value)
 
-    return [bilinear("rank_one_fit", 1.0, False), bilinear("rank_one_convex", -1.0, True)]
+    # digits by least squares for every direction of b, a single angle
+    return [bilinear("rank_one_fit", 1.0, False, 0.34051374007229496),
+            bilinear("rank_one_convex", -1.0, True, 8.641311715505692)]
 
 
 def _nuclear() -> Case:
@@ -279,24 +268,3 @@ def _group_sparse() -> Case:
 
     return _case("group_shrinkage", {**shapes, "residual": 12}, statement, value=value,
                  point=dict(zip(shapes, shrunk)), duals={"residual": -rest})
-
-
-def _search(matrix: np.ndarray, y: np.ndarray, *, convex: bool) -> float:
-    """Minimise over the direction of b, a single angle; for each angle the rest is (constrained) least squares."""
-    from scipy.optimize import minimize_scalar, nnls
-
-    levels = (matrix.shape[1] - 1) // 2
-    # mu = free line + kinks with coefficients >= 0 is exactly "convex"; without the constraint kinks of either sign
-    ramps = np.maximum(np.subtract.outer(np.arange(levels), np.arange(levels)), 0.0)
-    line, kinks = np.column_stack([np.ones(levels), ramps[:, 0]]), ramps[:, 1:-1]
-    shapes = np.column_stack([line, -line, kinks] if convex else [line, -line, kinks, -kinks])
-
-    def value(angle: float) -> float:
-        b = np.array([np.cos(angle), np.sin(angle)])
-        wide = matrix[:, 1:].reshape(-1, levels, 2, order="F") @ b
-        return nnls(np.column_stack([matrix[:, 0], -matrix[:, 0], wide @ shapes]), y)[1] ** 2
-
-    grid = np.linspace(0.0, 2 * np.pi, 721)
-    best = float(min(grid, key=value))
-    found: Any = minimize_scalar(value, bounds=(best - 0.01, best + 0.01), method="bounded", options={"xatol": 1e-10})
-    return float(found.fun)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 Map = Callable[[np.ndarray], np.ndarray]
-"""From the derivatives of an argument to their part of those of an atom."""
+"""From the Jacobian of an argument to its part of that of an atom."""
 
 DENSE = 100_000
 """Entries of the Jacobian up to which an expression is small."""
@@ -40,7 +40,7 @@ def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
     variables = expression.variables()
     if expression.size * sum(variable.size for variable in variables) <= DENSE:
         node = _differentiate(expression, {})
-        return None if node is None else {v: _columns(slope) for v, slope in node.slopes.items()}
+        return None if node is None else dict(node.slopes)
     found = {}
     for variable, part in expression.grad.items():
         if part is None:
@@ -53,7 +53,7 @@ def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
 
 @dataclass(frozen=True)
 class _Node:
-    """Value of an expression and its derivatives (*shape, size of the variable) by every entry of the variables."""
+    """Value of an expression and its Jacobians (size, size of the variable), entries column by column."""
 
     value: Any
     slopes: dict[cp.Variable, np.ndarray]
@@ -72,42 +72,25 @@ def _derive(expression: Any, known: dict[int, _Node | None]) -> _Node | None:
         if value is None:
             return None
         value = value.toarray() if sp.issparse(value) else np.asarray(value, dtype=float)
-        return _Node(value, {} if expression.is_constant() else {
-            expression: _shaped(np.eye(expression.size), expression.shape)})
+        return _Node(value, {} if expression.is_constant() else {expression: np.eye(expression.size)})
     nodes = [_differentiate(arg, known) for arg in expression.args]
     if any(node is None for node in nodes):
         return None
-    values, shape = [node.value for node in nodes], expression.shape  # type: ignore[union-attr]
+    values = [node.value for node in nodes]  # type: ignore[union-attr]
     name = type(expression).__name__
     if name in RULES and all(value.ndim <= 2 for value in values):
         maps: Any = RULES[name](expression, values)
     else:
-        flat = _moved(expression) if name in MOVES else map(_of_atom, expression._grad(values), values)
-        maps = [None if one is None else partial(_through, one, shape) for one in flat]
+        maps = _moved(expression) if name in MOVES else map(_of_atom, expression._grad(values), values)
     slopes: dict[cp.Variable, np.ndarray] = {}
     for node, apply in zip(nodes, maps):
         for variable, slope in node.slopes.items():  # type: ignore[union-attr]
             if apply is None:
                 return None
             part = apply(slope)
-            part = part if part.shape[:-1] == shape else np.broadcast_to(part, (*shape, variable.size))
             slopes[variable] = slopes[variable] + part if variable in slopes else part
     value = expression.numeric(values)
     return _Node(value.toarray() if sp.issparse(value) else np.asarray(value, dtype=float), slopes)
-
-
-def _columns(slope: np.ndarray) -> np.ndarray:
-    """Return derivatives (*shape, n) as a Jacobian (size, n), entries column by column."""
-    return slope if slope.ndim == 2 else slope.reshape((-1, slope.shape[-1]), order="F")
-
-
-def _shaped(jacobian: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return jacobian if len(shape) == 1 else jacobian.reshape((*shape, jacobian.shape[-1]), order="F")
-
-
-def _through(apply: Map, shape: tuple[int, ...], slope: np.ndarray) -> np.ndarray:
-    """Apply what maps Jacobians."""
-    return _shaped(apply(_columns(slope)), shape)
 
 
 def sources(expression: Any) -> np.ndarray:
@@ -142,34 +125,40 @@ def _of_atom(part: Any, value: np.ndarray) -> Map | None:
     return partial(np.matmul, np.reshape(matrix, (value.size, -1)).T)
 
 
+def _scaled(factors: np.ndarray) -> Map:
+    """Multiply every row by a number."""
+    return partial(np.multiply, np.ravel(factors, order="F")[:, None])
+
+
 def _product(expression: Any, values: list[Any]) -> list[Map]:
-    left, right = values
-    return [lambda slope: np.moveaxis(np.tensordot(slope, right, (-2, 0)), left.ndim - 1, -1),
-            lambda slope: np.tensordot(left, slope, (-1, 0))]
+    left, right = values[0], values[1] if values[1].ndim == 2 else values[1][:, None]
+    left = left if left.ndim == 2 else left[None]
+    (rows, inner), columns = left.shape, right.shape[1]
+    return [lambda slope: np.tensordot(right.T, slope.reshape(inner, rows, -1), 1).reshape(rows * columns, -1),
+            lambda slope: np.matmul(left, slope.reshape(columns, inner, -1)).reshape(rows * columns, -1)]
 
 
 def _sum(expression: Any, values: list[Any]) -> list[Map]:
-    dimensions, axis = values[0].ndim, expression.axis
-    axes = range(dimensions) if axis is None else [axis] if isinstance(axis, int) else axis
-    summed = tuple(one % dimensions for one in axes)
-    return [lambda slope: slope.sum(axis=summed).reshape((*expression.shape, -1))]
+    shape, axis = values[0].shape, expression.axis
+    axes = range(len(shape)) if axis is None else [axis] if isinstance(axis, int) else axis
+    summed = tuple(len(shape) - 1 - one % len(shape) for one in axes)  # rows run through the entries in reverse order
+    return [lambda slope: slope.reshape(*shape[::-1], slope.shape[1]).sum(axis=summed).reshape(-1, slope.shape[1])]
 
 
 def _squares(expression: Any, values: list[Any]) -> list[Map]:
     above, below = values
     (total,) = _sum(expression, [above])
-    return [lambda slope: total(2 / below * above[..., None] * slope),
-            lambda slope: -total((above / below)[..., None] ** 2) * slope]
+    return [lambda slope: total(_scaled(2 / below * above)(slope)),
+            lambda slope: -total(np.ravel((above / below) ** 2, order="F")[:, None] * slope)]
 
 
 RULES: dict[str, Callable[[Any, list[Any]], list[Map]]] = {
     "AddExpression": lambda _, values: [lambda slope: slope] * len(values),
     "NegExpression": lambda _, values: [np.negative],
-    "multiply": lambda _, values: [partial(np.multiply, value[..., None]) for value in reversed(values)],
-    "DivExpression": lambda _, values: [partial(np.multiply, 1 / values[1][..., None]),
-                                        partial(np.multiply, -(values[0] / values[1] ** 2)[..., None])],
+    "multiply": lambda _, values: [_scaled(value) for value in reversed(values)],
+    "DivExpression": lambda _, values: [_scaled(1 / values[1]), _scaled(-values[0] / values[1] ** 2)],
     "MulExpression": _product, "Sum": _sum, "quad_over_lin": _squares}
-"""By atom, from its arguments' values, what maps the derivatives (*shape, n) of every argument, up to broadcasting."""
+"""By atom, from its arguments' values, what maps the Jacobian of every argument; arguments have the atom's shape."""
 
 
 def side_by_side(slopes: Mapping[cp.Variable, Any], variables: Iterable[cp.Variable], rows: int) -> np.ndarray:
@@ -193,11 +182,9 @@ def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, Any], np.
 
 
 def row_sizes(expression: cp.Expression, usual: Mapping[int, float]) -> np.ndarray:
-    """Return how much every entry of an expression changes when its variables have their usual size; never zero.
+    """Return the change of every entry of an affine or smooth expression by variables of usual size; never zero.
 
-    Args:
-        expression: affine or smooth.
-        usual: {id of a variable: usual size of its entries}; one where it is not named.
+    The usual size of the entries is given by the id of a variable; it is one where it is not.
     """
     rng = np.random.default_rng(0)
     with _values_kept(expression.variables()) as variables:

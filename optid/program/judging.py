@@ -10,23 +10,21 @@ from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
 from optid.program.gradients import flat_value, jacobians
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
 
+KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
+         "sum_largest", "lambda_sum_largest", "pos", "neg"}
+"""Atoms whose gradient says nothing where they have a kink."""
+
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
-    """Measure a point: objective, violation, stationarity and complementarity.
+    """Measure a point: recomputed objective, violation, stationarity and complementarity.
 
-    Args:
-        program: the programme.
-        values: {variable: array}; derived variables are recomputed from the others first.
-        duals: {constraint: flat multipliers}; names may be missing.
-
-    Returns:
-        The recomputed objective and the residuals. Stationarity is ``nan`` where multipliers are missing or the
-        objective has a kink at the point.
+    Derived variables are recomputed from the others first. The duals are flat multipliers by constraint, of which some
+    may be missing; see `Residuals` for where the measurements are ``nan``.
     """
     program.assign(values)
     violation, worst = measure_violation(program)
@@ -34,8 +32,15 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
     if known is not None:
         objective, stationarity = known
         return objective, Residuals(violation, worst, stationarity, 0.0)
-    objective = float(np.asarray(program.objective.expr.value))
-    stationarity, complementarity = _first_order(program, duals, objective)
+    objective, stationarity, complementarity = float(np.asarray(program.objective.expr.value)), np.nan, np.nan
+    try:
+        lagrangian = Lagrangian.of(program, duals, program.constraints)
+        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
+            stationarity = lagrangian.residual(max(abs(objective), program.scale))
+            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
+            complementarity = lagrangian.complementarity / size
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        pass
     return objective, Residuals(violation, worst, stationarity, complementarity)
 
 
@@ -75,11 +80,8 @@ def measure_violation(program: Program) -> tuple[float, str]:
 def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> float:
     """Size of the terms that a constraint adds up at the assigned point: what a slack or a violation is relative to.
 
-    Every variable counts with its largest entry, so that the measure does not depend on units.
-
-    Args:
-        member: the constraint.
-        usual: sizes below which a variable does not count: at a point where it vanishes only roundoff is left of it.
+    Every variable counts with its largest entry, so that the measure does not depend on units, but not below its usual
+    size: at a point where it vanishes only roundoff is left of it.
     """
     expressions = [member.expr] if isinstance(member, EQUALITIES | INEQUALITIES) else member.args
     sizes = [_terms(expression, usual or {}) for expression in expressions]
@@ -111,13 +113,8 @@ def bounds_of(variable: cp.Variable) -> tuple[np.ndarray, np.ndarray] | None:
 def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expression, np.ndarray]] | None:
     """Return (expression, weights) pairs whose inner products are the constraint's part of the Lagrangian.
 
-    Args:
-        member: a CVXPY constraint.
-        dual: its multipliers, flat, in the order of its dual variables.
-
-    Returns:
-        The pairs, with the multipliers projected on the dual cone so that one of the wrong sign leaves a residual,
-        or None for a cone whose multipliers are not used here.
+    The flat multipliers are projected on the dual cone, so that one of the wrong sign leaves a residual. None for a
+    cone whose multipliers are not used here.
     """
     if isinstance(member, EQUALITIES):
         return [(member.expr, dual)]
@@ -162,13 +159,11 @@ class Lagrangian:
         """Add up the named constraints, multipliers projected on the dual cones; None where one has none, or no use."""
         found = cls(program)
         for name in names:
-            position = 0
             if name not in duals:
                 return None
-            for member in program.constraints[name]:
-                length = sum(d.size for d in member.dual_variables)
-                terms = multiplier_terms(member, duals[name][position : position + length])
-                position += length
+            group = program.constraints[name]
+            for member, span in zip(group, spans(group)):
+                terms = multiplier_terms(member, duals[name][span])
                 if terms is None or not all(found.add(expression, weights) for expression, weights in terms):
                     return None
                 products = [flat_value(expression) * weights for expression, weights in terms]
@@ -181,7 +176,7 @@ class Lagrangian:
 
     def add(self, expression: cp.Expression, weights: np.ndarray) -> bool:
         """Add d<weights, expression>/dx; False where the expression has a kink or no gradient."""
-        if not _smooth(expression):
+        if not expression.is_affine() and {atom.__name__ for atom in expression.atoms()} & KINKS:
             return False
         slopes = jacobians(expression)
         for variable, slope in (slopes or {}).items():
@@ -200,35 +195,19 @@ class Lagrangian:
             worst = max(worst, relative_gradient(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
         return worst
 
+    def gradient(self, variable: cp.Variable) -> np.ndarray:
+        """Return the gradient in the shape of a variable, symmetric where the variable is."""
+        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
+        return (gradient + gradient.T) / 2 if variable.attributes["symmetric"] else gradient
+
     def free_part(self, variable: cp.Variable) -> np.ndarray | None:
         """Magnitudes of the gradient that the variable's own attributes leave free; None where that is not known."""
         flags = variable.attributes
         if any(flags[key] not in (None, False) for key in ("PSD", "NSD", "diag", "sparsity", "boolean", "integer")):
             return None
-        gradient = np.reshape(self.total[variable.id], variable.shape, order="F")
-        if flags["symmetric"]:
-            gradient = (gradient + gradient.T) / 2
+        gradient = self.gradient(variable)
         if (bounds := bounds_of(variable)) is not None:
             value, margin = np.asarray(variable.value), 1e-6 * _size(variable, self.usual)
             held = ((value <= bounds[0] + margin) & (gradient > 0)) | ((value >= bounds[1] - margin) & (gradient < 0))
             gradient = np.where(held, 0.0, gradient)
         return np.abs(np.ravel(gradient, order="F"))
-
-
-def _first_order(program: Program, duals: Values, objective: float) -> tuple[float, float]:
-    try:
-        lagrangian = Lagrangian.of(program, duals, program.constraints)
-        if lagrangian is not None and lagrangian.add(program.objective.expr, np.ones(1)):
-            size = max(abs(objective), 1e-2 * program.scale)  # a hundredth of the zero model's where it vanishes
-            return (lagrangian.residual(max(abs(objective), program.scale)), float(lagrangian.complementarity / size))
-    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-        pass
-    return float("nan"), float("nan")
-
-
-_KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
-          "sum_largest", "lambda_sum_largest", "pos", "neg"}
-
-
-def _smooth(expression: cp.Expression) -> bool:
-    return expression.is_affine() or not {atom.__name__ for atom in expression.atoms()} & _KINKS

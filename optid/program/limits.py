@@ -55,7 +55,11 @@ class Limit:
         if not isinstance(self.member, EQUALITIES | INEQUALITIES):
             return self.member, self
         sizes = row_sizes(self.member.expr, usual)
-        scaled = times(1 / sizes, self.member.expr)
+        expression = self.member.expr
+        if sizes.size > 1:
+            scaled = cp.multiply(np.reshape(1 / sizes, expression.shape, order="F"), expression)
+        else:
+            scaled = expression if sizes.item() == 1.0 else 1 / sizes.item() * expression
         posed = scaled == 0 if isinstance(self.member, EQUALITIES) else scaled <= 0
         return posed, replace(self, sizes=sizes)
 
@@ -70,26 +74,21 @@ class Limit:
         return np.broadcast_to(shift, (self.member.size,))
 
 
-def times(factors: np.ndarray, expression: cp.Expression) -> cp.Expression:
-    """Multiply an expression, column by column, by flat factors."""
-    if factors.size == 1:
-        return expression if factors.item() == 1.0 else factors.item() * expression
-    return cp.multiply(np.reshape(factors, expression.shape, order="F"), expression)
+def spans(group: Sequence[Constraint]) -> list[slice]:
+    """Return the places of every member in the flat multipliers of its group."""
+    edges = np.cumsum([0, *(sum(dual.size for dual in member.dual_variables) for member in group)])
+    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
 
 
 def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
     """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
-    Args:
-        limits: of the members of the constraint.
-        steps: what a small step of each is: bounds are compared by what such a step gains.
-        multipliers: of their rows as they are posed, flat over the members, per unit of the objective.
+    Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are posed,
+    flat over the members, per unit of the objective.
     """
-    position, totals = 0, {}
-    for number, limit in enumerate(limits):
-        length = sum(dual.size for dual in limit.member.dual_variables)
-        part = multipliers[position : position + length]
-        position += length
+    totals = {}
+    for number, (limit, span) in enumerate(zip(limits, spans([limit.member for limit in limits]))):
+        part = multipliers[span]
         if not isinstance(limit.member, EQUALITIES | INEQUALITIES):
             known = isinstance(limit.shift, np.ndarray)
             totals[number] = float(part @ limit.shift if known else np.max(np.abs(part), initial=0.0)), number

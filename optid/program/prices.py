@@ -72,8 +72,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     found, usual = [], program.usual_sizes()
     for name, group in program.user_constraints.items():
         limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
-        active = rows = 0
-        slack = np.inf
+        active, rows, slack = 0, 0, np.inf
         for limit in limits:
             gaps = _slacks(limit.member)
             rows += gaps.size
@@ -88,13 +87,9 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
 
 
 def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:
-    """Return the prices of the constraints that stood in earlier steps of a procedure only.
+    """Return the prices of the constraints that are not in the last programme, from the step in which each stood.
 
     Their multipliers are in units of the objective of their own step, so they have no price in points of fit.
-
-    Args:
-        steps: programme and solution of every constraint, by its name.
-        last: the last programme, whose constraints are left out.
     """
     found = []
     for name, (program, solution) in steps.items():

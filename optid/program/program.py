@@ -18,11 +18,9 @@ from optid.program.view import Values, View
 
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
-    """Bring what a constraint builder returned into the form {name: (limit, ...)}.
+    """Bring what a builder returned, CVXPY constraints or `Limit` objects, into the form {name: (limit, ...)}.
 
-    Args:
-        built: a CVXPY constraint or a `Limit`, a list of them, or a dictionary of either.
-        default: name used where the builder gave none.
+    It returns one of them, a list, or a dictionary of either; the default is the name where it gave none.
 
     Raises:
         StructureError: when something in it is not a CVXPY constraint.
@@ -181,10 +179,7 @@ class Program:
         """Return the programme with some variables held at values, as parameters that may be changed later.
 
         Freezing ``b`` (or ``mu``) of a bilinear programme leaves a convex one. Structural constraints in which
-        nothing is left to choose are dropped.
-
-        Args:
-            values: variable name (brackets allowed through ``**{"mu[u1]": value}``) -> array of its shape.
+        nothing is left to choose are dropped. Names with brackets are passed as ``**{"mu[u1]": value}``.
 
         Raises:
             StructureError: unknown name or wrong shape.
@@ -205,15 +200,12 @@ class Program:
             if name in self.structural and not any(c.variables() for c in kept):
                 continue
             constraints[name] = kept
-        view = View({name: inner.tree_copy(swap) for name, inner in self.view.inner.items()}, iterate=self.view.iterate,
-                    channels=self.view.channels, bases=self.view.bases, gauge=self.view.gauge,
-                    reference=self.view.reference, outputs=self.view.outputs, units=self.view.units)
+        view = replace(self.view, inner={name: inner.tree_copy(swap) for name, inner in self.view.inner.items()})
         limits = {name: tuple(limit.substituted(swap) for limit in group) for name, group in self.limits.items()}
         left = {name: v for name, v in self.variables.items() if name not in values}
-        held = {name: parameters[name] for name in values}
 
         def recover(found: Values) -> Any:
-            return self.recover({**found, **{name: np.asarray(p.value) for name, p in held.items()}})
+            return self.recover({**found, **{name: np.asarray(parameters[name].value) for name in values}})
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, limits=limits,
@@ -222,11 +214,9 @@ class Program:
                        start={name: v for name, v in self.start.items() if name in left})
 
     def soften(self, name: str, weight: float) -> "Program":
-        """Return the programme with one constraint turned into a quadratic penalty on its violation.
+        """Return the programme with a user's equality or inequality turned into a quadratic penalty on its violation.
 
-        Args:
-            name: a user's constraint (equality or inequality).
-            weight: penalty per squared unit of violation.
+        The weight is the penalty per squared unit of violation.
 
         Raises:
             StructureError: unknown name, or a constraint that is neither an equality nor an inequality.

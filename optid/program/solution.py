@@ -172,11 +172,8 @@ def tolerance(accuracy: float) -> float:
 
 
 def relative_gap(objective: float, bound: float, scale: float) -> float:
-    """Return ``(F - D) / max(F, 1e-9 scale)``, never below zero.
+    """Return ``(F - D) / max(F, 1e-9 scale)``, never below zero, for the value F reached and the certified bound D.
 
-    Args:
-        objective: F, the value reached.
-        bound: D, the certified lower bound.
-        scale: ``YᵀY``; its floor keeps noise-free problems meaningful.
+    The floor, with the scale ``YᵀY``, keeps noise-free problems meaningful.
     """
     return max(0.0, objective - bound) / max(objective, 1e-9 * scale, np.finfo(float).tiny)

@@ -43,12 +43,7 @@ def relative_gradient(gradient: Array, terms: Array, yardstick: float, size: flo
 
 
 def variable_size(value: Array, usual: float | None) -> float:
-    """Return the largest entry of a value or of its start; one where there is no start and nothing but rounding.
-
-    Args:
-        value: of a variable.
-        usual: largest entry at the start, None where that vanishes.
-    """
+    """Return the largest entry of a value or of its start; one where there is no start and nothing but rounding."""
     size = float(np.max(np.abs(value), initial=0.0))
     if usual is not None:
         return max(size, usual)

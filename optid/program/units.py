@@ -25,12 +25,9 @@ HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", 
 def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> Transform:
     """Return the units in which outputs, and inputs that act linearly, have mean zero and variance one.
 
-    Of a stream the first chunk with samples decides; any fixed choice near the record serves.
-
-    Args:
-        data: the record, a `Data` or a `Stream`.
-        linear: whether each input acts linearly; the others keep their units, which their bases take care of.
-        centred: subtract the means; False for a model without a constant.
+    Inputs that do not act linearly keep their units, which their bases take care of. The means of a model without a
+    constant stay (not ``centred``). Of a stream the first chunk with samples decides; any fixed choice near the record
+    serves.
     """
     experiments = getattr(data, "experiments", None)
     arrays = [(e.u, e.y) for e in experiments] if experiments else [data.first_chunk()]
@@ -89,13 +86,9 @@ def energy_unit(units: Transform) -> float:
 
 
 def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> dict[str, Any]:
-    """Return the named expressions of a programme in the units of the record.
+    """Return the named expressions of a programme in the units of the record, to which ``units`` leads.
 
-    Args:
-        expressions: by name, in the units of the programme.
-        units: from those of the programme to those of the record.
-        inputs: names of the inputs.
-        states: whether the constant is that of the output equation of a state-space model.
+    The constant of a state-space model (``states``) is that of its output equation.
     """
     r, found = units.y_scale[0], {}
     for name, expression in expressions.items():
@@ -103,7 +96,8 @@ def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[s
         alone = word == "b" and "mu" + name[1:] not in expressions  # of an input that acts linearly
         factor = r if word in HEIGHTS or alone else 1.0
         if factor != 1.0 and word in ("mu", "Theta", "b", "static"):
-            factor /= units.u_scale[_position(channel.rstrip("]"), inputs)]
+            channel = channel.rstrip("]")
+            factor /= units.u_scale[inputs.index(channel) if channel in inputs else 0]
         found[name] = expression if factor == 1.0 else factor * expression
         if word in SIGNALS:
             level = np.array(units.y_offset)
@@ -111,10 +105,6 @@ def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[s
     if "offset" in found:
         found["offset"] = found["offset"] + _level(found, units, inputs, states)
     return found
-
-
-def _position(channel: str, inputs: Sequence[str]) -> int:
-    return list(inputs).index(channel) if channel in inputs else 0
 
 
 def _level(found: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> Any:

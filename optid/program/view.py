@@ -1,6 +1,7 @@
 """What a constraint may speak about: the named expressions of a programme, in the units of the record."""
 
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,7 @@ Values = Mapping[str, np.ndarray]
 """Values of variables by name."""
 
 
+@dataclass(eq=False, repr=False)
 class View(Mapping[str, cp.Expression]):
     """The named expressions that a constraint may speak about, and the structure it may need.
 
@@ -23,31 +25,29 @@ class View(Mapping[str, cp.Expression]):
     ``Theta`` = functions x [B; D] with A and C held.
 
     Attributes:
+        inner: the expressions in the units of the programme.
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
         bases: the fitted basis of every channel.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
         reference: values of the unconstrained least-squares estimate, for constraints that need a centre; matrices
             ``A`` and ``C`` of a state-space model, held where they are no variables.
-        iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
-        inner: the expressions in the units of the programme.
+        iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
     """
 
-    def __init__(self, expressions: Mapping[str, cp.Expression], *, channels: tuple[str, ...] = (),
-                 bases: Mapping[str, Any] | None = None, gauge: str = "", reference: Values | None = None,
-                 outputs: tuple[str, ...] = (), units: Transform | None = None, iterate: bool = False) -> None:
-        self.inner = dict(expressions)
-        self.units = units
-        self.reference = dict(reference or {})
-        self._auxiliaries: dict[int, cp.Variable] = {}
-        self.outputs = tuple(outputs)
-        self.iterate = iterate
-        self.channels = channels
-        self.bases = dict(bases or {})
-        self.gauge = gauge
+    inner: Mapping[str, cp.Expression]
+    _: KW_ONLY
+    channels: tuple[str, ...] = ()
+    bases: Mapping[str, Any] = field(default_factory=dict)
+    gauge: str = ""
+    reference: Values = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+    units: Transform | None = None
+    iterate: bool = False
+    _auxiliaries: set[int] = field(default_factory=set, init=False)
 
     @cached_property
     def _expressions(self) -> Mapping[str, cp.Expression]:
@@ -75,15 +75,10 @@ class View(Mapping[str, cp.Expression]):
     def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> cp.Variable:
         """Return a new variable that a constraint needs for itself, such as the matrix of a Lyapunov inequality.
 
-        It becomes a variable of every programme in which the constraint stands.
-
-        Args:
-            name: its name.
-            shape: its shape.
-            attributes: CVXPY attributes, such as ``symmetric=True``.
+        It becomes a variable of every programme in which the constraint stands; the attributes are CVXPY's.
         """
         variable = cp.Variable(shape, name=name, **attributes)
-        self._auxiliaries[variable.id] = variable
+        self._auxiliaries.add(variable.id)
         return variable
 
     def owns(self, variable: cp.Variable) -> bool:
@@ -98,8 +93,6 @@ class View(Mapping[str, cp.Expression]):
             raise StructureError(f"{name!r} needs a channel: there are several inputs ({', '.join(self.channels)})")
         return f"{name}[{channel}]"
 
-    # -- what constraints are stated in -----------------------------------------------------------------------------
-
     @property
     def poles(self) -> tuple[cp.Expression, cp.Expression] | cp.Expression | None:
         """What determines the poles: (P, Q = A P), or the coefficients a of a polynomial; None without poles."""
@@ -113,11 +106,7 @@ class View(Mapping[str, cp.Expression]):
         return "C" in self.reference and "C" not in self
 
     def basis(self, channel: str | None) -> Any:
-        """Return the basis of an input, of the only one where none is named.
-
-        Raises:
-            StructureError: several inputs and none named, or no such input.
-        """
+        """Return the basis of an input, of the only one where none is named; raises as `channel`."""
         return self.bases[self.channel(channel)]
 
     def channel(self, channel: str | None) -> str:
@@ -205,11 +194,7 @@ class View(Mapping[str, cp.Expression]):
     def weights(self, channel: str | None, row: np.ndarray, output: str | None, direct: float = 1.0) -> np.ndarray:
         """Return w of one output with ``Theta w = (row B + direct D_output) of every function``, with A and C held.
 
-        Args:
-            channel: name of the input; its Theta is (functions, n) where it has no direct feedthrough.
-            row: (n,) weights of the states.
-            output: name of the output.
-            direct: weight of its feedthrough.
+        The row (n,) weighs the states. The Theta of an input without direct feedthrough is (functions, n).
         """
         a, c = self.reference["A"], self.reference["C"]
         found = np.concatenate([row, np.zeros(len(c))])

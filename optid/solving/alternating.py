@@ -29,10 +29,6 @@ def run(program: Program, settings: Settings) -> Answer:
     Options: ``inner`` (word of the convex back end of the half-steps, default "clarabel"), ``steps`` (largest number of
     pairs of half-steps, default 1000).
 
-    Args:
-        program: a programme that carries a `RankOneStructure`; its constraints must be convex in each half.
-        settings: what is asked.
-
     Returns:
         The last point, with the multipliers of the last two half-steps.
 
@@ -61,7 +57,11 @@ def run(program: Program, settings: Settings) -> Answer:
         in_b = _step(without_mu, point, inner, accuracy)
         if not in_b.has_point:
             return _stopped(in_b, last, count)
-        last = _answer(program, form.gauge, point, in_mu, in_b, count)
+        duals = {**in_b.duals, **in_mu.duals}
+        if form.gauge == "norm" and GAUGE in in_b.duals:
+            duals[GAUGE] = in_b.duals[GAUGE] / 2.0  # the gradient of bᵀb is twice that of the tangent
+        values = {name: np.array(point[name]) for name in program.variables if name in point}
+        last = Answer(Status.LIMIT, "iteration limit", values, duals, count)
         # the decrease has to be far below the accuracy asked for, because convergence is only linear
         if before - in_mu.objective <= 1e-4 * settings.accuracy * max(in_mu.objective, 1e-9 * in_mu.scale):
             return replace(last, status=Status.LOCAL, word="stationary")
@@ -104,15 +104,6 @@ def _step(half: Program, point: Mapping[str, np.ndarray], inner: str, accuracy: 
         if _direction(name) in half.parameters:
             half.parameters[_direction(name)].value = np.ravel(value, order="F")
     return solve(half, inner, accuracy=accuracy, prove=False)
-
-
-def _answer(program: Program, gauge: str, point: Mapping[str, np.ndarray], in_mu: Solution, in_b: Solution, count: int
-            ) -> Answer:
-    duals = {**in_b.duals, **in_mu.duals}
-    if gauge == "norm" and GAUGE in in_b.duals:
-        duals[GAUGE] = in_b.duals[GAUGE] / 2.0  # the gradient of bᵀb is twice that of the tangent
-    values = {name: np.array(point[name]) for name in program.variables if name in point}
-    return Answer(Status.LIMIT, "iteration limit", values, duals, count)
 
 
 def _stopped(half: Solution, last: Answer | None, count: int) -> Answer:

@@ -15,12 +15,7 @@ GRACE = 0.5  # seconds a solver has to notice its own time limit before it is ki
 
 
 def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
-    """Run ``back_end`` in a forked child; kill it shortly after the time limit.
-
-    Args:
-        back_end: what to run.
-        program: the programme; the child works on its own copy.
-        settings: what is asked; ``time_limit`` None means no limit.
+    """Run a back end on a copy of the programme in a forked child, which is killed shortly after the time limit.
 
     Returns:
         The child's answer; ``Status.LIMIT`` when it was killed, ``Status.FAILED`` when it died.

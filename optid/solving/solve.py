@@ -63,7 +63,6 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     if refusal:
         raise SolverRefused(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
-
     separate = (time_limit is not None) if isolate is None else isolate
 
     def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
@@ -242,15 +241,12 @@ def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Setti
     answer = _attempt(replace(program, start=start), back_end, settings, separate)
     if answer.values and program.certify is not None:
         again = _judged(program, answer, point)
+        assert again.residuals is not None and point.residuals is not None
         lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-        if lower and _violation(again) <= max(_violation(point), 1e-9):
+        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
             point, bound = again, program.certify(program, again.values, again.duals)[0]
     program.assign(point.values)
     return point, bound
-
-
-def _violation(point: Solution) -> float:
-    return float("inf") if point.residuals is None else point.residuals.violation
 
 
 @dataclass(frozen=True)
@@ -315,14 +311,9 @@ class Outcome:
 
 
 def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
-    """Solve a programme, or drive a procedure that yields programmes, with one solver.
+    """Solve a programme, or drive a procedure that yields programmes and returns the model, with settings of `solve`.
 
     The time that a procedure itself takes, between its programmes, counts as building.
-
-    Args:
-        problem: a `Program`, or a generator that yields programmes, receives their solutions and returns the model.
-        solver: as in `solve`.
-        settings: as in `solve`.
     """
     constrained: dict[str, tuple[Program, Solution]] = {}
     steps: list[tuple[str, Solution]] = []

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
-from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
+from optid.structures.rank_one import Array, Core, Point, RankOne, matrices
 from optid.structures.whitening import block_slices
 
 _posv, _trtrs = get_lapack_funcs(("posv", "trtrs"), dtype=float)
+
+TOLERANCE = 1e-12  # on the tangent gradient relative to ||R^T s||
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +37,7 @@ class LocalSolution:
 
 
 def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array], list[Array]]]:
-    """Starting factors in whitened coordinates: the whitened SVD, the plain SVD split, further pairs, random ones.
-
-    Args:
-        core: the reduced problem.
-        count: how many.
-        seed: of the random directions b.
-    """
+    """Starting factors in whitened coordinates: the whitened SVD, the plain SVD split, further pairs, random ones."""
     if not core.shapes:  # linear least squares: nothing to start
         return [([], [])]
     estimates = matrices(core.least_squares, core.shapes)
@@ -67,21 +63,13 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     return found
 
 
-def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e-12, iterations: int = 1000,
-            alternations: int = 0) -> LocalSolution:
+def descend(core: Core, bs: list[Array], iterations: int = 1000, alternations: int = 0) -> LocalSolution:
     """Newton's method in the b alone, every mu the best for them; the objective never increases beyond roundoff.
 
     The mu are eliminated at every step (variable projection, Golub and Pereyra 1973), so that a valley along which
     large mu of correlated inputs cancel, however narrow, is no obstacle. A step d b_i is measured in units of
-    ||mu_i||; directions of negative curvature are followed downwards.
-
-    Args:
-        core: the reduced problem; without blocks the answer is exact least squares.
-        mus: whitened starting mu_i; they count where alternations come first.
-        bs: whitened starting b_i.
-        tolerance: on the tangent gradient relative to ||R^T s||.
-        iterations: at most.
-        alternations: alternating half-steps for mu and b before Newton starts, for starts far away.
+    ||mu_i||; directions of negative curvature are followed downwards. For whitened starts b_i far away, alternating
+    half-steps for mu and b come first. Without blocks the answer is exact least squares.
     """
     if not core.shapes:
         point = core.point([], [])
@@ -91,18 +79,15 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
               for where, (p, nb) in zip(block_slices(core.shapes), core.shapes)]  # both half-Jacobians are products
     reference = max(float(np.linalg.norm(root.T @ target)), np.finfo(float).tiny)
     noise = 1e-30 * float(target @ target)
-    if alternations:
-        state = [_unit(mu, b) for mu, b in zip(mus, bs)]
-        for _ in range(alternations):
-            state = _half_steps(pieces, target, state)
-        bs = [b for _, _, b in state]
+    for _ in range(alternations):
+        bs = _half_steps(pieces, target, bs)
     here = _Projected.at(pieces, target, bs)
     damping, taken, gradient, settled, promise = 0.0, 0, np.inf, False, np.inf
     while True:
         slope, hessian = here.curvature(root, core.shapes)
         before, gradient = gradient, float(np.linalg.norm(slope)) / reference
         settled = promise <= 1e-14 * here.value + noise and gradient > 0.5 * before  # what is left is rounding
-        if gradient <= tolerance or taken >= iterations or settled:
+        if gradient <= TOLERANCE or taken >= iterations or settled:
             break
         sizes, directions = np.linalg.eigh(hessian)
         sizes = np.maximum(np.abs(sizes), 1e-14 * np.max(np.abs(sizes)))
@@ -121,7 +106,7 @@ def descend(core: Core, mus: list[Array], bs: list[Array], tolerance: float = 1e
         damping = damping / 8 if damping > 1e-3 and fall > 0.25 * promise else damping if damping > 1e-3 else 0.0
         taken += 1
     point = core.point(here.mus, here.bs)
-    return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= tolerance or settled)
+    return LocalSolution(point, core.problem.value(point.lift()), taken, gradient, gradient <= TOLERANCE or settled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +131,7 @@ class _Projected:
 
     @classmethod
     def at(cls, pieces: list[Array], target: Array, bs: list[Array]) -> "_Projected":
-        units = [_unit(np.ones(1), b)[2] for b in bs]
+        units = [_unit(b) for b in bs]
         design = np.concatenate([np.tensordot(b, piece, 1) for piece, b in zip(pieces, units)], axis=1)
         basis, triangle = np.linalg.qr(design)
         diagonal = np.abs(np.diag(triangle))
@@ -196,22 +181,18 @@ class _Projected:
         return across.T @ self.residual, hessian
 
 
-def _unit(mu: Array, b: Array) -> tuple[float, Array, Array]:
-    """(||mu|| ||b||, unit mu, unit b); a zero factor keeps an arbitrary direction."""
-    size_mu, size_b = float(np.linalg.norm(mu)), float(np.linalg.norm(b))
-    unit_mu = mu / size_mu if size_mu else np.full(len(mu), len(mu) ** -0.5)
-    unit_b = b / size_b if size_b else np.full(len(b), len(b) ** -0.5)
-    return size_mu * size_b, unit_mu, unit_b
+def _unit(factor: Array) -> Array:
+    """Return the direction of a factor; a zero factor has an arbitrary one."""
+    size = float(np.linalg.norm(factor))
+    return factor / size if size else np.full(len(factor), len(factor) ** -0.5)
 
 
-def _half_steps(pieces: list[Array], target: Array, state: list) -> list:
-    """Least squares for all mu_i with the b_i fixed, then for all b_i with the mu_i fixed."""
-    design = np.concatenate([np.tensordot(b, piece, 1) for piece, (_, _, b) in zip(pieces, state)], axis=1)
+def _half_steps(pieces: list[Array], target: Array, bs: list[Array]) -> list[Array]:
+    """Least squares for all mu_i with the b_i fixed, then for all b_i with the mu_i fixed; directions alone count."""
+    design = np.concatenate([np.tensordot(_unit(b), piece, 1) for piece, b in zip(pieces, bs)], axis=1)
     mus = np.split(_normal_equations(design, target), np.cumsum([piece.shape[2] for piece in pieces])[:-1])
-    state = [_unit(mu, b) for mu, (_, _, b) in zip(mus, state)]
-    design = np.concatenate([(piece @ mu).T for piece, (_, mu, _) in zip(pieces, state)], axis=1)
-    bs = np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
-    return [_unit(mu, b) for b, (_, mu, _) in zip(bs, state)]
+    design = np.concatenate([(piece @ _unit(mu)).T for piece, mu in zip(pieces, mus)], axis=1)
+    return np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
 
 
 def _normal_equations(design: Array, target: Array) -> Array:
@@ -221,33 +202,20 @@ def _normal_equations(design: Array, target: Array) -> Array:
     return _posv(gram, design.T @ target)[1]
 
 
-def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0,
-             tolerance: float = 1e-12, iterations: int = 1000) -> LocalSolution:
+def minimise(problem: RankOne, start: Point | None = None, *, count: int = 8, seed: int = 0) -> LocalSolution:
     """Best local minimiser over several starts, or the one reached from a given start.
-
-    Args:
-        problem: the least-squares problem.
-        start: descend from here only.
-        count: number of starts when none is given.
-        seed: of the random starts.
-        tolerance: relative gradient at which a descent stops.
-        iterations: at most, each start.
 
     Raises:
         RankError: the compressed regressor is singular.
     """
-    core = reduce(problem)
+    core = problem.core
     if start is not None:
-        _, mus, bs = core.factors(start)
-        return descend(core, mus, bs, tolerance, iterations)
-    return best_of(core, count, seed, tolerance, iterations)
+        return descend(core, core.factors(start)[2])
+    return best_of(core, count, seed)
 
 
-def best_of(core: Core, count: int = 8, seed: int = 0, tolerance: float = 1e-12, iterations: int = 1000,
-            first: int = 0) -> LocalSolution:
+def best_of(core: Core, count: int = 8, seed: int = 0, iterations: int = 1000, first: int = 0) -> LocalSolution:
     """Best local minimiser of a reduced problem over the starts ``first .. count - 1``."""
-    if not core.shapes:
-        return descend(core, [], [])
-    found = [descend(core, mus, bs, tolerance, iterations, alternations=0 if k < 2 else 2)
-             for k, (mus, bs) in enumerate(starts(core, count, seed)) if k >= first]
+    found = [descend(core, bs, iterations, alternations=0 if k < 2 else 2)
+             for k, (_, bs) in enumerate(starts(core, count, seed)) if k >= first]
     return min(found, key=lambda solution: solution.value)

@@ -82,28 +82,18 @@ class GroupProblem:
         """Return the smallest penalty at which everything is zero."""
         return float(np.max(self.norms(self.design.T @ self.target) / self.weights))
 
-    def feasible(self, v: Array, penalty: float) -> Array:
-        """Return the best multiple of v (m,) that is feasible for the dual."""
-        most = float(np.max(self.norms(self.design.T @ v) / (penalty * self.weights), initial=0.0))
-        square = float(v @ v)
-        if square == 0.0:
-            return v
-        best = float(self.target @ v) / square
-        return v * (best if most == 0 else float(np.clip(best, -1 / most, 1 / most)))
-
     def dual(self, v: Array, penalty: float) -> tuple[float, Array]:
-        """Return the value of the dual and the feasible point near v, which is usually the residual of a primal one."""
-        point = self.feasible(v, penalty)
+        """Return the value of the dual and the best feasible multiple of v (m,), usually the residual of a point."""
+        most = float(np.max(self.norms(self.design.T @ v) / (penalty * self.weights), initial=0.0))
+        best = float(self.target @ v) / max(float(v @ v), np.finfo(float).tiny)
+        point = v * (best if most == 0 else float(np.clip(best, -1 / most, 1 / most)))
         rest = self.target - point
         return 0.5 * float(self.target @ self.target) - 0.5 * float(rest @ rest), point
 
     def certainly_zero(self, point: Array, gap: float, penalty: float) -> np.ndarray:
-        """Return which groups (G,) are zero in every minimiser.
+        """Return which groups (G,) are zero in every minimiser, from a feasible point (m,) of the dual.
 
-        Args:
-            point: (m,) a feasible point of the dual.
-            gap: a value of the primal less that of the dual at the point.
-            penalty: lambda.
+        The gap is a value of the primal less that of the dual at the point.
         """
         # the lengths and the gap are sums of about m rounded terms
         rounding = 1e-14 * float(self.target @ self.target)

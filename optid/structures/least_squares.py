@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,6 +22,7 @@ class LeastSquaresStructure(Structure):
         problem: the numbers, see `optid.program.compressed.Compressed`.
         linear: names of the linear variables in the order of z (each flattened column by column).
         blocks: (mu name, b name) of every rank-one block; none without products.
+        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
     """
 
     word: ClassVar[str] = "least-squares"
@@ -28,55 +30,47 @@ class LeastSquaresStructure(Structure):
     problem: Any
     linear: tuple[str, ...]
     blocks: tuple[tuple[str, str], ...] = ()
+    gauge: str = "norm"
 
     def flat(self, values: Mapping[str, Any]) -> Array:
         """Return the linear variables among named values as they follow one another in z."""
         return np.concatenate([*(np.ravel(values[name], order="F") for name in self.linear), np.zeros(0)])
 
+    def point(self, values: Mapping[str, Any]) -> Point:
+        """Read a point from named values."""
+        return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
+                     tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
+
     def measure(self, program: Any) -> tuple[float, float]:
         """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
-        problem = self.problem
-        flat = {name: np.ravel(v.value, order="F") for name, v in program.variables.items()}
-        pairs = [(flat[mu], flat[b]) for mu, b in self.blocks]
-        products = (np.outer(b, mu).ravel() for mu, b in pairs)
-        z = np.concatenate([*(flat[name] for name in self.linear), *products, np.zeros(0)])
-        r = problem.root @ z - problem.target
+        problem, usual = self.problem, program.usual_sizes()
+        point = self.point({name: variable.value for name, variable in program.variables.items()})
+        r = problem.root @ point.lift() - problem.target
         value = float(r @ r) + problem.remainder
         pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
-        sizes = [*(flat[name].size for name in self.linear), *(mu.size * b.size for mu, b in pairs)]
-        pulls, efforts = (np.split(part, np.cumsum(sizes)[:-1]) for part in (pull, effort))
-        parts, count = list(zip(self.linear, pulls, efforts)), len(self.linear)
-        for (mu_name, b_name), (mu, b), *both in zip(self.blocks, pairs, pulls[count:], efforts[count:]):
-            block, terms = (part.reshape(b.size, mu.size) for part in both)
-            parts += [(mu_name, block.T @ b, terms.T @ np.abs(b)), (b_name, block @ mu, terms @ np.abs(mu))]
-        yardstick, worst, usual = max(value, program.scale), 0.0, program.usual_sizes()
-        for name, gradient, terms in parts:
-            size = variable_size(flat[name], usual.get(program.variables[name].id))
+        if self.blocks:
+            slope = point.tangent()
+            pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
+        variables = [program.variables[name] for name in (*self.linear, *chain.from_iterable(self.blocks))]
+        edges = np.cumsum([variable.size for variable in variables])[:-1]
+        yardstick, worst = max(value, program.scale), 0.0
+        for variable, gradient, terms in zip(variables, np.split(pull, edges), np.split(effort, edges)):
+            size = variable_size(variable.value, usual.get(variable.id))
             worst = max(worst, relative_gradient(np.abs(gradient), terms, yardstick, size))
         return value, worst
 
 
 @dataclass(frozen=True, eq=False)
 class RankOneStructure(LeastSquaresStructure):
-    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate.
-
-    Attributes:
-        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
-    """
+    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
 
     word: ClassVar[str] = "rank-one"
     problem: RankOne
-    gauge: str = "norm"
 
     @property
     def about(self) -> str:
         """What the programme is and how large."""
         return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
-
-    def point(self, values: Mapping[str, Any]) -> Point:
-        """Read a point from named values."""
-        return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
-                     tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
 
     def named(self, point: Point, variables: Mapping[str, Any]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""

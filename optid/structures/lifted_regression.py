@@ -31,15 +31,10 @@ def positions(layout: Layout) -> NDArray[np.intp]:
 
 def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: float = 0.0, curvature: float = 0.0,
                    scales: Sequence[float] = (), weights: Array | float = 1.0) -> RankOne:
-    """Order the triangular system of the statistics by z and add the quadratic penalties on Theta.
+    """Order the triangular system of the statistics by z, by the `positions` of its columns, and penalise Theta.
 
-    Args:
-        statistics: of the record.
-        columns: the `positions` of its layout.
-        ridge: weight of ``‖Theta‖²``.
-        curvature: weight of the integral of ``f''²``.
-        scales: unit of every input: Theta in the units of the record is Theta / scale.
-        weights: (l,) of the residuals of every output.
+    The penalties are ridge times ``‖Theta‖²``, and curvature times the integral of ``f''²``; Theta in the units of the
+    record is Theta / scale, with one scale an input. The weights (l,) are those of the residuals of every output.
     """
     layout, (n, ny), root = statistics.layout, columns.shape, statistics.root.copy()
     root[:, n:] *= weights
@@ -70,10 +65,7 @@ def _square_root(matrix: Array) -> Array:
 def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) -> list[tuple[Array, Array]]:
     """Return the (mu, vec b) nearest to every Theta_c (P_c, nb_c l) (Luo, Algorithm 3.1; Bai, Automatica 34, 1998).
 
-    Args:
-        core: of the problem.
-        thetas: one matrix per block.
-        whitened: nearest in the Kronecker metric of the Gram matrix, not in the Frobenius norm.
+    Nearest is meant in the Kronecker metric of the core's Gram matrix, or in the Frobenius norm.
     """
     pairs = []
     for c, theta in enumerate(thetas):

@@ -7,12 +7,9 @@ from optid.arrays import Array
 
 
 def fit_multipliers(rows: Array, target: Array, equality: np.ndarray) -> tuple[Array, float]:
-    """Return the w that minimises ``‖rowsᵀ w - target‖``, and the norm that is left.
+    """Return the w (r,) that minimises ``‖rowsᵀ w - target‖``, rows (r, n), and the norm that is left.
 
-    Args:
-        rows: (r, n).
-        target: (n,).
-        equality: (r,) which w may have either sign; the others are >= 0.
+    It may have either sign where ``equality``, and is >= 0 elsewhere.
 
     Raises:
         RuntimeError: the iterations did not suffice.
@@ -29,12 +26,8 @@ def fit_multipliers(rows: Array, target: Array, equality: np.ndarray) -> tuple[A
 def least_distance(rows: Array, need: Array, equality: np.ndarray) -> Array | None:
     """Return the w with which ``x = -rowsᵀ w`` is the shortest x with ``rows x + need <= 0``, None without such an x.
 
+    Rows (r, n) are of about one length, needs (r,) of about the size one; where ``equality``, ``rows x + need = 0``.
     Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
-
-    Args:
-        rows: (r, n), of about one length.
-        need: (r,), of about the size one.
-        equality: (r,) rows that hold as ``rows x + need = 0``.
 
     Raises:
         RuntimeError: the iterations did not suffice.

@@ -7,11 +7,12 @@ decomposed once for all weights and step sizes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from scipy.linalg import pinvh
 
 from optid.arrays import Array
 from optid.program.structure import Structure
@@ -69,9 +70,7 @@ class Predictor:
     @cached_property
     def inverse(self) -> Array:
         """Pseudo-inverse of the Gram matrix of the coefficients of one output."""
-        values, vectors = np.linalg.eigh(self.gram)
-        kept = values > RANK * max(float(values[-1]), np.finfo(float).tiny)
-        return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+        return np.asarray(pinvh(self.gram, rtol=RANK))
 
     @cached_property
     def gram(self) -> Array:
@@ -193,34 +192,24 @@ class NuclearProblem:
 
         (T, T) where outputs do not mix, else (T l, T l).
         """
-        samples, j = len(self.y), len(self.starts)
-        if self.left is not None:
-            outer = np.eye(j) if self.right is None else self.right @ self.right.T
-            inner = (self.left.T @ self.left).reshape(self.rows, self.l, self.rows, self.l)
-            whole = np.zeros((self.l, self.l, samples, samples))
-            for i in range(self.rows):
-                for ii in range(self.rows):
-                    where = np.ix_(self.starts + i, self.starts + ii)
-                    if self.starts[-1] - self.starts[0] == j - 1:  # without gaps: slices instead of copies
-                        first = self.starts[0]
-                        where = slice(first + i, first + i + j), slice(first + ii, first + ii + j)
-                    for o in range(self.l):
-                        for oo in range(self.l):
-                            whole[o, oo][where] += inner[i, o, ii, oo] * outer
-            whole = whole.transpose(2, 0, 3, 1)
-            return whole.reshape(samples * self.l, samples * self.l), False
-        single = np.zeros((samples, samples))
-        if self.right is None:
-            counts = np.bincount((self.starts[None] + np.arange(self.rows)[:, None]).ravel(), minlength=samples)
-            single[np.diag_indices(samples)] = counts
-        else:
-            outer = self.right @ self.right.T
-            for i in range(self.rows):
-                single[np.ix_(self.starts + i, self.starts + i)] += outer
+        samples, j, first = len(self.y), len(self.starts), self.starts[0]
+        outputs = 1 if self.left is None else self.l
+        inner = np.eye(self.rows) if self.left is None else self.left.T @ self.left
+        inner = inner.reshape(self.rows, outputs, self.rows, outputs)
+        outer = 1.0 if self.right is None else self.right @ self.right.T
+        whole = np.zeros((outputs, outputs, samples, samples))
+        for i, o, ii, oo in zip(*np.nonzero(inner)):
+            where: Any = np.ix_(self.starts + i, self.starts + ii)
+            if self.right is None:
+                where = self.starts + i, self.starts + ii
+            elif self.starts[-1] - first == j - 1:  # without gaps: slices instead of copies
+                where = slice(first + i, first + i + j), slice(first + ii, first + ii + j)
+            whole[o, oo][where] += inner[i, o, ii, oo] * outer
+        whole = whole.transpose(2, 0, 3, 1).reshape(samples * outputs, samples * outputs)
         if self.predictor is not None:
             coupling = self.predictor.coupling(self.starts, samples)
-            single -= coupling @ self.predictor.inverse @ coupling.T
-        return single, True
+            whole -= coupling @ self.predictor.inverse @ coupling.T
+        return whole, self.left is None
 
     @cached_property
     def groups(self) -> tuple["Group", ...]:
@@ -230,9 +219,10 @@ class NuclearProblem:
             return (Group.of(np.arange(self.y.size), gram, self.known.ravel()),)
         found: list[Group] = []
         for o in range(self.l):
-            same = [g for g in range(o) if np.array_equal(self.known[:, g], self.known[:, o])]
-            where = np.arange(len(self.y)) * self.l + o
-            found.append(found[same[0]].moved(where) if same else Group.of(where, gram, self.known[:, o]))
+            known, where = self.known[:, o], np.arange(len(self.y)) * self.l + o
+            same = [found[g] for g in range(o) if np.array_equal(self.known[:, g], known)]
+            found.append(replace(same[0], measured=where[known], free=where[~known]) if same
+                         else Group.of(where, gram, known))
         return tuple(found)
 
     def update(self, target: Array, weight: float, step: float) -> tuple[Array, Array]:
@@ -242,23 +232,18 @@ class NuclearProblem:
         for group in self.groups:
             group.solve(v, self.data.ravel(), pull, weight, step)
         v = v.reshape(self.y.shape)
-        theta = self.explained(self.hankel(v) - target) if self.predictor is not None else np.zeros((0, self.l))
-        return v, theta
+        return v, self.explained(self.hankel(v) - target)
 
     def value(self, v: Array, theta: Array, weight: float) -> float:
         """Return the objective."""
         misfit = np.where(self.known, v - self.data, 0.0)
-        return nuclear_norm(self.matrix(v, theta)) + weight * float(np.sum(misfit**2))
+        return float(np.linalg.norm(self.matrix(v, theta), "nuc")) + weight * float(np.sum(misfit**2))
 
     def dual(self, multipliers: Array, weight: float) -> tuple[float, Array]:
         """Return a lower bound on the objective in closed form, and the dual point it is taken at.
 
-        The multipliers are projected on what the free variables demand, then scaled into the unit ball of the spectral
-        norm: what comes out is feasible whatever came in.
-
-        Args:
-            multipliers: (r, q) anything; those of ``X = matrix(v, theta)`` give a tight bound.
-            weight: of the misfit.
+        The multipliers (r, q) are projected on what the free variables demand, then scaled into the unit ball of the
+        spectral norm: what comes out is feasible whatever came in. Those of ``X = matrix(v, theta)`` give a tight one.
         """
         point = self.projected(multipliers)
         for group in self.groups:
@@ -307,13 +292,6 @@ class Group:
         values, vectors = np.linalg.eigh((reduced + reduced.T) / 2)
         return cls(where[known], where[~known], np.maximum(values, 0.0), vectors, cross, inverse)
 
-    def moved(self, where: np.ndarray) -> "Group":
-        """Return the same decomposition for another output with the same samples missing."""
-        known = np.zeros(where.size, dtype=bool)
-        order = np.argsort(np.concatenate([self.measured, self.free]))
-        known[order < self.measured.size] = True
-        return Group(where[known], where[~known], self.values, self.vectors, self.cross, self.free_inverse)
-
     def solve(self, v: Array, y: Array, pull: Array, weight: float, step: float) -> None:
         """Write the minimiser for given pulls into v."""
         rest = pull[self.measured] - self.cross @ (self.free_inverse @ pull[self.free])
@@ -322,18 +300,10 @@ class Group:
         v[self.free] = self.free_inverse @ (pull[self.free] - self.cross.T @ v[self.measured])
 
 
-def nuclear_norm(matrix: Array) -> float:
-    """Sum of the singular values."""
-    return float(np.sum(np.linalg.svd(matrix, compute_uv=False)))
-
-
 def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the first samples of the windows whose samples are all usable, in the stacked record.
+    """Return the first samples of the windows of some rows whose samples are all usable, in the stacked record.
 
-    Args:
-        lengths: samples of every experiment.
-        rows: samples of a window.
-        usable: (N,) per experiment.
+    Lengths are those of the experiments; usable is (N,) for each.
     """
     if sum(lengths) < rows:
         return np.zeros(0, dtype=int)

@@ -63,7 +63,7 @@ class RankOne:
     @cached_property
     def core(self) -> "Core":
         """The reduction that keeps nothing in the core (`reduce`): start, solver and proof share it."""
-        return _reduced(self, (), False)
+        return reduce(self)
 
     def value(self, z: Array) -> float:
         """Objective at the lifted vector z (n,)."""
@@ -82,6 +82,20 @@ class Point:
     def lift(self) -> Array:
         """Return z = [w; kron(b_1, mu_1); ...]."""
         return np.concatenate([self.w, *(np.outer(b, mu).ravel() for mu, b in zip(self.mus, self.bs))])
+
+    def tangent(self) -> Array:
+        """Return the Jacobian of `lift` in [w; mu_1; b_1; mu_2; ...]."""
+        row = column = len(self.w)
+        found = np.zeros((row + sum(mu.size * b.size for mu, b in zip(self.mus, self.bs)),
+                          row + sum(mu.size + b.size for mu, b in zip(self.mus, self.bs))))
+        found[:row, :row] = np.eye(row)
+        for mu, b in zip(self.mus, self.bs):
+            p, q = mu.size, b.size
+            block = found[row : row + p * q, column : column + p + q].reshape(q, p, p + q)
+            block[:, :, :p] = b[:, None, None] * np.eye(p)
+            block[:, :, p:] = np.eye(q)[:, None, :] * mu[:, None]
+            row, column = row + p * q, column + p + q
+        return found
 
     def normalised(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""
@@ -150,8 +164,7 @@ class Core:
     @cached_property
     def least_squares(self) -> Array:
         """Unrestricted minimiser (k,) in the original coordinates of the core."""
-        part = self.triangle[self.eliminated:, self.eliminated:]
-        return _solve_upper(part, self.target)
+        return _solve_upper(self.triangle[self.eliminated:, self.eliminated:], self.target)
 
     def factors(self, point: Point) -> tuple[Array, list[Array], list[Array]]:
         """Whitened (w, mus, bs) of a point, balanced so that every b has unit length."""
@@ -193,17 +206,9 @@ def _solve_upper(triangle: Array, right: Array) -> Array:
 def reduce(problem: RankOne, keep: tuple[int, ...] = (), keep_linear: bool = False) -> Core:
     """Eliminate what is linear and whiten the rest.
 
-    The Schur complement of leading columns is the trailing triangle of the root itself, so nothing is squared.
-
-    Args:
-        problem: the problem.
-        keep: blocks that stay in the core although they have one row or one column.
-        keep_linear: keep w, because constraints act on it.
+    Blocks with one row or one column stay in the core where they are to be kept, and w where constraints act on it. The
+    Schur complement of leading columns is the trailing triangle of the root itself, so nothing is squared.
     """
-    return _reduced(problem, keep, keep_linear) if keep or keep_linear else problem.core
-
-
-def _reduced(problem: RankOne, keep: tuple[int, ...], keep_linear: bool) -> Core:
     slices = problem.slices
     kept = tuple(i for i, shape in enumerate(problem.blocks) if min(shape) > 1 or i in keep)
     chunks = [slices[i] for i in range(len(slices)) if i not in kept]

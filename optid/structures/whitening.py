@@ -16,22 +16,19 @@ from optid.arrays import Array
 _trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 
 
-def kronecker_factors(gram: Array, shape: tuple[int, int], passes: int = 5) -> tuple[Array, Array]:
+def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)``.
 
     Flip-flop iteration, the maximum-likelihood fit of a separable covariance (Dutilleul, J. Stat. Comput. Simul. 64,
     1999): each factor in turn is the average of the other one's whitened blocks.
 
-    Args:
-        gram: (P nb, P nb) positive semidefinite.
-        shape: (P, nb).
-        passes: alternations; five are enough for coordinates.
+    The Gram matrix is (P nb, P nb), the shape (P, nb).
     """
     p, nb = shape
     paired = gram.reshape(nb, p, nb, p).transpose(0, 2, 1, 3).reshape(nb * nb, p * p)
     inverse_b = np.eye(nb)
     factor_mu, factor_b = np.eye(p), np.eye(nb)
-    for _ in range(passes):
+    for _ in range(5):  # enough for coordinates
         factor_mu, inverse_mu = _factor((inverse_b.ravel() @ paired).reshape(p, p) / nb)
         factor_b, inverse_b = _factor((paired @ inverse_mu.ravel()).reshape(nb, nb) / p)
     return factor_mu, factor_b
@@ -57,10 +54,7 @@ def invert_triangular(factor: Array, lower: bool = True) -> Array:
 def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
     """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
 
-    Args:
-        theta: (P, nb).
-        factor_mu: (P, P) lower triangular.
-        factor_b: (nb, nb) lower triangular.
+    Theta is (P, nb); the factors (P, P) and (nb, nb) are lower triangular.
     """
     left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
     return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
@@ -104,10 +98,6 @@ class Whitening:
             new[:, where] = np.matmul(invert_triangular(factor_b), block.reshape(-1, nb, p)).reshape(-1, p * nb)
         return new
 
-    def cone(self, block: int, rows: Array) -> Array:
-        """Rows (r, P) that act on mu of a block, written for the new coordinates."""
-        return rows @ invert_triangular(self.factors_mu[block]).T
-
     def forward(self, mus: tuple[Array, ...], bs: tuple[Array, ...]) -> tuple[list[Array], list[Array]]:
         """Factors (mu_i, b_i) in the new coordinates."""
         return ([factor.T @ mu for factor, mu in zip(self.factors_mu, mus)],
@@ -120,12 +110,9 @@ class Whitening:
 
 
 def whiten(root: Array, shapes: tuple[tuple[int, int], ...], linear: int = 0) -> Whitening:
-    """Choose the coordinates from the root of the Gram matrix.
+    """Choose the coordinates of blocks (P_i, nb_i) from the root (n, n) of the Gram matrix.
 
-    Args:
-        root: (n, n) upper triangular; its first ``linear`` columns belong to unknowns outside the blocks.
-        shapes: (P_i, nb_i) of every block, in the order of the columns.
-        linear: number of leading columns outside the blocks.
+    Its first ``linear`` columns belong to unknowns outside the blocks.
     """
     parts = [root[:, where] for where in block_slices(shapes, linear)]
     pairs = [kronecker_factors(part.T @ part, shape) for part, shape in zip(parts, shapes)]
