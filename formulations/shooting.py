@@ -37,7 +37,6 @@ from optid.program.program import Program, Values
 from optid.program.solution import Bound
 from optid.program.units import outer_bases
 from optid.program.view import View
-from optid.statistics.sensitivities import simulate
 
 Array = np.ndarray
 
@@ -167,7 +166,7 @@ class _Shooting:
         for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
             sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
             start |= {self.key("mu", c): sign * mu, self.key("b", c): sign * b}
-        start |= {f"x{label}": x for label, x in zip(self.labels, simulate(self.data, unknowns, point))}
+        start |= {f"x{label}": x for label, x in zip(self.labels, criterion.simulate(point))}
         level = point.a
         start["kappa"] = np.zeros(self.layout.na)
         for m in range(self.layout.na, 0, -1):  # the recursion backwards

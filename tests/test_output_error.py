@@ -19,7 +19,6 @@ from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.models.layout import Layout
 from optid.program.solution import Status
-from optid.statistics.sensitivities import simulate
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 BASIS = Triangular(4).fitted(-0.7, 1.3)
@@ -116,7 +115,7 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     ours = descend(criterion, start)
 
     def residual(x):
-        return simulate(data, unknowns, unknowns.unpack(x))[0] - data.y[:, 0]
+        return criterion.simulate(unknowns.unpack(x))[0] - data.y[:, 0]
 
     theirs = least_squares(residual, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=400)
     assert ours.converged

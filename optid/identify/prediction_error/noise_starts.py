@@ -15,7 +15,6 @@ from optid.identify.prediction_error.search import search
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models import roots
 from optid.models.layout import Layout
-from optid.statistics.sensitivities import simulate
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 PASSES = 8
@@ -49,7 +48,7 @@ def _residual_models(criterion: TransferErrors, count: int, seed: int) -> dict[s
     found = {}
     for name, x in plants.items():
         point = plain.unknowns.unpack(x)
-        rest = [e.y[:, 0] - y for e, y in zip(data.experiments, simulate(data, plain.unknowns, point))]
+        rest = [e.y[:, 0] - y for e, y in zip(data.experiments, plain.simulate(point))]
         c, d = arma(rest, unknowns.nc, unknowns.nd or 0)
         found[name] = unknowns.pack(replace(point, c=c, d=d))
     return found

@@ -20,7 +20,6 @@ from optid.models.layout import Layout
 from optid.models.roots import contained, roots_of
 from optid.statistics.expansion import expand
 from optid.statistics.regression import collect
-from optid.statistics.sensitivities import instruments
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
 from optid.structures.lifted_regression import lifted_problem, positions
@@ -113,7 +112,7 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
     p, na = unknowns.shared, unknowns.layout.na
     at, best = unknowns.slices["a"], None
     for _ in range(PASSES if na else 0):
-        gram = instruments(criterion.data, unknowns, unknowns.unpack(x), functions=criterion.functions)
+        gram = criterion.instruments(unknowns.unpack(x))
         regressors = np.arange(p)
         regressors[at] = p + np.arange(na)
         tested = regressors if method == "Steiglitz-McBride" else np.arange(p)

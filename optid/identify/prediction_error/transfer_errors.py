@@ -20,26 +20,21 @@ from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.regression import ROWS_PER_COLUMN, collect
-from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict, simulate
-from optid.statistics.unknowns import TransferUnknowns
+from optid.statistics.sensitivities import CHUNK, TransferPredictor
 
 STABLE = 1 - 1e-9
 """Radius inside which every pole of an iterate, or zero of C, lies."""
 
 
 @dataclass(frozen=True, eq=False)
-class TransferErrors(Criterion):
+class TransferErrors(TransferPredictor, Criterion):
     """Simulation errors, or one-step prediction errors with a noise filter.
 
     Attributes:
-        data: the record.
-        unknowns: their order.
         gauge: how the scale between mu and b is fixed; "none" for a linear model.
         units: from those of the record above (`optid.program.units`) to those of the model.
     """
 
-    data: Data
-    unknowns: TransferUnknowns
     gauge: str
     units: Transform = field(default_factory=lambda: Transform.identity(1, 1))
 
@@ -62,11 +57,6 @@ class TransferErrors(Criterion):
         return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
 
     @cached_property
-    def functions(self) -> tuple[Array, ...] | None:
-        """Values of the basis functions, where they are few enough to be kept."""
-        return expanded(self.data, self.unknowns.layout)
-
-    @cached_property
     def energy(self) -> float:
         """Sum of squares of the output about its mean."""
         y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
@@ -74,8 +64,7 @@ class TransferErrors(Criterion):
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
-        return linearise(self.data, self.unknowns, self.unknowns.unpack(x), gauge=self.gauge_rows(x),
-                         functions=self.functions, method=method)
+        return self.compress(self.unknowns.unpack(x), self.gauge_rows(x), method)
 
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""
@@ -84,8 +73,7 @@ class TransferErrors(Criterion):
     def innovations(self, x: Array) -> list[Array]:
         """Return the innovations (N,) of every experiment, NaN where there is none."""
         point = self.unknowns.unpack(x)
-        simulated = simulate(self.data, self.unknowns, point)
-        found = [predict(self.data, self.unknowns, point, i, y) for i, y in enumerate(simulated)]
+        found = [self.predict(point, i, y) for i, y in enumerate(self.simulate(point))]
         return [np.where(one.state == noise_filter.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
