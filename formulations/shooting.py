@@ -25,12 +25,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.prediction_error import Bases, Orders, transfer_errors, transfer_model
+from formulations.prediction_error import Bases, Orders, transfer_model
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.gauges import scale_fixed
 from optid.identify.prediction_error.plant_starts import arx_start, iterated
-from optid.identify.prediction_error.transfer_errors import TransferErrors
+from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF
 from optid.models.gauges import leading_sign
 from optid.program.program import Program, Values

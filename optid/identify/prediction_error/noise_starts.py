@@ -113,7 +113,7 @@ def _long_innovations(criterion: TransferErrors) -> list[Array] | None:
     """Return the innovations of an ARX model with more lags; None where the record does not allow one."""
     unknowns, more = criterion.unknowns, MORE + criterion.unknowns.nc
     layout = replace(unknowns.layout, na=unknowns.layout.na + more, nb=tuple(nb + more for nb in unknowns.layout.nb))
-    long = TransferErrors(criterion.data, replace(unknowns, layout=layout, nc=0, nd=None), "none")
+    long = replace(criterion, unknowns=replace(unknowns, layout=layout, nc=0, nd=None), gauge="none")
     try:
         return long.innovations(long.unknowns.pack(equation_error(long))) if unknowns.nc else None
     except OptidError:
