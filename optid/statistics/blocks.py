@@ -196,32 +196,22 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     return Block(frame, tuple(groups), valid, weights, candidates)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Part of a record: [u, y] or [u, y, weights] with the samples before its rows, and where it begins."""
-
-    arrays: list[Array]
-    record: str
-    position: int
-
-
-def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[Stretch]:
-    """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time."""
-    size = _block_size(layout, chunk)
-    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
-    for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
-        yield Stretch(arrays, record, i * length)
-
-
-def blocks_of(part: Stretch, layout: Layout, chunk: int) -> Iterator[Block]:
-    """Evaluate the bases on a stretch, block by block.
+def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[list[Array]]:
+    """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time.
 
     Raises:
         DataError: a sample outside a basis with outside="error".
     """
     size = _block_size(layout, chunk)
-    for i, (u, y, *weights) in enumerate(stretches([part.arrays], layout.first_row, size)):
-        check_inside(u, layout, part.record, part.position + i * size)
+    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
+    for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
+        check_inside(arrays[0], layout, record, i * length)
+        yield arrays
+
+
+def blocks_of(stretch: Sequence[Array], layout: Layout, chunk: int) -> Iterator[Block]:
+    """Evaluate the bases on a stretch, block by block."""
+    for u, y, *weights in stretches([stretch], layout.first_row, _block_size(layout, chunk)):
         yield make_block(u, y, weights[0] if weights else None, layout)
 
 
