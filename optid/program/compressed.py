@@ -15,6 +15,7 @@ class Compressed(Protocol):
         problem: the numbers of ``‖root z - target‖² + remainder``: root (k, n), target (k,), remainder.
         statistics: the rows behind it: ``root``, the triangular factor of [regressor | outputs]; ``rows`` used and
             ``candidates`` in the record; ``condition`` of the factor and the ``method`` that made it.
+        columns: (n_columns, l) positions in z of the coefficients of the columns of the factor.
         energy: (l,) sum of squares of every output about its mean, in units of the objective.
     """
 
@@ -23,14 +24,12 @@ class Compressed(Protocol):
     @property
     def statistics(self) -> Any: ...  # noqa: D102
     @property
+    def columns(self) -> Any: ...  # noqa: D102
+    @property
     def energy(self) -> Array: ...  # noqa: D102
 
     def lifted(self, values: Mapping[str, np.ndarray]) -> Array:
         """Return z (n,) of named values."""
-        ...
-
-    def regression(self, values: Mapping[str, np.ndarray]) -> Array:
-        """Return the coefficients (n_columns, l) of the columns of the factor."""
         ...
 
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.identify.prediction_error.descent import Criterion
@@ -190,9 +191,10 @@ class CompressedErrors:
         """Return z."""
         return self.places.pack(values)
 
-    def regression(self, values: Mapping[str, Array]) -> Array:
-        """Return the coefficients (n, 1) of the columns."""
-        return self.lifted(values)[:, None]
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Positions (n, 1) in z of the coefficients of the columns."""
+        return np.arange(len(self.reference))[:, None]
 
     def one_step_fit(self, values: Mapping[str, Array]) -> Array:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
