@@ -31,7 +31,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.arrays import check_integer
-from optid.bases.basis import Basis
+from optid.bases import Bases
 from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.arguments import enough_rows
@@ -52,7 +52,6 @@ from optid.structures.least_squares import LeastSquaresStructure
 
 Array = np.ndarray
 Orders = int | Sequence[int]
-Bases = Basis | str | Sequence[Basis | str]
 
 
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,

@@ -26,7 +26,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.prediction_error import Bases, Orders, transfer_model
+from formulations.prediction_error import Orders, transfer_model
+from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.gauges import scale_fixed

@@ -106,7 +106,7 @@ def test_derivatives_where_outputs_never_follow_one_another(name, monkeypatch):
     predictor, point, rows = TransferPredictor(data, unknowns), unknowns.unpack(x), []
     for i, e in enumerate(data.experiments):
         found = predictor.predict(point, i, predictor.simulate(point)[i])
-        assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.skipped :]).sum() > 5
+        assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.layout.first_row :]).sum() > 5
         rows.append(np.vstack([b for b, _ in predictor.blocks(point, i)]))
     whole = np.vstack(rows)
     for j in range(unknowns.size):
@@ -129,7 +129,7 @@ def test_compression_keeps_values_gradients_and_steps(name, method, monkeypatch)
     value = lambda x: np.sum(errors(data, unknowns, x) ** 2)  # noqa: E731
     gradient = np.array([(value(x + s) - value(x - s)) / 2e-6 for s in 1e-6 * np.eye(unknowns.size)])
     assert 2 * matrix.T @ pull == pytest.approx(gradient, rel=1e-4, abs=1e-5 * np.max(np.abs(gradient)))
-    assert at.rows == sum(np.isfinite(p.y[unknowns.skipped :]).sum() for p in data.experiments)
+    assert at.rows == sum(np.isfinite(p.y[0 if apart else unknowns.layout.first_row :]).sum() for p in data.experiments)
 
 
 def test_errors_are_those_of_the_models_predictor():

@@ -263,11 +263,7 @@ def row_weights(weights: Any, count: int, name: str = "") -> Array:
 
 
 def check_channels(data: Any, layout: Layout) -> None:
-    """Refuse a record with another number of channels than the layout.
-
-    Raises:
-        DataError: the channels of both.
-    """
+    """Refuse a record with another number of channels than the layout (`DataError`)."""
     for kind, given, wanted in (("inputs", data.inputs, layout.inputs), ("outputs", data.outputs, layout.outputs)):
         if len(given) != len(wanted):
             raise DataError(f"The data have {len(given)} {kind} ({', '.join(given)}), the model {len(wanted)} "
@@ -275,11 +271,7 @@ def check_channels(data: Any, layout: Layout) -> None:
 
 
 def check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
-    """Refuse samples (N, m) outside a basis with outside="error"; the first of them has number `position`.
-
-    Raises:
-        DataError: names the input and the sample.
-    """
+    """Refuse samples (N, m) outside a basis with outside="error" (`DataError`); the first has number `position`."""
     for c, basis in enumerate(layout.bases):
         if basis.outside == "error" and (out := basis.is_outside(u[:, c])).any():
             k = int(np.argmax(out))

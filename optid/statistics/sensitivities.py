@@ -107,7 +107,7 @@ class TransferPredictor:
         y = self.data.experiments[index].y[:, 0]
         if self.unknowns.apart:
             return noise_filter.innovations(y - x, None, point.c, point.d)
-        return noise_filter.innovations(y, x, point.c, point.a, start=self.unknowns.skipped)
+        return noise_filter.innovations(y, x, point.c, point.a, start=self.unknowns.layout.first_row)
 
     def blocks(self, point: TransferPoint, index: int, measured: bool = False) -> Iterator[tuple[Array, int]]:
         """Yield [x0 | shared | (measured) | errors] of every chunk of an experiment, and its number of errors.

@@ -115,11 +115,6 @@ class TransferUnknowns(Unknowns):
         """Size n of an initial state among the unknowns."""
         return self.layout.first_row if self.apart else 0
 
-    @property
-    def skipped(self) -> int:
-        """First samples of a record whose innovation counts as zero."""
-        return 0 if self.apart else self.layout.first_row
-
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Sizes of "a", "mu0", "b0", "mu1", ..., "offset", "c" and "d"; zero where a part is not unknown."""

@@ -66,17 +66,12 @@ def _part(criterion: TransferErrors) -> TransferErrors:
     data = criterion.data
     if data.n_samples <= 2 * SEARCH:
         return criterion
-    longest = int(np.argmax([e.n_samples for e in data.experiments]))
-    size = data.experiments[longest].n_samples
-    if size < SEARCH:  # many short experiments
-        kept, total = [], 0
-        for i, e in enumerate(data.experiments):
-            if total < SEARCH:
-                kept, total = [*kept, i], total + e.n_samples
-        cut = data.select(experiments=kept)
+    sizes = [e.n_samples for e in data.experiments]
+    if max(sizes) < SEARCH:  # many short experiments
+        cut = data.select(experiments=list(range(int(np.searchsorted(np.cumsum(sizes), SEARCH)) + 1)))
     else:
-        first = (size - SEARCH) // 2
-        cut = data.select(experiments=[longest]).window(first, first + SEARCH)
+        first = (max(sizes) - SEARCH) // 2
+        cut = data.select(experiments=[int(np.argmax(sizes))]).window(first, first + SEARCH)
     if 2 * _complete(cut) < _complete(data):
         return criterion
     return replace(criterion, data=cut, unknowns=replace(criterion.unknowns, experiments=cut.n_experiments))

@@ -35,7 +35,7 @@ class TransferErrors(TransferPredictor, Criterion):
 
     Attributes:
         gauge: how the scale between mu and b is fixed; "none" for a linear model.
-        units: from those of the record above (`optid.program.units`) to those of the model.
+        units: from those of the record (`optid.program.units`) to those of the model.
     """
 
     gauge: str
@@ -132,22 +132,8 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     Unless D is A the initial states are unknown, and the record is cut where inputs are missing: every stretch is an
     experiment with an initial state of its own.
 
-    Args:
-        data: the record; one output.
-        na: number of poles.
-        nb: number of coefficients of B, one per input or one for all.
-        nk: delays, one per input or one for all.
-        basis: one per input or one for all.
-        nc: order of C.
-        nd: order of D; None where D is A.
-        gauge: how the scale between mu and b is fixed; None for a linear model.
-        offset: whether the model has a constant; without one nothing is centred.
-
-    Raises:
-        StructureError: impossible orders, unknown gauge, several outputs.
-        DataError: no stretch with every input is long enough.
-        RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
-            does not tell apart.
+    Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A, and ``gauge``
+    for a linear model. Without ``offset`` nothing is centred.
     """
     if gauge is not None:
         one_of("gauge", gauge, FIXED)
