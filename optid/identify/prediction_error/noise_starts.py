@@ -31,7 +31,7 @@ def starts_of(criterion: TransferErrors, number: int, seed: int) -> Iterable[tup
         StructureError, RankError: the record does not determine the ARX model of an ARMAX fit.
     """
     unknowns = criterion.unknowns
-    if unknowns.plain:
+    if not unknowns.innovations:
         return islice(plant_starts(criterion, seed), number)
     found = _residual_models(criterion, number, seed) if unknowns.apart else extended_least_squares(criterion)
     return islice(chain(found.items(), _other_zeros(unknowns, next(iter(found.values())), seed)), number)

@@ -42,18 +42,17 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
     Raises:
         RankError: no start has a stable predictor.
     """
-    part = _part(criterion)
-    found = best_of(part, starts(part), enough=SUFFICIENT if criterion.unknowns.plain else None)
+    part, filtered = _part(criterion), criterion.unknowns.innovations
+    found = best_of(part, starts(part), enough=None if filtered else SUFFICIENT)
     if not found:
-        raise RankError(f"no start has a stable {'simulation' if criterion.unknowns.plain else 'predictor'}; use other "
-                        "orders")
+        raise RankError(f"no start has a stable {'predictor' if filtered else 'simulation'}; use other orders")
     agreed, sentence = agreement(found, 1e-12 * part.energy)
     best = found[0]
     x = np.zeros(criterion.unknowns.size)
     x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
     final = descend(criterion, best.x if part is criterion else x, start=best.start)
     figures: dict[str, Any] = {"starts": sentence}
-    if not criterion.unknowns.plain:
+    if filtered:
         figures["starts that agree"] = agreed
     figures[f"{criterion.errors} of the starts"] = criterion.unit * np.array(
         sorted((one.value for one in found), reverse=True))

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -40,11 +39,7 @@ class TransferErrors(TransferPredictor, Criterion):
 
     gauge: str
     units: Transform
-
-    @property
-    def errors(self) -> str:
-        """What they are called."""
-        return "simulation errors" if self.unknowns.plain else "prediction errors"
+    weight: ClassVar[Array] = np.eye(1)
 
     @property
     def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -54,12 +49,6 @@ class TransferErrors(TransferPredictor, Criterion):
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
         return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
-
-    @cached_property
-    def energy(self) -> float:
-        """Sum of squares of the output about its mean."""
-        y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
-        return float(np.nansum((y - np.nanmean(y)) ** 2))
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
@@ -132,7 +121,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     Unless D is A the initial states are unknown, and the record is cut where inputs are missing: every stretch is an
     experiment with an initial state of its own.
 
-    Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A, and ``gauge``
+    Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge``
     for a linear model. Without ``offset`` nothing is centred.
     """
     if gauge is not None:
