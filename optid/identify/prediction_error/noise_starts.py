@@ -64,7 +64,7 @@ def _armax_plant(plain: TransferErrors, nc: int) -> Array | None:
         return None
     states = np.zeros((unknowns.experiments, unknowns.memory))
     x = unknowns.pack(replace(armax.unknowns.unpack(x), x0=states))
-    return with_poles(plain, plain.normalised(x), roots.contained(x[unknowns.slices["a"]], RADIUS), "ARMAX").x
+    return with_poles(plain, plain.normalised(x), roots.contained(x[unknowns.slices["a"]], RADIUS)).x
 
 
 def extended_least_squares(criterion: TransferErrors) -> dict[str, Array]:

@@ -44,11 +44,11 @@ def plant_starts(criterion: TransferErrors, seed: int) -> Iterator[tuple[str, Ar
         if (one := iterated(criterion, base.x, name)) is not None:
             yield name, one.x
     if (a := _subspace(criterion.data, criterion.unknowns.layout)) is not None:
-        yield "subspace", with_poles(criterion, base.x, a, "").x
+        yield "subspace", with_poles(criterion, base.x, a).x
     rng = np.random.default_rng(seed)
     for i in count(1) if criterion.unknowns.layout.na else ():
         a = _perturbed(rng, base.x[criterion.unknowns.slices["a"]])
-        yield f"perturbed {i}", with_poles(criterion, base.x, a, "").x
+        yield f"perturbed {i}", with_poles(criterion, base.x, a).x
 
 
 def arx_start(criterion: TransferErrors) -> Descent:
@@ -60,7 +60,7 @@ def arx_start(criterion: TransferErrors) -> Descent:
     except OptidError:
         point = _guess(criterion.unknowns)
     x = criterion.normalised(criterion.unknowns.pack(point))
-    return with_poles(criterion, x, contained(point.a, RADIUS), "ARX")
+    return with_poles(criterion, x, contained(point.a, RADIUS))
 
 
 def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | None = None) -> TransferPoint:
@@ -90,13 +90,13 @@ def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | Non
                          contained(c[0][0] * c[1], RADIUS), a)
 
 
-def with_poles(criterion: TransferErrors, x: Array, a: Array, start: str) -> Descent:
+def with_poles(criterion: TransferErrors, x: Array, a: Array) -> Descent:
     """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
     unknowns, moved = criterion.unknowns, x.copy()
     moved[unknowns.slices["a"]] = a
     held = np.zeros(unknowns.shared, dtype=bool)
     held[unknowns.slices["a"]] = True
-    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3, start=start)
+    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3)
 
 
 def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
@@ -123,7 +123,7 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
         x[:p] += step
         if not np.all(np.isfinite(x)):
             break
-        found = with_poles(criterion, x, contained(x[at], 0.9999), method)
+        found = with_poles(criterion, x, contained(x[at], 0.9999))
         settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
         best = found if best is None or found.value < best.value else best
         if settled:

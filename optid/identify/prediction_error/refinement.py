@@ -35,6 +35,9 @@ INSIDE = 1e-6
 NOWHERE = 1e-9
 """Relative violation that is rounding; a step to more than that pays for it."""
 
+ROUNDING = 1e-14
+"""Share of the energy of the record below which differences of sums of squares are rounding."""
+
 PATIENCE = 5
 """Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
 
@@ -106,7 +109,7 @@ class _Iterate:
         return self.at.value - self.at.after(step)
 
     def negligible(self, gain: float, share: float) -> bool:
-        return abs(gain) <= share * self.at.value + self.fit.floor
+        return abs(gain) <= share * self.at.value + ROUNDING * self.fit.criterion.energy
 
     def judged(self, solution: Solution, share: float) -> tuple[Status, str]:
         """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
@@ -120,8 +123,8 @@ class _Iterate:
 
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
-        value = self.fit.criterion.unit * self.at.value
-        return Evidence(self.fit.model(self.x), value, bound, status, reason, figures)
+        model, value = self.fit.recover(self.fit.places.values(self.x)), self.fit.criterion.unit * self.at.value
+        return Evidence(model, value, bound, status, reason, figures)
 
 
 def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:

@@ -92,15 +92,6 @@ class TangentFit(ABC):
         """The named variables in the order of the unknowns."""
         return Places.of(self.criterion.unknowns, self.criterion.key)
 
-    @property
-    def floor(self) -> float:
-        """Sum of squares below which differences are rounding."""
-        return 1e-14 * self.criterion.energy
-
-    def model(self, x: Array) -> Any:
-        """Return the model of x."""
-        return self.recover(self.places.values(x))
-
     def signed(self, x: Array) -> Array:
         """Turn the signs of mu and b to where the constraints are violated least.
 
@@ -135,12 +126,11 @@ def violation(program: Program) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """``‖root z - target‖² + remainder``; ``scale`` is the energy against which a vanishing value is judged."""
+    """``‖root z - target‖² + remainder``."""
 
     root: Array
     target: Array
     remainder: float
-    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +166,7 @@ class CompressedErrors:
     def problem(self) -> LeastSquares:
         """The sum of squares in z."""
         root, errors = self.at.whole
-        return LeastSquares(root, root @ self.reference - errors, self.at.remainder, float(self.energy[0]))
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
 
     @cached_property
     def statistics(self) -> ErrorRows:
