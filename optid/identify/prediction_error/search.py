@@ -99,7 +99,7 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
         for radius in PULLS:
             pulled = x[at] if radius == 1.0 else contained(x[at], radius)
             if _poles_obey(fit, np.concatenate([pulled, x[at.stop :]]), one.at):
-                again = one if radius == 1.0 else with_poles(replace(criterion, gauge="norm"), x, pulled)
+                again = one if radius == 1.0 else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
     return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
