@@ -131,11 +131,12 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
         rows += count
         add(block)
     if gauge is not None and len(gauge):
-        energy = (np.sum(total**2, axis=0) if exact else np.diag(total))[first : first + gauge.shape[1]]
+        span, extra = slice(first, first + gauge.shape[1]), np.zeros((len(gauge), columns))
+        energy = (np.sum(total**2, axis=0) if exact else np.diag(total))[span]
         sizes = np.abs(gauge)  # directions without effect get a weight of the size of the others
         lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
-        extra = gauge * np.where(lengths > 0, lengths, 1.0)[:, None]
-        add(np.pad(extra, ((0, 0), (first, columns - first - gauge.shape[1]))))
+        extra[:, span] = gauge * np.where(lengths > 0, lengths, 1.0)[:, None]
+        add(extra)
     return total if exact else any_root_of_gram(total), rows
 
 

@@ -118,7 +118,8 @@ class TransferPredictor:
         y, x = self.data.experiments[index].y[:, 0], self._simulated(point, index)
         found, depth = self.predict(point, index, x), max(unknowns.nc, len(point.d))
         innovations = np.concatenate([np.zeros(depth), found.innovations])
-        explained = np.concatenate([np.zeros(depth), np.nan_to_num(found.filled)])
+        explained = np.concatenate([np.zeros(depth), found.filled])
+        explained[np.isnan(explained)] = 0.0
         width = n + unknowns.shared + measured * na + 1
         history, kinds = np.zeros((depth, width)), np.full(depth, DEAD, dtype=np.int8)
         head, run = n, _Run(unknowns, point)
@@ -135,8 +136,10 @@ class TransferPredictor:
             for i in range(head):
                 rows[:, i] = run.shifted(run.impulse, i)
             if unknowns.apart:
-                outputs = [x[part], np.where(np.isnan(y[part]), x[part], y[part])][: 1 + measured]
-                lines = np.vstack([past, np.column_stack(outputs)])
+                lines = np.empty((len(past) + count, 1 + measured))
+                lines[: len(past)], lines[len(past) :, 0] = past, x[part]
+                if measured:
+                    lines[len(past) :, 1] = np.where(np.isnan(y[part]), x[part], y[part])
                 _all_pole(point.a, lines, len(past))
                 past, lines = lines[count:], _through(run.d, lines)
             else:
