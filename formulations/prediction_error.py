@@ -31,16 +31,16 @@ import cvxpy as cp
 import numpy as np
 
 from optid.arrays import check_integer
-from optid.bases.basis import Basis
+from optid.bases import Bases
 from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.identify.arguments import enough_rows, one_of, one_output, outputs_present, per_channel
-from optid.identify.gauges import FIXED, scale_fixed
+from optid.identify.arguments import enough_rows
+from optid.identify.gauges import scale_fixed
 from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
 from optid.identify.prediction_error.tangent_fit import CompressedErrors, TangentFit
-from optid.identify.prediction_error.transfer_errors import TransferErrors, plant_record
+from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
@@ -48,12 +48,10 @@ from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
-from optid.statistics.unknowns import TransferUnknowns
 from optid.structures.least_squares import LeastSquaresStructure
 
 Array = np.ndarray
 Orders = int | Sequence[int]
-Bases = Basis | str | Sequence[Basis | str]
 
 
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,
@@ -144,33 +142,11 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
+    """Search for the best optimum in a gauge that is always reached, and go on from there in the one asked for."""
     count = check_integer(starts, "starts")
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
-    return _run(name, criterion, constraints, count, seed)
-
-
-def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
-                    gauge: str | None, offset: bool) -> TransferErrors:
-    """Return the criterion on the record in its own units, its arguments checked as in `hammerstein_bj`.
-
-    Where D is A, nd is None; of a linear model the gauge.
-    """
-    if gauge is not None:
-        one_of("gauge", gauge, FIXED)
-    data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
-    orders = (check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
-              per_channel("nk", nk, data.inputs, low=0))
-    record, layout, units = plant_record(data, *orders, basis, offset, states=nd is not None)
-    unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, bool(offset),
-                                check_integer(nc, "nc", 0), nd)
-    if unknowns.apart:
-        enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
-    return TransferErrors(record, unknowns, gauge or "none", units)
-
-
-def _run(name: str, criterion: TransferErrors, constraints: Sequence[Any], starts: int, seed: int) -> Procedure:
-    free = replace(criterion, gauge="none" if criterion.gauge == "none" else "norm")
-    best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
+    free = replace(criterion, gauge="none" if gauge is None else "norm")
+    best, others, figures = search(free, lambda part: starts_of(part, count, seed))
     enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")
     fit = _Fit(name, criterion, tuple(constraints), best.x)
     return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))

@@ -20,24 +20,25 @@ without it here and are for some hundred samples. Longer records are refused; ``
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from formulations.prediction_error import Bases, Orders, transfer_errors, transfer_model
+from formulations.prediction_error import Orders, transfer_model
+from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.gauges import scale_fixed
 from optid.identify.prediction_error.plant_starts import arx_start, iterated
-from optid.identify.prediction_error.transfer_errors import TransferErrors
-from optid.models import HammersteinTF
+from optid.identify.prediction_error.tangent_fit import Places
+from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models.gauges import leading_sign
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.program.solution import Bound
 from optid.program.units import outer_bases
 from optid.program.view import View
-from optid.statistics.sensitivities import simulate
 
 Array = np.ndarray
 
@@ -74,15 +75,13 @@ class _Shooting:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
         several = criterion.unknowns.experiments > 1
         self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
-        self.key, self.variables = criterion.key, dict[str, cp.Variable]()
+        self.key, self.places = criterion.key, Places.of(criterion.unknowns, criterion.key)
+        self.variables = self.places.variables()
+        self.variables.pop("x0", None)  # the first outputs are the initial state
 
     def program(self, constraints: Sequence[Any]) -> Program:
         """Return the programme under the user's constraints."""
         layout, gauge = self.layout, self.criterion.gauge
-        shapes = {"a": layout.na, "offset": int(self.criterion.unknowns.constant)}
-        for c, (basis, nb) in enumerate(zip(layout.bases, layout.nb)):
-            shapes |= {self.key("mu", c): basis.size, self.key("b", c): nb}
-        self.variables = {name: cp.Variable(size, name=name) for name, size in shapes.items() if size}
         expressions: dict[str, Any] = dict(self.variables)
         for c in range(layout.m):
             expressions[self.key("Theta", c)] = cp.outer(self.variables[self.key("mu", c)],
@@ -106,10 +105,10 @@ class _Shooting:
                     units=units)
         objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))
         bound = Bound.none(NO_BOUND)
-        program = Program(name="hammerstein_oe.shooting", objective=objective, constraints=structural,
-                          variables=self.variables, start=start, recover=self.recover, view=view,
-                          structural=frozenset(structural), derived=derived, scale=self.criterion.energy,
-                          certify=lambda program, values, duals: (bound, None), note=NO_BOUND, unit=self.criterion.unit)
+        program = Program("hammerstein_oe.shooting", objective, structural, self.variables, start,
+                          partial(transfer_model, self.criterion), view, frozenset(structural), derived=derived,
+                          scale=self.criterion.energy, certify=lambda program, values, duals: (bound, None),
+                          note=NO_BOUND, unit=self.criterion.unit)
         return program.subject_to(*constraints)
 
     def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -158,18 +157,17 @@ class _Shooting:
 
     def _start(self, derived: Mapping[str, Any]) -> dict[str, Array]:
         """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
-        criterion, unknowns = self.criterion, self.criterion.unknowns
+        criterion = self.criterion
         found = arx_start(criterion)
         others = [iterated(criterion, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
         best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
-        point = unknowns.unpack(criterion.normalised(best.x))
-        start = {"a": point.a, "offset": np.array([point.offset])}
-        for c, (mu, b) in enumerate(zip(point.mus, point.bs)):
-            sign = leading_sign(b) if criterion.gauge == "norm" else 1.0
-            start |= {self.key("mu", c): sign * mu, self.key("b", c): sign * b}
-        start |= {f"x{label}": x for label, x in zip(self.labels, simulate(self.data, unknowns, point))}
-        level = point.a
-        start["kappa"] = np.zeros(self.layout.na)
+        x = criterion.normalised(best.x)
+        start = self.places.values(x)
+        for mu, b in [(self.key("mu", c), self.key("b", c)) for c in range(self.layout.m)]:
+            sign = leading_sign(start[b]) if criterion.gauge == "norm" else 1.0
+            start |= {mu: sign * start[mu], b: sign * start[b]}
+        start |= zip([f"x{label}" for label in self.labels], criterion.simulate(criterion.unknowns.unpack(x)))
+        level, start["kappa"] = start.get("a", np.zeros(0)), np.zeros(self.layout.na)
         for m in range(self.layout.na, 0, -1):  # the recursion backwards
             start[f"a of order {m}"], start["kappa"][m - 1] = level, level[-1]
             level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
@@ -177,7 +175,3 @@ class _Shooting:
         for name, value in start.items():
             self.variables[name].value = value
         return {**start, **{name: np.asarray(expression.value) for name, expression in derived.items()}}
-
-    def recover(self, values: Values) -> HammersteinTF:
-        """Build the model."""
-        return transfer_model(self.criterion, values)

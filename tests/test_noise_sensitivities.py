@@ -10,7 +10,8 @@ from systems import inputs, nonlinearity
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.models import HammersteinTF
-from optid.statistics.sensitivities import blocks, linearise, predict, simulate
+from optid.statistics import sensitivities
+from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
@@ -57,8 +58,9 @@ CASES = {"armax": (plant(c=C), False), "arx": (plant(), False), "long": (plant(c
 
 def errors(data, unknowns, x):
     found = []
-    for i, y in enumerate(simulate(data, unknowns, unknowns.unpack(x))):
-        one = predict(data, unknowns, unknowns.unpack(x), i, y)
+    predictor, point = TransferPredictor(data, unknowns), unknowns.unpack(x)
+    for i, y in enumerate(predictor.simulate(point)):
+        one = predictor.predict(point, i, y)
         found.append(np.where(one.state == 0, -one.innovations, 0.0))
     return np.concatenate(found)
 
@@ -68,14 +70,15 @@ GAPS = [(name, gaps) for name, (_, apart) in CASES.items() for gaps in (("", "y"
 
 
 @pytest.mark.parametrize(("name", "gaps"), GAPS)
-def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps):
+def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps, monkeypatch):
+    monkeypatch.setattr(sensitivities, "CHUNK", 17)
     model, apart = CASES[name]
     data = records(model, gaps=gaps)
     unknowns, x = point_of(model, data, apart)
-    rows = []
+    predictor, point, rows = TransferPredictor(data, unknowns), unknowns.unpack(x), []
     for i, e in enumerate(data.experiments):
-        found = predict(data, unknowns, unknowns.unpack(x), i, simulate(data, unknowns, unknowns.unpack(x))[i])
-        parts = [block for block, _ in blocks(data, unknowns, unknowns.unpack(x), i, chunk=17)]
+        found = predictor.predict(point, i, predictor.simulate(point)[i])
+        parts = [block for block, _ in predictor.blocks(point, i)]
         width = unknowns.memory + unknowns.shared + 1  # a forgotten initial state has no columns
         part = np.vstack([np.pad(block, ((0, 0), (width - block.shape[1], 0))) for block in parts])
         states = np.zeros((len(part), data.n_experiments * unknowns.memory))
@@ -91,19 +94,20 @@ def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps):
 
 
 @pytest.mark.parametrize("name", ["armax", "long"])
-def test_derivatives_where_outputs_never_follow_one_another(name):
+def test_derivatives_where_outputs_never_follow_one_another(name, monkeypatch):
     """Every second output: the recursion begins with held samples, whose derivatives do not count."""
+    monkeypatch.setattr(sensitivities, "CHUNK", 17)
     model, apart = CASES[name]
     data = records(model)
     ys = [e.y.copy() for e in data.experiments]
     ys[0][::2], ys[1][1::2] = np.nan, np.nan
     data = Data([e.u for e in data.experiments], ys)
     unknowns, x = point_of(model, data, apart)
-    rows = []
+    predictor, point, rows = TransferPredictor(data, unknowns), unknowns.unpack(x), []
     for i, e in enumerate(data.experiments):
-        found = predict(data, unknowns, unknowns.unpack(x), i, simulate(data, unknowns, unknowns.unpack(x))[i])
-        assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.skipped :]).sum() > 5
-        rows.append(np.vstack([b for b, _ in blocks(data, unknowns, unknowns.unpack(x), i, chunk=17)]))
+        found = predictor.predict(point, i, predictor.simulate(point)[i])
+        assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.layout.first_row :]).sum() > 5
+        rows.append(np.vstack([b for b, _ in predictor.blocks(point, i)]))
     whole = np.vstack(rows)
     for j in range(unknowns.size):
         step = 1e-6 * np.eye(unknowns.size)[j]
@@ -113,18 +117,19 @@ def test_derivatives_where_outputs_never_follow_one_another(name):
 
 @pytest.mark.parametrize("method", ["gram", "qr", "auto"])
 @pytest.mark.parametrize("name", ["armax", "bj"])
-def test_compression_keeps_values_gradients_and_steps(name, method):
+def test_compression_keeps_values_gradients_and_steps(name, method, monkeypatch):
+    monkeypatch.setattr(sensitivities, "CHUNK", 23)
     model, apart = CASES[name]
     data = records(model, gaps="y")
     unknowns, x = point_of(model, data, apart)
-    at = linearise(data, unknowns, unknowns.unpack(x), method=method, chunk=23)
+    at = TransferPredictor(data, unknowns).compress(unknowns.unpack(x), method=method)
     e = errors(data, unknowns, x)
     assert at.value == pytest.approx(e @ e, rel=1e-9)
     matrix, pull = at.whole
     value = lambda x: np.sum(errors(data, unknowns, x) ** 2)  # noqa: E731
     gradient = np.array([(value(x + s) - value(x - s)) / 2e-6 for s in 1e-6 * np.eye(unknowns.size)])
     assert 2 * matrix.T @ pull == pytest.approx(gradient, rel=1e-4, abs=1e-5 * np.max(np.abs(gradient)))
-    assert at.rows == sum(np.isfinite(p.y[unknowns.skipped :]).sum() for p in data.experiments)
+    assert at.rows == sum(np.isfinite(p.y[0 if apart else unknowns.layout.first_row :]).sum() for p in data.experiments)
 
 
 def test_errors_are_those_of_the_models_predictor():
@@ -137,8 +142,9 @@ def test_errors_are_those_of_the_models_predictor():
             type(f)(f.basis, mu) for f, mu in zip(model.nonlinearities, point.mus)), (0, 2),
             point.offset, inputs=data.inputs, c=point.c, d=point.d)
         expected = truth.innovations(data, list(point.x0) if apart else "fit")
-        for i, y in enumerate(simulate(data, unknowns, point)):
-            found = predict(data, unknowns, point, i, y)
+        predictor = TransferPredictor(data, unknowns)
+        for i, y in enumerate(predictor.simulate(point)):
+            found = predictor.predict(point, i, y)
             assert np.array_equal(found.state == 0, np.isfinite(expected[i][:, 0]))
             assert found.innovations == pytest.approx(np.nan_to_num(expected[i][:, 0]), abs=1e-11)
 
@@ -147,12 +153,12 @@ def test_without_a_noise_filter_it_is_the_output_error():
     model, _ = CASES["oe"]
     data = records(model, counts=(300, 200), gaps="y")
     unknowns, x = point_of(model, data, True)
-    plain = linearise(data, unknowns, unknowns.unpack(x), method="qr")
+    plain = TransferPredictor(data, unknowns).compress(unknowns.unpack(x), method="qr")
     filtered = replace(unknowns, nc=1, nd=2)  # C = D = 1 as a point of a model with a noise filter
     point = replace(unknowns.unpack(x), c=np.zeros(1), d=np.zeros(2))
-    ours = linearise(data, filtered, point, method="qr").whole[0]
+    ours = TransferPredictor(data, filtered).compress(point, method="qr").whole[0]
     ours = np.delete(ours, np.arange(unknowns.shared, filtered.shared), axis=1)
-    assert linearise(data, filtered, point, method="qr").value == pytest.approx(plain.value, rel=1e-10)
+    assert TransferPredictor(data, filtered).compress(point, method="qr").value == pytest.approx(plain.value, rel=1e-10)
     theirs = plain.whole[0]
     assert ours.T @ ours == pytest.approx(theirs.T @ theirs, rel=1e-8, abs=1e-8)
 

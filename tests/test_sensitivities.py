@@ -7,7 +7,8 @@ import optid
 from optid.bases import BSpline, Linear, Polynomial, Triangular
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.layout import Layout
-from optid.statistics.sensitivities import expanded, instruments, linearise, simulate
+from optid.statistics import sensitivities
+from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 
@@ -36,8 +37,8 @@ def scale_row(unknowns, point):
     return row
 
 
-def errors(data, unknowns, x, chunk=4096):
-    found = simulate(data, unknowns, unknowns.unpack(x), chunk)
+def errors(data, unknowns, x):
+    found = TransferPredictor(data, unknowns).simulate(unknowns.unpack(x))
     whole = np.concatenate([y - e.y[:, 0] for y, e in zip(found, data.experiments)])
     return whole[~np.isnan(whole)]
 
@@ -57,27 +58,31 @@ def test_packing_is_undone():
 
 
 @pytest.mark.parametrize("chunk", [7, 50, 4096])
-def test_simulation_equals_that_of_the_model(chunk):
+def test_simulation_equals_that_of_the_model(chunk, monkeypatch):
+    monkeypatch.setattr(sensitivities, "CHUNK", chunk)
+    monkeypatch.setattr(sensitivities, "TABLE", 0)
     data, unknowns, point = case()
     layout = unknowns.layout
     model = HammersteinTF(point.a, point.bs, tuple(Nonlinearity(b, mu) for b, mu in zip(layout.bases, point.mus)),
                            layout.nk, point.offset)
-    for ours, theirs in zip(simulate(data, unknowns, point, chunk), model.simulate(data, x0=list(point.x0))):
+    found = TransferPredictor(data, unknowns).simulate(point)
+    for ours, theirs in zip(found, model.simulate(data, x0=list(point.x0))):
         assert np.max(np.abs(ours - theirs[:, 0])) < 1e-12
 
 
 @pytest.mark.parametrize("constant", [True, False])
 @pytest.mark.parametrize("method", ["gram", "qr"])
 @pytest.mark.parametrize("chunk", [7, 50, 4096])
-def test_compressed_sensitivities_equal_finite_differences(chunk, method, constant):
+def test_compressed_sensitivities_equal_finite_differences(chunk, method, constant, monkeypatch):
+    monkeypatch.setattr(sensitivities, "CHUNK", chunk)
     data, unknowns, point = case(constant=constant)
     x = unknowns.pack(point)
     e, slopes = errors(data, unknowns, x), jacobian(data, unknowns, x)
-    matrix, pulled = linearise(data, unknowns, point, method=method, chunk=chunk).whole
+    matrix, pulled = TransferPredictor(data, unknowns).compress(point, method=method).whole
     size = np.linalg.norm(slopes, axis=0)
     assert np.max(np.abs(matrix.T @ matrix - slopes.T @ slopes) / np.outer(size, size)) < 1e-7
     assert np.max(np.abs(matrix.T @ pulled - slopes.T @ e) / size) < 1e-6
-    found = linearise(data, unknowns, point, method=method, chunk=chunk, gauge=scale_row(unknowns, point))
+    found = TransferPredictor(data, unknowns).compress(point, method=method, gauge=scale_row(unknowns, point))
     assert found.value == pytest.approx(e @ e, rel=1e-12)
     assert found.rows == e.size
     full = np.linalg.lstsq(slopes, e, rcond=1e-10)[0]
@@ -88,7 +93,7 @@ def test_eliminated_initial_states_follow_a_step():
     data, unknowns, point = case()
     x = unknowns.pack(point)
     e, slopes = errors(data, unknowns, x), jacobian(data, unknowns, x)
-    found = linearise(data, unknowns, point, gauge=scale_row(unknowns, point))
+    found = TransferPredictor(data, unknowns).compress(point, gauge=scale_row(unknowns, point))
     step = 0.1 * np.random.default_rng(3).normal(size=unknowns.shared)
     moves = np.linalg.lstsq(slopes[:, unknowns.shared :], -(e + slopes[:, : unknowns.shared] @ step), rcond=None)[0]
     assert np.allclose(found.follow(step), moves, atol=1e-5)
@@ -100,8 +105,8 @@ def test_eliminated_initial_states_follow_a_step():
 
 def test_directions_without_effect_get_weight_and_change_nothing():
     data, unknowns, point = case()
-    plain = linearise(data, unknowns, point)
-    weighted = linearise(data, unknowns, point, gauge=scale_row(unknowns, point))
+    plain = TransferPredictor(data, unknowns).compress(point)
+    weighted = TransferPredictor(data, unknowns).compress(point, gauge=scale_row(unknowns, point))
     assert plain.condition > 1e7 > 1e4 > weighted.condition
     assert weighted.value == pytest.approx(plain.value, rel=1e-12)
     across = np.zeros(unknowns.shared)  # a step along the gauge row itself is the only one that costs
@@ -116,7 +121,7 @@ def test_ill_conditioned_sensitivities_are_factorised_by_qr():
     unknowns = TransferUnknowns(layout, 1, (False,))
     nearly = np.poly([0.99, 0.985, 0.98, 0.975])[1:]
     point = TransferPoint(nearly, (np.ones(1),), (np.array([1.0, 0.5, 0.2, 0.1]),), 0.0, np.zeros((1, 4)))
-    found = linearise(data, unknowns, point)
+    found = TransferPredictor(data, unknowns).compress(point)
     assert found.method == "qr" and found.condition > 1e6
     assert found.value == pytest.approx(np.sum(errors(data, unknowns, unknowns.pack(point)) ** 2), rel=1e-10)
 
@@ -126,7 +131,7 @@ def test_instruments_hold_the_measured_output_in_the_columns_of_a():
     from scipy.signal import lfilter
 
     x, na, p = unknowns.pack(point), unknowns.layout.na, unknowns.shared
-    simulated, a = simulate(data, unknowns, point), np.concatenate([[1.0], point.a])
+    simulated, a = TransferPredictor(data, unknowns).simulate(point), np.concatenate([[1.0], point.a])
     columns = []
     for y, e in zip(simulated, data.experiments):
         record = np.where(np.isnan(e.y[:, 0]), y, e.y[:, 0])
@@ -138,11 +143,13 @@ def test_instruments_hold_the_measured_output_in_the_columns_of_a():
     formed = np.column_stack([slopes[:, :p], np.vstack(columns), errors(data, unknowns, x)])
     formed -= states @ np.linalg.lstsq(states, formed, rcond=None)[0]
     size = np.linalg.norm(formed, axis=0)
-    assert np.max(np.abs(instruments(data, unknowns, point) - formed.T @ formed) / np.outer(size, size)) < 1e-6
+    found = TransferPredictor(data, unknowns).instruments(point)
+    assert np.max(np.abs(found - formed.T @ formed) / np.outer(size, size)) < 1e-6
 
 
 @pytest.mark.parametrize("basis", [Polynomial(3), BSpline(5), Triangular(6)], ids=str)
-def test_every_basis(basis):
+def test_every_basis(basis, monkeypatch):
+    monkeypatch.setattr(sensitivities, "CHUNK", 13)
     rng = np.random.default_rng(2)
     data = optid.Data(rng.uniform(-1, 1, 80), rng.normal(size=80))
     basis = basis.fitted(-1, 1)
@@ -151,18 +158,19 @@ def test_every_basis(basis):
                        rng.normal(size=(1, unknowns.memory)))
     x = unknowns.pack(point)
     slopes = jacobian(data, unknowns, x)
-    matrix, _ = linearise(data, unknowns, point, chunk=13).whole
+    matrix, _ = TransferPredictor(data, unknowns).compress(point).whole
     assert np.allclose(matrix.T @ matrix, slopes.T @ slopes, atol=1e-6 * np.max(slopes.T @ slopes))
 
 
-def test_kept_basis_functions_change_nothing():
+def test_kept_basis_functions_change_nothing(monkeypatch):
     data, unknowns, point = case()
-    table = expanded(data, unknowns.layout)
-    assert expanded(data, unknowns.layout, limit=data.n_samples) is None
-    kept = linearise(data, unknowns, point, functions=table, chunk=50).whole
-    for ours, theirs in zip(kept, linearise(data, unknowns, point, chunk=50).whole):
+    monkeypatch.setattr(sensitivities, "CHUNK", 50)
+    kept = TransferPredictor(data, unknowns)
+    with_table = *kept.compress(point).whole, kept.instruments(point)
+    monkeypatch.setattr(sensitivities, "TABLE", data.n_samples)
+    anew = TransferPredictor(data, unknowns)
+    for ours, theirs in zip(with_table, (*anew.compress(point).whole, anew.instruments(point))):
         assert np.array_equal(ours, theirs)
-    assert np.array_equal(instruments(data, unknowns, point, functions=table), instruments(data, unknowns, point))
 
 
 @pytest.mark.parametrize("method", ["gram", "qr"])
@@ -172,8 +180,8 @@ def test_gauge_changes_the_factor_of_one_experiment_in_its_own_direction_alone(m
     unknowns = TransferUnknowns(unknowns.layout, 1, unknowns.free)
     point = TransferPoint(point.a, point.mus, point.bs, point.offset, point.x0[:1])
     row = scale_row(unknowns, point)
-    free = linearise(data, unknowns, point, method=method)
-    fixed = linearise(data, unknowns, point, gauge=row, method=method)
+    free = TransferPredictor(data, unknowns).compress(point, method=method)
+    fixed = TransferPredictor(data, unknowns).compress(point, gauge=row, method=method)
     more = fixed.root.T @ fixed.root - free.root.T @ free.root
     weight = more[unknowns.slices["b0"].start, unknowns.slices["b0"].start] / point.bs[0][0] ** 2
     assert weight > 0 and np.max(np.abs(more - weight * row.T @ row)) < 1e-8 * np.max(np.abs(free.root)) ** 2

@@ -115,16 +115,13 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     equalities, inequalities, slack = _constraint_rows(program, tuple(shapes))
 
     lift, lifted = _differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
-    coefficients, regression = _differences(lambda x: compressed.regression(_unpacked(shapes, x)).ravel(), x)
     problem = compressed.problem
     free, triangle, basis = whitened(problem.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
     pull = basis.T @ (problem.root @ lifted - problem.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
 
-    moves = coefficients @ directions
-    theta = (regression + moves @ centre).reshape(compressed.regression(found).shape)
-    spread = compressed.spread(theta, moves)
+    spread = compressed.spread(lifted + lift @ (directions @ centre), lift @ directions)
     # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
     scatter = _square_root(spread.covariance) @ basis.T
     local = LocalEstimate(centre, scatter, spread.dof, inequalities @ directions, slack, draws, seed)
@@ -200,25 +197,30 @@ def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]
 
 def _constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
     """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at the point."""
-    size = sum(program.variables[name].size for name in names)
-    equal: list[Array] = [np.zeros((0, size))]
-    above: list[Array] = [np.zeros((0, size))]
-    slack = [np.zeros(0)]
-    derived = {id(program.variables[name]) for name in program.derived}
+    variables, derived = ([program.variables[name] for name in group] for group in (names, program.derived))
+    nothing = np.zeros((0, sum(variable.size for variable in variables)))
+    equal, above, slack = [nothing], [nothing], [np.zeros(0)]
     for name, group in program.constraints.items():
         for member in group:
-            if any(id(v) in derived for v in member.variables()):
+            level = None if {v.id for v in member.variables()} & {v.id for v in derived} else _level(name, member)
+            if level is None:
                 continue
+            if (slopes := jacobians(level)) is None:
+                raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap "
+                                     "instead")
+            rows = side_by_side(slopes, variables, level.size)
             if isinstance(member, EQUALITIES):
-                equal.append(_gradient(program, names, name, member.expr))
-            elif (positive := _one_sided(name, member)) is not None:
-                above.append(_gradient(program, names, name, positive))
-                slack.append(np.maximum(flat_value(positive), 0.0))
+                equal.append(rows)
+            else:
+                above.append(rows)
+                slack.append(np.maximum(flat_value(level), 0.0))
     return np.vstack(equal), np.vstack(above), np.concatenate(slack)
 
 
-def _one_sided(name: str, member: Constraint) -> Expression | None:
-    """Return an expression that must be >= 0; None for a matrix or cone constraint far from active."""
+def _level(name: str, member: Constraint) -> Expression | None:
+    """Return an expression that must be zero, or >= 0; None for a matrix or cone constraint far from active."""
+    if isinstance(member, EQUALITIES):
+        return member.expr
     if isinstance(member, INEQUALITIES):
         return -member.expr
     if isinstance(member, NonNeg):
@@ -233,13 +235,6 @@ def _one_sided(name: str, member: Constraint) -> Expression | None:
             return None
     raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
                          "use optid.bootstrap for intervals")
-
-
-def _gradient(program: Program, names: tuple[str, ...], name: str, expression: Expression) -> Array:
-    slopes = jacobians(expression)
-    if slopes is None:
-        raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap instead")
-    return side_by_side(slopes, [program.variables[key] for key in names], expression.size)
 
 
 def _square_root(matrix: Array) -> Array:

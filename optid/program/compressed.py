@@ -34,6 +34,7 @@ class Compressed(Protocol):
         problem: the numbers of ``‖root z - target‖² + remainder``: root (k, n), target (k,), remainder.
         statistics: the rows behind it: ``root``, the triangular factor of [regressor | outputs]; ``rows`` used and
             ``candidates`` in the record; ``condition`` of the factor and the ``method`` that made it.
+        columns: (n_columns, l) positions in z of the coefficients of the columns of the factor.
         energy: (l,) sum of squares of every output about its mean, in units of the objective.
     """
 
@@ -42,31 +43,29 @@ class Compressed(Protocol):
     @property
     def statistics(self) -> Any: ...  # noqa: D102
     @property
+    def columns(self) -> Any: ...  # noqa: D102
+    @property
     def energy(self) -> Array: ...  # noqa: D102
 
     def lifted(self, values: Mapping[str, np.ndarray]) -> Array:
         """Return z (n,) of named values."""
         ...
 
-    def regression(self, values: Mapping[str, np.ndarray]) -> Array:
-        """Return the coefficients (n_columns, l) of the columns of the factor."""
-        ...
-
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> Array | None:
         """Return the one-step fit (l,) in %; None where only a run of the model tells it."""
         ...
 
-    def spread(self, theta: Array, moves: Array) -> Spread:
+    def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter of an estimate in k coordinates in which its information is the identity.
 
         Args:
-            theta: (n_columns, l) coefficients of the columns at the minimum.
-            moves: (n_columns l, k) their derivatives with respect to the coordinates.
+            z: (n,) at the minimum.
+            moves: (n, k) its derivatives with respect to the coordinates.
         """
         ...
 
 
-def white_spread(statistics: Any, theta: Array, moves: Array) -> Spread:
+def white_spread(compressed: Compressed, z: Array, moves: Array) -> Spread:
     """Return `Compressed.spread` for rows whose errors are white.
 
     Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
@@ -75,12 +74,12 @@ def white_spread(statistics: Any, theta: Array, moves: Array) -> Spread:
     Raises:
         RankError: no rows are left to estimate the noise from.
     """
-    n, l = theta.shape  # noqa: E741
-    root = statistics.root
-    sensitivity = np.einsum("ij,jok->oik", root[:n, :n], moves.reshape(n, l, -1))
+    statistics, columns = compressed.statistics, compressed.columns
+    (n, l), root = columns.shape, statistics.root  # noqa: E741
+    sensitivity = np.einsum("ij,jok->oik", root[:n, :n], moves[columns])
     parameters = float(np.sum(sensitivity**2))
     dof = degrees_of_freedom(statistics.rows, parameters / l)
-    residual = root @ np.vstack([theta, -np.eye(l)])
+    residual = root @ np.vstack([z[columns], -np.eye(l)])
     noise = residual.T @ residual / dof
     covariance = np.einsum("oij,op,pik->jk", sensitivity, noise, sensitivity)
     penalised = parameters < len(covariance) * (1 - 1e-9)

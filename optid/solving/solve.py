@@ -74,7 +74,8 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
         return solution
-    if solution.status is Status.FAILED or (solution.status is Status.LIMIT and _violation(solution) > LIE):
+    outside = solution.residuals is not None and solution.residuals.violation > LIE
+    if solution.status is Status.FAILED or (solution.status is Status.LIMIT and outside):
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
             if found.status is Status.INFEASIBLE or (found.has_point and found.status not in UNUSABLE):

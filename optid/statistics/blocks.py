@@ -196,32 +196,22 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     return Block(frame, tuple(groups), valid, weights, candidates)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Part of a record: [u, y] or [u, y, weights] with the samples before its rows, and where it begins."""
-
-    arrays: list[Array]
-    record: str
-    position: int
-
-
-def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[Stretch]:
-    """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time."""
-    size = _block_size(layout, chunk)
-    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
-    for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
-        yield Stretch(arrays, record, i * length)
-
-
-def blocks_of(part: Stretch, layout: Layout, chunk: int) -> Iterator[Block]:
-    """Evaluate the bases on a stretch, block by block.
+def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[list[Array]]:
+    """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time.
 
     Raises:
         DataError: a sample outside a basis with outside="error".
     """
     size = _block_size(layout, chunk)
-    for i, (u, y, *weights) in enumerate(stretches([part.arrays], layout.first_row, size)):
-        check_inside(u, layout, part.record, part.position + i * size)
+    length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
+    for i, arrays in enumerate(stretches(chunks, layout.first_row, length)):
+        check_inside(arrays[0], layout, record, i * length)
+        yield arrays
+
+
+def blocks_of(stretch: Sequence[Array], layout: Layout, chunk: int) -> Iterator[Block]:
+    """Evaluate the bases on a stretch, block by block."""
+    for u, y, *weights in stretches([stretch], layout.first_row, _block_size(layout, chunk)):
         yield make_block(u, y, weights[0] if weights else None, layout)
 
 
@@ -273,11 +263,7 @@ def row_weights(weights: Any, count: int, name: str = "") -> Array:
 
 
 def check_channels(data: Any, layout: Layout) -> None:
-    """Refuse a record with another number of channels than the layout.
-
-    Raises:
-        DataError: the channels of both.
-    """
+    """Refuse a record with another number of channels than the layout (`DataError`)."""
     for kind, given, wanted in (("inputs", data.inputs, layout.inputs), ("outputs", data.outputs, layout.outputs)):
         if len(given) != len(wanted):
             raise DataError(f"The data have {len(given)} {kind} ({', '.join(given)}), the model {len(wanted)} "
@@ -285,11 +271,7 @@ def check_channels(data: Any, layout: Layout) -> None:
 
 
 def check_inside(u: Array, layout: Layout, name: str, position: int) -> None:
-    """Refuse samples (N, m) outside a basis with outside="error"; the first of them has number `position`.
-
-    Raises:
-        DataError: names the input and the sample.
-    """
+    """Refuse samples (N, m) outside a basis with outside="error" (`DataError`); the first has number `position`."""
     for c, basis in enumerate(layout.bases):
         if basis.outside == "error" and (out := basis.is_outside(u[:, c])).any():
             k = int(np.argmax(out))

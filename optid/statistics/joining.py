@@ -1,14 +1,14 @@
 """Sums over the parts of a record that are read separately.
 
-A part keeps the samples at its ends, and joining two adds the rows that reach across their border. Joining is
-associative and every row is added exactly once, so that parts may be joined in any tree and may be shorter than the
-lags. Sums of different trees differ by rounding alone: a sum of n products in any order is off by at most n
-rounding errors of the sum of their magnitudes (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2),
-in practice by far less, and a tree over parts by less than one pass.
+A part keeps the samples at its ends; when the sums of all parts are joined, the rows that reach across their borders
+are added. Every row is added exactly once, so that parts may be joined in any tree and may be shorter than the lags.
+Sums of different trees differ by rounding alone: a sum of n products in any order is off by at most n rounding errors
+of the sum of their magnitudes (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2), in practice by far
+less, and a tree over parts by less than one pass.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -24,25 +24,19 @@ from optid.statistics.sums import Total
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Neighbouring parts: their sums, and the samples at their ends that joining them takes.
+    """Neighbouring parts: the sums over the rows inside them, and their ends.
 
     Attributes:
-        total: sums over the rows inside.
-        first: experiment in which the run begins.
-        last: experiment in which it ends.
-        head: the first samples [u | y] of its first experiment, as many as the lags reach back, or all there are.
-        tail: the last samples [u | y] of its last experiment likewise.
+        total: the sums.
+        ends: experiment, first and last samples [u | y] of every part; as many samples as the lags reach back, or all
+            there are.
     """
 
     total: Total
-    first: int
-    last: int
-    head: Array
-    tail: Array
+    ends: tuple[tuple[int, Array, Array], ...]
 
 
-def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int
-                   ) -> Any:
+def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int) -> Any:
     """Return the sums over all parts of a stream, each added up where it is read.
 
     Args:
@@ -56,53 +50,41 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
         RankError: an experiment shorter than the lags.
     """
     check_lengths(stream.lengths, layout)
-    return stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, layout, start), threads).total
+    whole = _joined(start, [stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, start), threads)])
+    last, before = -1, np.empty((0, layout.m + layout.l))
+    for experiment, head, tail in whole.ends:
+        before = before if experiment == last else before[:0]
+        across = np.concatenate([before, head])
+        if len(across) > layout.first_row:
+            whole.total.add(make_block(across[:, : layout.m], across[:, layout.m :], None, layout))
+        last, before = experiment, _last(np.concatenate([before, tail]), layout.first_row)
+    return whole.total
 
 
 def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: Part, chunks: Iterable[Chunk]) -> Run:
-    reach = layout.first_row
+    reach, total = layout.first_row, start()
     head = tail = np.empty((0, layout.m + layout.l))
 
     def watched() -> Iterable[Sequence[Array]]:
         nonlocal head, tail
         for u, y, _ in chunks:
-            head = _first(head, np.hstack([u[:reach], y[:reach]]), reach)
-            tail = _last(tail, np.hstack([_end(u, reach), _end(y, reach)]), reach)
+            head = np.concatenate([head, np.hstack([u[:reach], y[:reach]])])[:reach]
+            tail = _last(np.concatenate([tail, np.hstack([_last(u, reach), _last(y, reach)])]), reach)
             yield u, y
 
-    total = start()
     for stretch in cut(watched(), f"{part.label}, ", layout, chunk):
         for block in blocks_of(stretch, layout, chunk):
             total.add(block)
-    return Run(total, part.experiment, part.experiment, head, tail)
+    return Run(total, ((part.experiment, head, tail),))
 
 
-def _joined(layout: Layout, start: Callable[[], Total], runs: Sequence[Run]) -> Run:
-    total, reach = start(), layout.first_row
-    total.merge(runs[0].total)
-    whole = replace(runs[0], total=total)
-    for run in runs[1:]:
+def _joined(start: Callable[[], Total], runs: Sequence[Run]) -> Run:
+    """Join runs into a new one: Dask may use those given again."""
+    total = start()
+    for run in runs:
         total.merge(run.total)
-        head, tail = whole.head, run.tail
-        if run.first == whole.last:
-            rows = np.concatenate([whole.tail, run.head])
-            if len(rows) > reach:
-                total.add(make_block(rows[:, : layout.m], rows[:, layout.m :], None, layout))
-            if whole.first == whole.last:
-                head = _first(head, run.head, reach)
-            if run.first == run.last:
-                tail = _last(whole.tail, tail, reach)
-        whole = Run(total, whole.first, run.last, head, tail)
-    return whole
+    return Run(total, tuple(end for run in runs for end in run.ends))
 
 
-def _first(before: Array, behind: Array, count: int) -> Array:
-    return np.concatenate([before, behind])[:count]
-
-
-def _last(before: Array, behind: Array, count: int) -> Array:
-    return _end(np.concatenate([before, behind]), count)
-
-
-def _end(samples: Array, count: int) -> Array:
+def _last(samples: Array, count: int) -> Array:
     return samples[max(len(samples) - count, 0) :]

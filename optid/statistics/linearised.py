@@ -122,23 +122,22 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
     Returns:
         A factor of [x0 | shared | (measured) | errors], and the number of errors.
     """
-    total, rows = np.zeros((columns, columns)), 0
+    def add(block: Array) -> None:
+        used = slice(columns - block.shape[1], None)
+        total[used, used] = add_to_root(total[used, used], block) if exact else total[used, used] + block.T @ block
+
+    total, rows, exact = np.zeros((columns, columns)), 0, method == "qr"
     for block, count in blocks:
         rows += count
-        used = slice(columns - block.shape[1], None)
-        if method == "qr":
-            total[used, used] = add_to_root(total[used, used], block)
-        else:
-            total[used, used] += block.T @ block
+        add(block)
     if gauge is not None and len(gauge):
-        span = slice(first, first + gauge.shape[1])
-        energy = np.sum(total[:, span] ** 2, axis=0) if method == "qr" else np.diag(total)[span]
+        span, extra = slice(first, first + gauge.shape[1]), np.zeros((len(gauge), columns))
+        energy = (np.sum(total**2, axis=0) if exact else np.diag(total))[span]
         sizes = np.abs(gauge)  # directions without effect get a weight of the size of the others
         lengths = sizes @ np.sqrt(energy) / np.maximum(np.sum(sizes, axis=1), 1e-300)
-        extra = np.zeros((len(gauge), columns))
         extra[:, span] = gauge * np.where(lengths > 0, lengths, 1.0)[:, None]
-        total = add_to_root(total, extra) if method == "qr" else total + extra.T @ extra
-    return total if method == "qr" else any_root_of_gram(total), rows
+        add(extra)
+    return total if exact else any_root_of_gram(total), rows
 
 
 def eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:

@@ -17,7 +17,7 @@ from optid.bases.basis import Basis
 from optid.data.reduction import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
-from optid.statistics.blocks import CHUNK, Frame, Stretch, blocks_of, check_channels, cut, records, stretches, used_rows
+from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums, Total
 
@@ -242,15 +242,15 @@ def _total(
 
         return total_of_parts(data, layout, start, chunk, threads)
 
-    def sum_part(part: Stretch) -> Total:
+    def sum_stretch(stretch: Sequence[Array]) -> Total:
         sums = start()
-        for block in blocks_of(part, layout, chunk):
+        for block in blocks_of(stretch, layout, chunk):
             sums.add(block)
         return sums
 
     total = start()
     parts = (part for name, chunks in records(data, layout, weights) for part in cut(chunks, name, layout, chunk))
-    for sums in mapped(sum_part, parts, threads):
+    for sums in mapped(sum_stretch, parts, threads):
         total.merge(sums)
     return total
 

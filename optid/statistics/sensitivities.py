@@ -18,15 +18,16 @@ zero; otherwise the initial state of the plant is unknown, and the noise starts 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.models import noise_filter
-from optid.models.layout import Layout
 from optid.models.noise_filter import DEAD, PRESENT, Filtered
-from optid.models.recursions import late_njit
+from optid.models.recursions import late_njit, lfilter
 from optid.statistics.linearised import Linearised, Method, compressed, eliminated, linearised
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
@@ -43,219 +44,184 @@ FORGOTTEN = 1e-13
 """Share of its peak below which the response to the initial state no longer informs about it."""
 
 
-def expanded(data: "Data", layout: Layout, limit: int = TABLE) -> tuple[Array, ...] | None:
-    """Return the basis functions (N, P) of all inputs side by side for every experiment, None beyond a limit.
+@dataclass(frozen=True, eq=False)
+class TransferPredictor:
+    """The predictor of a record.
 
-    Descents on short records evaluate them once instead of at every point.
-
-    Args:
-        data: the record.
-        layout: orders and bases.
-        limit: numbers that are kept at most.
-    """
-    if data.n_samples * sum(basis.size for basis in layout.bases) > limit:
-        return None
-    return tuple(np.hstack([basis.values(e.u[:, c]) for c, basis in enumerate(layout.bases)]) for e in data.experiments)
-
-
-def linearise(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, *, gauge: Array | None = None,
-              method: Method = "auto", chunk: int = CHUNK,
-              functions: Sequence[Array] | None = None) -> Linearised:
-    """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
-
-    Args:
-        data: the record; missing outputs drop out of the sum.
+    Attributes:
+        data: the record; missing outputs drop out of all sums.
         unknowns: their order.
-        point: where; C must be invertible, and A stable where D is not A.
-        gauge: (rows, p) directions of the shared unknowns that change no prediction (the scale between mu and b).
-            They are given weight in the factor, so that it is not singular; at the point they contribute nothing.
-        method: see `optid.statistics.linearised.Method`.
-        chunk: samples at a time.
-        functions: what `expanded` returned for the record.
     """
-    return linearised(lambda i: blocks(data, unknowns, point, i, functions=functions, chunk=chunk),
-                      unknowns.experiments, unknowns.memory, unknowns.shared, gauge, method)
 
+    data: "Data"
+    unknowns: TransferUnknowns
 
-def instruments(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chunk: int = CHUNK,
-                functions: Sequence[Array] | None = None) -> Array:
-    """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors] without initial states.
+    def compress(self, point: TransferPoint, gauge: Array | None = None, method: Method = "auto") -> Linearised:
+        """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
 
-    It holds the normal equations of Steiglitz-McBride and of the refined instrumental variable: in both the measured
-    output takes the place of the simulated one in the columns of a. Missing outputs are replaced by simulated ones.
-    There must be no noise filter.
-    """
-    size = unknowns.shared + unknowns.layout.na + 1
-    total = np.zeros((size, size))
-    for i in range(unknowns.experiments):
-        found = blocks(data, unknowns, point, i, functions=functions, chunk=chunk, measured=True)
-        _, rest = eliminated(compressed(found, unknowns.memory + size, "gram")[0], unknowns.memory)
-        total += rest.T @ rest
-    return total
+        Args:
+            point: where; C must be invertible, and A stable where D is not A.
+            gauge: (rows, p) directions of the shared unknowns that change no prediction (the scale between mu and b).
+            method: see `optid.statistics.linearised.Method`.
+        """
+        return linearised(partial(self.blocks, point), self.unknowns.experiments, self.unknowns.memory,
+                          self.unknowns.shared, gauge, method)
 
+    def instruments(self, point: TransferPoint) -> Array:
+        """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors], x0 eliminated.
 
-def simulate(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, chunk: int = CHUNK) -> list[Array]:
-    """Return the simulated output (N,) of every experiment; where D is A, the right-hand side of its equation."""
-    return [_simulated(data, unknowns, point, i, None, chunk) for i in range(unknowns.experiments)]
+        It holds the normal equations of Steiglitz-McBride and of the refined instrumental variable: in both the
+        measured output takes the place of the simulated one in the columns of a. Missing outputs are replaced by
+        simulated ones. There must be no noise filter.
+        """
+        n, size = self.unknowns.memory, self.unknowns.shared + self.unknowns.layout.na + 1
+        total = np.zeros((size, size))
+        for i in range(self.unknowns.experiments):
+            _, rest = eliminated(compressed(self.blocks(point, i, measured=True), n + size, "gram")[0], n)
+            total += rest.T @ rest
+        return total
 
+    def simulate(self, point: TransferPoint) -> list[Array]:
+        """Return the simulated output (N,) of every experiment; where D is A, the right-hand side of its equation."""
+        return [self._simulated(point, i) for i in range(self.unknowns.experiments)]
 
-def predict(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, x: Array) -> Filtered:
-    """Run the predictor over one experiment.
+    def _simulated(self, point: TransferPoint, index: int) -> Array:
+        count, right = self.data.experiments[index].n_samples, []
+        for start in range(0, count, CHUNK):
+            values = self._values(index, slice(start, start + CHUNK))
+            right.append(np.column_stack([part @ mu for part, mu in zip(values, point.mus)]))
+        functions, total = np.concatenate(right), np.full(count, point.offset)
+        for f, lags, b in zip(functions.T, self.unknowns.layout.lags, point.bs):
+            for lag, weight in zip(lags, b):
+                total[lag:] += weight * f[: max(count - lag, 0)]
+        if not self.unknowns.apart:
+            return total
+        total[: self.unknowns.memory] += point.x0[index][:count]
+        return lfilter([1.0], np.concatenate([[1.0], point.a]), total)
 
-    The samples that its noise filter explains are y - x, or y where D is A.
+    def predict(self, point: TransferPoint, index: int, x: Array) -> Filtered:
+        """Run the predictor over one experiment, of which `simulate` returned x (N,).
 
-    Args:
-        data: the record.
-        unknowns: their order.
-        point: as in `linearise`.
-        index: number of the experiment.
-        x: (N,) what `simulate` returned for it.
-    """
-    y = data.experiments[index].y[:, 0]
-    if unknowns.apart:
-        return noise_filter.innovations(y - x, None, point.c, point.d)
-    return noise_filter.innovations(y, x, point.c, point.a, start=unknowns.skipped)
+        The samples that its noise filter explains are y - x, or y where D is A.
+        """
+        y = self.data.experiments[index].y[:, 0]
+        if self.unknowns.apart:
+            return noise_filter.innovations(y - x, None, point.c, point.d)
+        return noise_filter.innovations(y, x, point.c, point.a, start=self.unknowns.layout.first_row)
 
+    def blocks(self, point: TransferPoint, index: int, measured: bool = False) -> Iterator[tuple[Array, int]]:
+        """Yield [x0 | shared | (measured) | errors] of every chunk of an experiment, and its number of errors.
 
-def blocks(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int, *,
-           functions: Sequence[Array] | None = None, chunk: int = CHUNK, measured: bool = False
-           ) -> Iterator[tuple[Array, int]]:
-    """Yield [x0 | shared | (measured) | errors] of every chunk of an experiment, and its number of errors.
-
-    Rows without an error are zero. The columns of x0 are left out where the initial state is forgotten.
-    """
-    e, layout, at, n = data.experiments[index], unknowns.layout, unknowns.slices, unknowns.memory
-    y, na, extra = e.y[:, 0], layout.na, layout.na if measured else 0
-    noise, x, innovations, explained = None, np.zeros(0), np.zeros(0), np.zeros(0)
-    depth = max(unknowns.nc, len(point.d))
-    if not unknowns.plain:
-        x = _simulated(data, unknowns, point, index, functions, chunk)
-        noise = predict(data, unknowns, point, index, x)
-        innovations, explained = (np.pad(signal, (depth, 0)) for signal in (noise.innovations, noise.filled))
-        explained = np.nan_to_num(explained)
-    history, kinds = np.zeros((depth, n + unknowns.shared + 1)), np.full(depth, DEAD, dtype=np.int8)
-    head, run = n, _Run(unknowns, point, index, whitened=True)
-    past = np.zeros((na + len(run.d), 1 + measured))  # outputs of the plant and measured ones through 1 / A
-    for start in range(0, len(y), chunk):
-        part = slice(start, min(start + chunk, len(y)))
-        count = part.stop - part.start
-        run.advance(e.u[part], None if functions is None else functions[index][part])
-        output = run.output() if noise is None else x[part]
-        if head and run.forgotten and np.max(np.abs(history[:, :n]), initial=0.0) <= FORGOTTEN * run.peak:
-            head, history = 0, history[:, n:]
-        block = np.empty((depth + count, head + unknowns.shared + extra + 1))
-        if depth:
+        Rows without an error are zero. The columns of x0 are left out where the initial state is forgotten.
+        """
+        unknowns, at, n, na = self.unknowns, self.unknowns.slices, self.unknowns.memory, self.unknowns.layout.na
+        y, x = self.data.experiments[index].y[:, 0], self._simulated(point, index)
+        found, depth = self.predict(point, index, x), max(unknowns.nc, len(point.d))
+        innovations = np.concatenate([np.zeros(depth), found.innovations])
+        explained = np.concatenate([np.zeros(depth), found.filled])
+        explained[np.isnan(explained)] = 0.0
+        width = n + unknowns.shared + measured * na + 1
+        history, kinds = np.zeros((depth, width)), np.full(depth, DEAD, dtype=np.int8)
+        head, run = n, _Run(unknowns, point)
+        past = np.zeros((na + len(run.d), 1 + measured))  # outputs of the plant and measured ones through 1 / A
+        for start in range(0, len(y), CHUNK):
+            part = slice(start, min(start + CHUNK, len(y)))
+            count = part.stop - part.start
+            run.advance(np.hstack(self._values(index, part)))
+            if head and run.forgotten and np.max(np.abs(history[:, :n]), initial=0.0) <= FORGOTTEN * run.peak:
+                head, history = 0, history[:, n:]
+            block = np.empty((depth + count, history.shape[1]))
             block[:depth] = history
-        rows = block[depth:]
-        for i in range(head):
-            rows[:, i] = run.shifted(run.impulse, i)
-        if unknowns.apart and na:
-            lines = np.empty((len(past) + count, 1 + measured))
-            lines[: len(past)], lines[len(past) :, 0] = past, output
-            if measured:
-                lines[len(past) :, 1] = np.where(np.isnan(y[part]), output, y[part])
-            all_pole(point.a, lines, len(past))
-            past, lines = lines[count:], through(run.d, lines)
-            for i in range(1, na + 1):
-                rows[:, head + i - 1] = -lines[na - i : na - i + count, 0]
+            rows = block[depth:]
+            for i in range(head):
+                rows[:, i] = run.shifted(run.impulse, i)
+            if unknowns.apart:
+                lines = np.empty((len(past) + count, 1 + measured))
+                lines[: len(past)], lines[len(past) :, 0] = past, x[part]
                 if measured:
-                    rows[:, head + unknowns.shared + i - 1] = -lines[na - i : na - i + count, 1]
-        elif noise is not None:
-            for i in range(1, na + 1):
-                rows[:, head + i - 1] = -explained[depth + start - i :][:count]
-        for c, lags in enumerate(layout.lags):
-            if unknowns.free[c]:
-                rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
-            for j, lag in enumerate(lags):
-                rows[:, head + at[f"b{c}"].start + j] = run.shifted_function(c, lag)
-        if unknowns.constant:
-            rows[:, head + at["offset"].start] = run.shifted(run.step, 0)
-        if noise is None:
-            rows[:, -1] = output - y[part]
-            present = np.isfinite(y[part])
-        else:
-            for name, signal, sign in (("c", innovations, 1.0), ("d", explained, -1.0)):
+                    lines[len(past) :, 1] = np.where(np.isnan(y[part]), x[part], y[part])
+                _all_pole(point.a, lines, len(past))
+                past, lines = lines[count:], _through(run.d, lines)
+            else:
+                lines = explained[depth + start - na : depth + part.stop, None]
+            for line, first in zip(lines.T, (head, head + unknowns.shared)):
+                for i in range(na):
+                    rows[:, first + i] = -line[na - 1 - i :][:count]
+            for c, lags in enumerate(unknowns.layout.lags):
+                if unknowns.free[c]:
+                    rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
+                f = run.table[:, run.spans[c]] @ point.mus[c]
+                for j, lag in enumerate(lags):
+                    rows[:, head + at[f"b{c}"].start + j] = f[run.n - lag :][:count]
+            if unknowns.constant:
+                rows[:, head + at["offset"].start] = run.shifted(run.step, 0)
+            for name, signal in (("c", innovations), ("d", -explained)):
                 for i in range(at[name].stop - at[name].start):
-                    rows[:, head + at[name].start + i] = sign * signal[depth + start - i - 1 :][:count]
-            rows[:, -1] = -noise.innovations[part]
-            state = np.concatenate([kinds, noise.state[part]])
-            late_njit(_mixed)(block, state, np.ascontiguousarray(point.c), np.ascontiguousarray(point.d), depth)
+                    rows[:, head + at[name].start + i] = signal[depth + start - i - 1 :][:count]
+            rows[:, -1] = -found.innovations[part]
+            state = np.concatenate([kinds, found.state[part]])
+            if depth:
+                late_njit(_mixed)(block, state, np.ascontiguousarray(point.c), np.ascontiguousarray(point.d), depth)
             history, kinds, present = block[count:].copy(), state[count:], state[depth:] == PRESENT
-        rows[~present] = 0.0
-        yield rows, int(np.count_nonzero(present))
+            rows[~present] = 0.0
+            yield rows, int(np.count_nonzero(present))
+
+    def _values(self, index: int, part: slice) -> Sequence[Array]:
+        """Basis functions (T, P) of every input in a part of an experiment."""
+        if self._kept is not None:
+            return [values[part] for values in self._kept[index]]
+        u = self.data.experiments[index].u[part]
+        return [basis.values(u[:, c]) for c, basis in enumerate(self.unknowns.layout.bases)]
+
+    @cached_property
+    def _kept(self) -> list[list[Array]] | None:
+        """Basis functions that descents on short records evaluate once instead of at every point."""
+        bases = self.unknowns.layout.bases
+        if self.data.n_samples * sum(basis.size for basis in bases) > TABLE:
+            return None
+        return [[basis.values(e.u[:, c]) for c, basis in enumerate(bases)] for e in self.data.experiments]
 
 
 class _Run:
-    """Basis functions, the constant and an impulse through 1/A (apart) and D, chunk by chunk, with n samples before."""
+    """Basis functions, the constant and an impulse through D/A (one where D is A), chunk by chunk, n samples before."""
 
-    def __init__(self, unknowns: TransferUnknowns, point: TransferPoint, index: int, whitened: bool) -> None:
-        self.unknowns, self.point, self.x0 = unknowns, point, point.x0[index]
+    def __init__(self, unknowns: TransferUnknowns, point: TransferPoint) -> None:
+        self.unknowns, self.point, self.n = unknowns, point, unknowns.layout.first_row
         edges = np.cumsum([0, *(basis.size for basis in unknowns.layout.bases)])
         self.spans = [slice(int(i), int(j)) for i, j in zip(edges[:-1], edges[1:])]
         self.step, self.impulse = int(edges[-1]), int(edges[-1]) + 1
-        self.d = point.d if whitened and unknowns.apart else np.zeros(0)
-        self.n = unknowns.layout.first_row
-        self.history = np.zeros((self.n + len(self.d), self.impulse + 1))
-        self.table, self.functions = self.history, []
+        self.d = point.d if unknowns.apart else np.zeros(0)
+        self.history = self.table = np.zeros((self.n + len(self.d), self.impulse + 1))
         self.count, self.started, self.peak, self.forgotten = 0, False, 0.0, False
 
-    def advance(self, u: Array, functions: Array | None = None) -> None:
-        """Filter the next chunk (T, m) of the input, or its basis functions."""
-        past, self.count = len(self.history), len(u)
+    def advance(self, values: Array) -> None:
+        """Filter the basis functions (T, P) of the next chunk."""
+        past, self.count = len(self.history), len(values)
         if self.unknowns.apart and self.started and not self.forgotten:
             tail = float(np.max(np.abs(self.history[:, self.impulse]), initial=0.0))
             self.forgotten = tail <= FORGOTTEN * self.peak
         table = np.empty((past + self.count, self.impulse + 1))
-        table[:past] = self.history
-        if functions is not None:
-            table[past:, : self.step] = functions
-        for c, (basis, span) in enumerate(zip(self.unknowns.layout.bases if functions is None else (), self.spans)):
-            table[past:, span] = basis.values(u[:, c])
+        table[:past], table[past:, : self.step] = self.history, values
         table[past:, self.step], table[past:, self.impulse] = 1.0, 0.0
         table[past, self.impulse] += not self.started
         if self.unknowns.apart:
-            all_pole(self.point.a, table, past)
+            _all_pole(self.point.a, table, past)
             self.peak = max(self.peak, float(np.max(np.abs(table[:, self.impulse]))))
-        self.started, self.history, self.table = True, table[len(table) - past :], through(self.d, table)
-        self.functions = [self.table[:, span] @ mu for span, mu in zip(self.spans, self.point.mus)]
+        self.started, self.history, self.table = True, table[len(table) - past :], _through(self.d, table)
 
-    def output(self) -> Array:
-        """Return the output of the plant (T,), or the right-hand side of its equation where nothing is filtered."""
-        output = self.point.offset * self.shifted(self.step, 0)
-        for c, lags in enumerate(self.unknowns.layout.lags):
-            for b, lag in zip(self.point.bs[c], lags):
-                output += b * self.shifted_function(c, lag)
-        for i, value in enumerate(self.x0 if not self.forgotten else ()):
-            output += value * self.shifted(self.impulse, i)
-        return output
-
-    def shifted(self, column: int, lag: int) -> Array:
-        """Return a filtered signal of the chunk, delayed."""
-        return self.table[self.n - lag : self.n - lag + self.count, column]
-
-    def shifted_function(self, c: int, lag: int) -> Array:
-        """Return f_c, filtered and delayed."""
-        return self.functions[c][self.n - lag : self.n - lag + self.count]
+    def shifted(self, columns: int | slice, lag: int) -> Array:
+        """Return filtered signals of the chunk, delayed."""
+        return self.table[self.n - lag : self.n - lag + self.count, columns]
 
     def through_numerator(self, c: int) -> Array:
         """Return B_c eta_c, filtered, (T, P_c)."""
         total = np.zeros((self.count, self.spans[c].stop - self.spans[c].start))
         for b, lag in zip(self.point.bs[c], self.unknowns.layout.lags[c]):
-            total += b * self.table[self.n - lag : self.n - lag + self.count, self.spans[c]]
+            total += b * self.shifted(self.spans[c], lag)
         return total
 
 
-def _simulated(data: "Data", unknowns: TransferUnknowns, point: TransferPoint, index: int,
-               functions: Sequence[Array] | None, chunk: int) -> Array:
-    u, run, found = data.experiments[index].u, _Run(unknowns, point, index, whitened=False), []
-    for start in range(0, len(u), chunk):
-        part = slice(start, start + chunk)
-        run.advance(u[part], None if functions is None else functions[index][part])
-        found.append(run.output())
-    return np.concatenate(found)
-
-
-def through(d: Array, table: Array) -> Array:
+def _through(d: Array, table: Array) -> Array:
     """Return the columns of a table (nd + T, K) through D (T, K): its first rows are history."""
     total = table[len(d) :]
     for i, value in enumerate(d, start=1):
@@ -263,14 +229,8 @@ def through(d: Array, table: Array) -> Array:
     return total
 
 
-def all_pole(a: Array, table: Array, first: int) -> None:
-    """Filter every column of a table (first + T, K) by 1 / A in place, given its first rows already filtered.
-
-    Args:
-        a: (na,) coefficients of A without the leading one, na <= first.
-        table: C-contiguous.
-        first: rows of history.
-    """
+def _all_pole(a: Array, table: Array, first: int) -> None:
+    """Filter the columns of a table (first + T, K) by 1 / A in place; its first rows, at least na, are filtered."""
     if len(a):
         late_njit(_march)(np.ascontiguousarray(a), table, first)
 

@@ -15,11 +15,13 @@ class Unknowns:
     Attributes:
         experiments: number of experiments.
         memory: size of an initial state.
+        innovations: whether the errors are those of predictions rather than of simulations.
         shapes: shape of every shared part in the order of x.
     """
 
     experiments: int
     memory: int
+    innovations: bool
     shapes: dict[str, tuple[int, ...]]
 
     @cached_property
@@ -106,19 +108,14 @@ class TransferUnknowns(Unknowns):
         return self.nd is not None
 
     @property
-    def plain(self) -> bool:
-        """Whether there is no noise filter: C = D = 1."""
-        return self.nc == 0 and self.nd == 0
+    def innovations(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether there is a noise filter: C and D are not both one."""
+        return (self.nc, self.nd) != (0, 0)
 
     @property
     def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Size n of an initial state among the unknowns."""
         return self.layout.first_row if self.apart else 0
-
-    @property
-    def skipped(self) -> int:
-        """First samples of a record whose innovation counts as zero."""
-        return 0 if self.apart else self.layout.first_row
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]

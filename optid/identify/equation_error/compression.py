@@ -129,9 +129,9 @@ class EquationError:
         rest = np.sum((root[:, :n] @ self.regression(values) - root[:, n:]) ** 2, axis=0)
         return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
 
-    def spread(self, theta: np.ndarray, moves: np.ndarray) -> Spread:
+    def spread(self, z: np.ndarray, moves: np.ndarray) -> Spread:
         """Return the scatter under white equation errors."""
-        return white_spread(self.statistics, theta, moves)
+        return white_spread(self, z, moves)
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
               gauge: str, flip: bool = True) -> HammersteinTF:

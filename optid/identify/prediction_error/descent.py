@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,20 +47,27 @@ class Criterion(ABC):
         data: the record.
         unknowns: the order of x.
         gauge: how the scale between mu and b is fixed.
-        energy: sum of squares of the outputs about their means.
+        weight: (l, l) weight of the errors.
         unit: what one unit of the sum of squares is in units of the record.
     """
 
     data: Data
     unknowns: Unknowns
     gauge: str
-    energy: float
+    weight: Array
     unit: float = 1.0
 
     @property
-    @abstractmethod
     def errors(self) -> str:
-        """What they are called: "simulation errors" or "prediction errors"."""
+        """What they are called."""
+        return "prediction errors" if self.unknowns.innovations else "simulation errors"
+
+    @cached_property
+    def energy(self) -> float:
+        """Weighted sum of squares of the outputs about their means."""
+        y = np.vstack([e.y for e in self.data.experiments])
+        y = np.nan_to_num(y - np.nanmean(y, axis=0))
+        return float(np.sum((y @ self.weight) * y))
 
     @abstractmethod
     def key(self, name: str, number: int) -> str:

@@ -5,7 +5,9 @@ nonlinearities that belong to a given A follow by a few steps in which A is held
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
@@ -17,10 +19,9 @@ from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
-from optid.models.roots import contained, roots_of
+from optid.models.roots import contained, roots_of, with_roots
 from optid.statistics.expansion import expand
 from optid.statistics.regression import collect
-from optid.statistics.sensitivities import instruments
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
 from optid.structures.lifted_regression import lifted_problem, positions
@@ -35,26 +36,19 @@ RADIUS = 0.98
 """Poles of a start lie inside this radius, so that its simulation forgets within the record."""
 
 
-def plant_starts(criterion: TransferErrors, count: int, seed: int) -> Iterator[tuple[str, Array]]:
-    """Yield starts one by one, each estimated when it is asked for: those of other methods first, then moved poles."""
-    at, na = criterion.unknowns.slices["a"], criterion.unknowns.layout.na
+def plant_starts(criterion: TransferErrors, seed: int) -> Iterator[tuple[str, Array]]:
+    """Yield starts, each estimated when it is asked for: those of other methods, then moved poles again and again."""
     base = arx_start(criterion)
     yield "ARX", base.x
-    done = 1
-    for name in ("Steiglitz-McBride", "instruments", "subspace"):
-        if done == count:
-            return
-        if name == "subspace":
-            a = _subspace(criterion.data, criterion.unknowns.layout)
-            one = None if a is None else with_poles(criterion, base.x, a, name)
-        else:
-            one = iterated(criterion, base.x, name)
-        if one is not None:
-            done += 1
+    for name in ("Steiglitz-McBride", "instruments"):
+        if (one := iterated(criterion, base.x, name)) is not None:
             yield name, one.x
+    if (a := _subspace(criterion.data, criterion.unknowns.layout)) is not None:
+        yield "subspace", with_poles(criterion, base.x, a).x
     rng = np.random.default_rng(seed)
-    for i in range(1, (count - done if na else 0) + 1):
-        yield f"perturbed {i}", with_poles(criterion, base.x, _perturbed(rng, base.x[at]), "").x
+    for i in count(1) if criterion.unknowns.layout.na else ():
+        a = _perturbed(rng, base.x[criterion.unknowns.slices["a"]])
+        yield f"perturbed {i}", with_poles(criterion, base.x, a).x
 
 
 def arx_start(criterion: TransferErrors) -> Descent:
@@ -62,44 +56,47 @@ def arx_start(criterion: TransferErrors) -> Descent:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # rows lost here are not lost to the simulation error
-            point = equation_error(criterion.data, criterion.unknowns)
+            point = equation_error(criterion)
     except OptidError:
         point = _guess(criterion.unknowns)
     x = criterion.normalised(criterion.unknowns.pack(point))
-    return with_poles(criterion, x, contained(point.a, RADIUS), "ARX")
+    return with_poles(criterion, x, contained(point.a, RADIUS))
 
 
-def equation_error(data: Data, unknowns: TransferUnknowns, noise: int = 0) -> TransferPoint:
-    """Return the rank-one least squares of the equation error (ARX).
+def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | None = None) -> TransferPoint:
+    """Return the rank-one least squares of the equation error (ARX); initial states are zero.
 
     Args:
-        data: the record, in the units of the unknowns.
-        unknowns: what is wanted; initial states are zero.
-        noise: lags of a last channel of the record that holds innovations, whose coefficients are those of C.
+        criterion: record and unknowns.
+        innovations: (N,) of every experiment, whose coefficients are those of C; None for a C of one.
 
     Raises:
         StructureError, RankError: the record does not determine them.
+        DataError: innovations of zero.
     """
-    layout = unknowns.layout
-    if noise:
-        layout = Layout(layout.na, (*layout.nb, noise), (*layout.nk, 1), fitted_bases(data, (*layout.bases, Linear())),
-                        layout.outputs, tuple(data.inputs))
+    data, unknowns, layout = criterion.data, criterion.unknowns, criterion.unknowns.layout
+    if innovations is not None:
+        names = [*data.inputs, " ".join(["innovation", *data.inputs, *data.outputs])]  # a name that no channel has
+        us = [np.column_stack([one.u, e]) for one, e in zip(data.experiments, innovations)]
+        data = Data(us, [one.y for one in data.experiments], data.dt, names, list(data.outputs))
+        layout = replace(layout, nb=(*layout.nb, unknowns.nc), nk=(*layout.nk, 1), inputs=tuple(names),
+                         bases=fitted_bases(data, (*layout.bases, Linear())))
     na, point = layout.na, minimise(lifted_problem(collect(data, layout), positions(layout)), count=4).point
     pairs = [(np.array(mu, dtype=float), np.ravel(np.array(b, dtype=float))) for mu, b in zip(point.mus, point.bs)]
-    c = pairs.pop() if noise else (np.ones(1), np.zeros(unknowns.nc))
+    c = pairs.pop() if innovations is not None else (np.ones(1), np.zeros(unknowns.nc))
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
     x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
     return TransferPoint(a, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), float(point.w[na]), x0,
                          contained(c[0][0] * c[1], RADIUS), a)
 
 
-def with_poles(criterion: TransferErrors, x: Array, a: Array, start: str) -> Descent:
+def with_poles(criterion: TransferErrors, x: Array, a: Array) -> Descent:
     """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
     unknowns, moved = criterion.unknowns, x.copy()
     moved[unknowns.slices["a"]] = a
     held = np.zeros(unknowns.shared, dtype=bool)
     held[unknowns.slices["a"]] = True
-    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3, start=start)
+    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3)
 
 
 def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
@@ -113,7 +110,7 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
     p, na = unknowns.shared, unknowns.layout.na
     at, best = unknowns.slices["a"], None
     for _ in range(PASSES if na else 0):
-        gram = instruments(criterion.data, unknowns, unknowns.unpack(x), functions=criterion.functions)
+        gram = criterion.instruments(unknowns.unpack(x))
         regressors = np.arange(p)
         regressors[at] = p + np.arange(na)
         tested = regressors if method == "Steiglitz-McBride" else np.arange(p)
@@ -126,7 +123,7 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
         x[:p] += step
         if not np.all(np.isfinite(x)):
             break
-        found = with_poles(criterion, x, contained(x[at], 0.9999), method)
+        found = with_poles(criterion, x, contained(x[at], 0.9999))
         settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
         best = found if best is None or found.value < best.value else best
         if settled:
@@ -151,8 +148,8 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
         poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
     except (OptidError, np.linalg.LinAlgError):
         return None
-    a = np.asarray(np.real(np.poly(poles))[1:], dtype=float)
-    return contained(a, RADIUS) if a.size == layout.na and np.all(np.isfinite(a)) else None
+    a = with_roots(poles, layout.na)
+    return contained(a, RADIUS) if np.all(np.isfinite(a)) else None
 
 
 def _guess(unknowns: TransferUnknowns) -> TransferPoint:
@@ -163,7 +160,7 @@ def _guess(unknowns: TransferUnknowns) -> TransferPoint:
         line = np.linalg.lstsq(basis.values(points), points - points.mean(), rcond=None)[0]
         mus.append(line if free else np.ones(1))
     bs = tuple(np.full(nb, 1 / np.sqrt(nb)) for nb in layout.nb)
-    a = np.asarray(np.atleast_1d(np.poly(np.full(layout.na, 0.5)))[1:], dtype=float)
+    a = with_roots(np.full(layout.na, 0.5), layout.na)
     return TransferPoint(a, tuple(mus), bs, 0.0, np.zeros((unknowns.experiments, unknowns.memory)))
 
 
@@ -175,8 +172,8 @@ def _perturbed(rng: np.random.Generator, a: Array) -> Array:
         radius = 1 - np.clip((1 - np.abs(upper)) * np.exp(rng.normal(0, 1.0, upper.size)), 1 - RADIUS, 1.0)
         angle = np.abs(np.angle(upper) + rng.normal(0, 0.1, upper.size))
         moved = radius * np.exp(1j * np.where(np.imag(upper) > 0, angle, np.angle(upper)))
-        return np.real(np.poly(np.concatenate([moved, np.conj(moved[np.imag(upper) > 0])])))[1:]
+        return with_roots(np.concatenate([moved, np.conj(moved[np.imag(upper) > 0])]), len(a))
     pairs = len(a) // 2
     moved = RADIUS * np.sqrt(rng.random(pairs)) * np.exp(1j * np.pi * rng.random(pairs) ** 2)
     real = RADIUS * np.sqrt(rng.random(len(a) - 2 * pairs))
-    return np.real(np.poly(np.concatenate([moved, np.conj(moved), real])))[1:]
+    return with_roots(np.concatenate([moved, np.conj(moved), real]), len(a))

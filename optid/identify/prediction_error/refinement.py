@@ -35,6 +35,9 @@ INSIDE = 1e-6
 NOWHERE = 1e-9
 """Relative violation that is rounding; a step to more than that pays for it."""
 
+ROUNDING = 1e-14
+"""Share of the energy of the record below which differences of sums of squares are rounding."""
+
 PATIENCE = 5
 """Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
 
@@ -61,19 +64,17 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
         raise RankError("no start has a run that stays within its range; use another order or another basis")
     figures = {**figures, "Gauss-Newton steps": found.steps}
     if here.program.user_constraints:
-        return (yield from _constrained(fit, here, figures))
+        return (yield from _constrained(here, figures))
     solution = yield here.program
     if not solution.has_point:
         return None
-    gain = here.at.value - here.at.after(fit.places.pack(solution.values) - here.x)
-    status, reason = _judged(solution, gain, here.at.value, fit.floor)
-    if not found.converged:
-        status, reason = Status.LIMIT, found.reason
-    return _evidence(fit, here, status, reason, {**figures, "programmes": 1})
+    verdict = here.judged(solution, CONFIRMED) if found.converged else (Status.LIMIT, found.reason)
+    return here.evidence(*verdict, {**figures, "programmes": 1})
 
 
 @dataclass(frozen=True, eq=False)
 class _Iterate:
+    fit: TangentFit
     x: Array
     at: Linearised
     program: Program
@@ -85,33 +86,54 @@ class _Iterate:
         x = fit.criterion.normalised(x)
         at = fit.criterion.linearise(x)
         program = fit.pose(x, at, 0.0)
-        if not program.user_constraints:
-            return cls(x, at, program, 0.0, 0.0)
-        outside = violation(program)
+        outside = violation(program) if program.user_constraints else 0.0
         amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
                      for group in program.user_constraints.values() for member in group)
-        return cls(x, at, program, outside, amount if outside > NOWHERE else 0.0)
+        return cls(fit, x, at, program, outside, amount if outside > NOWHERE else 0.0)
+
+    def moved(self, x: Array) -> "_Iterate | None":
+        """Return the iterate at x, None where it is inadmissible or its gauge cannot be reached."""
+        try:
+            return _Iterate.of(self.fit, x) if self.fit.criterion.admissible(x) else None
+        except StructureError:
+            return None
 
     def merit(self, weight: float) -> float:
         return self.at.value + weight * self.amount
 
+    def step(self, solution: Solution) -> Array:
+        return self.fit.places.pack(solution.values) - self.x
 
-def _reached(fit: TangentFit, x: Array) -> _Iterate | None:
-    """Return the iterate at x, None where it is inadmissible or its gauge cannot be reached."""
-    try:
-        return _Iterate.of(fit, x) if fit.criterion.admissible(x) else None
-    except StructureError:
-        return None
+    def gain(self, step: Array) -> float:
+        """By how much a step lowers the sum of squares of the linear errors."""
+        return self.at.value - self.at.after(step)
+
+    def negligible(self, gain: float, share: float) -> bool:
+        return abs(gain) <= share * self.at.value + ROUNDING * self.fit.criterion.energy
+
+    def judged(self, solution: Solution, share: float) -> tuple[Status, str]:
+        """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
+        if solution.status not in (Status.OPTIMAL, Status.LOCAL) and not _near(solution):
+            return solution.status, solution.reason
+        gain = self.gain(self.step(solution))
+        if self.negligible(gain, share):
+            return Status.LOCAL, NO_BOUND.format(self.fit.criterion.errors)
+        return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
+                                   f"{abs(gain) / max(self.at.value, 1e-300):.0e} of its value")
+
+    def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
+        bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
+        model, value = self.fit.recover(self.fit.places.values(self.x)), self.fit.criterion.unit * self.at.value
+        return Evidence(model, value, bound, status, reason, figures)
 
 
-def _constrained(fit: TangentFit, here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
+def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
-    floor = fit.floor
     previous: _Iterate | None = None
     damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, STEPS + 1):
-        solution = yield here.program if not damping else fit.pose(here.x, here.at, damping)
+        solution = yield here.program if not damping else here.fit.pose(here.x, here.at, damping)
         if not solution.has_point:
             if (solution.status is Status.INFEASIBLE and previous is None) or damping > 1e3:
                 return None
@@ -119,17 +141,15 @@ def _constrained(fit: TangentFit, here: _Iterate, figures: Mapping[str, Any]) ->
                 here, previous = previous, None
             damping = max(100.0 * damping, 1e-6)  # a nearer point, and a better conditioned programme
             continue
-        reached = fit.places.pack(solution.values)
-        gain = here.at.value - here.at.after(reached - here.x)
+        step = here.step(solution)
+        gain, new = here.gain(step), here.moved(here.x + step)
         weight = max(weight, 2.0 * _largest_dual(here.program, solution))
-        new = _reached(fit, reached)
         idle += not damping and abs(gain) <= STALLED * here.at.value
         share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
         last = abs(gain) if not damping else last
-        if not damping and abs(gain) <= share * here.at.value + floor and here.outside <= INSIDE:
-            status, reason = _judged(solution, gain, here.at.value, floor, share)
+        if not damping and here.negligible(gain, share) and here.outside <= INSIDE:
             best = here if new is None or new.outside > INSIDE else new
-            return _evidence(fit, best, status, reason, {**figures, "programmes": count + more})
+            return best.evidence(*here.judged(solution, share), {**figures, "programmes": count + more})
         expected = gain + weight * here.amount
         fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
         if new is not None and (not entered or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
@@ -139,21 +159,20 @@ def _constrained(fit: TangentFit, here: _Iterate, figures: Mapping[str, Any]) ->
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
-                shorter, more = (yield from _shortened(fit, here, weight)), more + 1
-                if shorter is not None:
-                    previous, here, damping, growth = here, shorter, 0.0, 4.0
-                    entered = entered or here.outside <= INSIDE
-                    continue
-                reason = f"no step descends; the last undamped one promised {last / here.at.value:.0e} of the value"
-                return (yield from _ended(fit, here, reason, {**figures, "programmes": count + more + 1}))
+                shorter, more = (yield from _shortened(here, weight)), more + 1
+                if shorter is None:
+                    figures = {**figures, "programmes": count + more + 1}
+                    return (yield from _ended(here, "no step descends", last, figures))
+                previous, here, damping, growth = here, shorter, 0.0, 4.0
+                entered = entered or here.outside <= INSIDE
+                continue
         if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
             damping = 0.0  # only an undamped programme can confirm
-    reason = (f"{STEPS} programmes did not suffice; the last undamped one promised {last / here.at.value:.0e} of the "
-              "value")
-    return (yield from _ended(fit, here, reason, {**figures, "programmes": STEPS + more + 1}))
+    reason = f"{STEPS} programmes did not suffice"
+    return (yield from _ended(here, reason, last, {**figures, "programmes": STEPS + more + 1}))
 
 
-def _shortened(fit: TangentFit, here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
+def _shortened(here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
     """Take a part of the undamped step: however damped, programmes end on a boundary that may be curved outwards.
 
     A part of the way there is off it, where the point to start from is.
@@ -161,36 +180,21 @@ def _shortened(fit: TangentFit, here: _Iterate, weight: float) -> Generator[Prog
     solution = yield here.program
     if not solution.has_point:
         return None
-    step = fit.places.pack(solution.values) - here.x
+    step = here.step(solution)
     for part in 0.5 ** np.arange(1, PARTS + 1):
-        new = _reached(fit, here.x + part * step)
-        gain = here.at.value - here.at.after(part * step)
+        new, gain = here.moved(here.x + part * step), here.gain(part * step)
         if new is not None and gain > 0 and here.merit(weight) - new.merit(weight) >= 1e-3 * gain:
             return new
     return None
 
 
-def _ended(fit: TangentFit, here: _Iterate, reason: str, figures: Mapping[str, Any]) -> Procedure:
-    """Judge where the steps ended by one more undamped programme; it may promise what a curved boundary does."""
+def _ended(here: _Iterate, reason: str, last: float, figures: Mapping[str, Any]) -> Procedure:
+    """Judge where the iteration stopped by one more undamped programme."""
     solution = yield here.program
-    floor = fit.floor
-    if not solution.has_point or here.outside > INSIDE:
-        return _evidence(fit, here, Status.LIMIT, reason, figures)
-    gain = here.at.value - here.at.after(fit.places.pack(solution.values) - here.x)
-    if abs(gain) > STALLED * here.at.value + floor:
-        return _evidence(fit, here, Status.LIMIT, reason, figures)
-    return _evidence(fit, here, *_judged(solution, gain, here.at.value, floor, STALLED), figures)
-
-
-def _judged(solution: Solution, gain: float, value: float, floor: float, share: float = CONFIRMED
-            ) -> tuple[Status, str]:
-    """What a back end's answer to the last programme makes of its reference: it must have been solved, and stay."""
-    if solution.status not in (Status.OPTIMAL, Status.LOCAL) and not _near(solution):
-        return solution.status, solution.reason
-    if abs(gain) > share * value + floor:
-        return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
-                                   f"{abs(gain) / max(value, 1e-300):.0e} of its value")
-    return Status.LOCAL, ""
+    if solution.has_point and here.outside <= INSIDE and here.negligible(here.gain(here.step(solution)), STALLED):
+        return here.evidence(*here.judged(solution, STALLED), figures)
+    reason = f"{reason}; the last undamped one promised {last / here.at.value:.0e} of the value"
+    return here.evidence(Status.LIMIT, reason, figures)
 
 
 def _near(solution: Solution) -> bool:
@@ -201,13 +205,6 @@ def _near(solution: Solution) -> bool:
     found = solution.residuals
     return found is not None and solution.status is Status.INACCURATE and (
         max(found.violation, found.stationarity) <= INSIDE and found.complementarity <= STALLED)
-
-
-def _evidence(fit: TangentFit, here: _Iterate, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
-    unknown = NO_BOUND.format(fit.criterion.errors)
-    bound = Bound.none(unknown)
-    reason = unknown if status is Status.LOCAL else reason
-    return Evidence(fit.model(here.x), fit.criterion.unit * here.at.value, bound, status, reason, figures)
 
 
 def _largest_dual(program: Program, solution: Solution) -> float:

@@ -42,18 +42,20 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
     Raises:
         RankError: no start has a stable predictor.
     """
-    part = _part(criterion)
-    found = best_of(part, starts(part), enough=SUFFICIENT if criterion.unknowns.plain else None)
+    part, filtered = _part(criterion), criterion.unknowns.innovations
+    found = best_of(part, starts(part), enough=None if filtered else SUFFICIENT)
     if not found:
-        raise RankError(f"no start has a stable {'simulation' if criterion.unknowns.plain else 'predictor'}; use other "
-                        "orders")
+        raise RankError(f"no start has a stable {'predictor' if filtered else 'simulation'}; use other orders")
+    while True:  # what arrived as far as starts are compared may still end at the border of stability
+        best, x = found[0], np.zeros(criterion.unknowns.size)
+        x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
+        final = descend(criterion, best.x if part is criterion else x, start=best.start)
+        if best.border or not final.border or len(found) == 1 or found[1].border:
+            break
+        found = [*found[1:], replace(best, border=True)]
     agreed, sentence = agreement(found, 1e-12 * part.energy)
-    best = found[0]
-    x = np.zeros(criterion.unknowns.size)
-    x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
-    final = descend(criterion, best.x if part is criterion else x, start=best.start)
     figures: dict[str, Any] = {"starts": sentence}
-    if not criterion.unknowns.plain:
+    if filtered:
         figures["starts that agree"] = agreed
     figures[f"{criterion.errors} of the starts"] = criterion.unit * np.array(
         sorted((one.value for one in found), reverse=True))
@@ -66,17 +68,12 @@ def _part(criterion: TransferErrors) -> TransferErrors:
     data = criterion.data
     if data.n_samples <= 2 * SEARCH:
         return criterion
-    longest = int(np.argmax([e.n_samples for e in data.experiments]))
-    size = data.experiments[longest].n_samples
-    if size < SEARCH:  # many short experiments
-        kept, total = [], 0
-        for i, e in enumerate(data.experiments):
-            if total < SEARCH:
-                kept, total = [*kept, i], total + e.n_samples
-        cut = data.select(experiments=kept)
+    sizes = [e.n_samples for e in data.experiments]
+    if max(sizes) < SEARCH:  # many short experiments
+        cut = data.select(experiments=list(range(int(np.searchsorted(np.cumsum(sizes), SEARCH)) + 1)))
     else:
-        first = (size - SEARCH) // 2
-        cut = data.select(experiments=[longest]).window(first, first + SEARCH)
+        first = (max(sizes) - SEARCH) // 2
+        cut = data.select(experiments=[int(np.argmax(sizes))]).window(first, first + SEARCH)
     if 2 * _complete(cut) < _complete(data):
         return criterion
     return replace(criterion, data=cut, unknowns=replace(criterion.unknowns, experiments=cut.n_experiments))
@@ -105,7 +102,7 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
         for radius in PULLS:
             pulled = x[at] if radius == 1.0 else contained(x[at], radius)
             if _poles_obey(fit, np.concatenate([pulled, x[at.stop :]]), one.at):
-                again = one if radius == 1.0 else with_poles(replace(criterion, gauge="norm"), x, pulled, one.start)
+                again = one if radius == 1.0 else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
     return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)

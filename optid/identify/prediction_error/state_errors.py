@@ -51,11 +51,6 @@ class StateErrors(Criterion):
     checks: tuple[Callable[[Any], str], ...] = ()
     gauge: ClassVar[str] = "norm"
 
-    @property
-    def errors(self) -> str:
-        """What they are called."""
-        return "prediction errors" if self.unknowns.innovations else "simulation errors"
-
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input, or of a family of feedback functions."""
         x = self.unknowns.expansion
@@ -66,13 +61,6 @@ class StateErrors(Criterion):
             word = {"nu": "mu feedback", "e": "b feedback"}[name]
             return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
         return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
-
-    @cached_property
-    def energy(self) -> float:
-        """Weighted sum of squares of the outputs about their means."""
-        y = np.vstack([e.y for e in self.data.experiments])
-        y = np.nan_to_num(y - np.nanmean(y, axis=0))
-        return float(np.sum((y @ self.weight) * y))
 
     @cached_property
     def limits(self) -> tuple[Any, ...] | None:

@@ -74,12 +74,12 @@ class CompressedStates(CompressedErrors):
         """The sum of squares in z."""
         matrix, errors = self.at.whole
         root, errors = np.vstack([matrix, self.free]), np.append(errors, np.zeros(len(self.free)))
-        return LeastSquares(root, root @ self.reference - errors, self.at.remainder, float(self.energy[0]))
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
 
     def one_step_fit(self, values: object) -> None:
         """Return nothing: the errors are those of the criterion."""
 
-    def spread(self, theta: Array, moves: Array) -> Spread:
+    def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter under the noise that the errors at the iterate show."""
         criterion, x = self.criterion, self.reference
         unknowns, outputs = criterion.unknowns, criterion.unknowns.l

@@ -8,6 +8,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.identify.prediction_error.descent import Criterion
@@ -92,15 +93,6 @@ class TangentFit(ABC):
         """The named variables in the order of the unknowns."""
         return Places.of(self.criterion.unknowns, self.criterion.key)
 
-    @property
-    def floor(self) -> float:
-        """Sum of squares below which differences are rounding."""
-        return 1e-14 * self.criterion.energy
-
-    def model(self, x: Array) -> Any:
-        """Return the model of x."""
-        return self.recover(self.places.values(x))
-
     def signed(self, x: Array) -> Array:
         """Turn the signs of mu and b to where the constraints are violated least.
 
@@ -135,12 +127,11 @@ def violation(program: Program) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """``‖root z - target‖² + remainder``; ``scale`` is the energy against which a vanishing value is judged."""
+    """``‖root z - target‖² + remainder``."""
 
     root: Array
     target: Array
     remainder: float
-    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +167,7 @@ class CompressedErrors:
     def problem(self) -> LeastSquares:
         """The sum of squares in z."""
         root, errors = self.at.whole
-        return LeastSquares(root, root @ self.reference - errors, self.at.remainder, float(self.energy[0]))
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
 
     @cached_property
     def statistics(self) -> ErrorRows:
@@ -196,15 +187,16 @@ class CompressedErrors:
         """Return z."""
         return self.places.pack(values)
 
-    def regression(self, values: Mapping[str, Array]) -> Array:
-        """Return the coefficients (n, 1) of the columns."""
-        return self.lifted(values)[:, None]
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Positions (n, 1) in z of the coefficients of the columns."""
+        return np.arange(len(self.reference))[:, None]
 
     def one_step_fit(self, values: Mapping[str, Array]) -> Array:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
         value = self.at.after(self.lifted(values) - self.reference)
         return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
 
-    def spread(self, theta: Array, moves: Array) -> Spread:
+    def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter under white errors."""
-        return white_spread(self.statistics, theta, moves)
+        return white_spread(self, z, moves)

@@ -1,26 +1,27 @@
 """The sum of squared errors of a transfer-function model, and the record it is taken from, in its own units."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer
 from optid.bases import Linear, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
-from optid.errors import RankError
+from optid.identify.arguments import enough_rows, one_of, one_output, outputs_present, per_channel
+from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import noise_filter, roots
 from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
+from optid.statistics.blocks import check_lengths
 from optid.statistics.linearised import Linearised, Method
-from optid.statistics.regression import ROWS_PER_COLUMN, collect
-from optid.statistics.sensitivities import CHUNK, expanded, linearise, predict, simulate
+from optid.statistics.regression import ROWS_PER_COLUMN, accumulate, collect
+from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferUnknowns
 
 STABLE = 1 - 1e-9
@@ -28,29 +29,17 @@ STABLE = 1 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class TransferErrors(Criterion):
+class TransferErrors(TransferPredictor, Criterion):
     """Simulation errors, or one-step prediction errors with a noise filter.
 
     Attributes:
-        data: the record.
-        unknowns: their order.
         gauge: how the scale between mu and b is fixed; "none" for a linear model.
-        units: from those of the record above (`optid.program.units`) to those of the model.
+        units: from those of the record (`optid.program.units`) to those of the model.
     """
 
-    data: Data
-    unknowns: TransferUnknowns
     gauge: str
-    units: Transform = field(default_factory=lambda: Transform.identity(1, 1))
-
-    def __post_init__(self) -> None:
-        if len(self.units.u_scale) != self.data.m:
-            object.__setattr__(self, "units", Transform.identity(self.data.m, 1))
-
-    @property
-    def errors(self) -> str:
-        """What they are called."""
-        return "simulation errors" if self.unknowns.plain else "prediction errors"
+    units: Transform
+    weight: ClassVar[Array] = np.eye(1)
 
     @property
     def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -61,21 +50,9 @@ class TransferErrors(Criterion):
         """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
         return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
 
-    @cached_property
-    def functions(self) -> tuple[Array, ...] | None:
-        """Values of the basis functions, where they are few enough to be kept."""
-        return expanded(self.data, self.unknowns.layout)
-
-    @cached_property
-    def energy(self) -> float:
-        """Sum of squares of the output about its mean."""
-        y = np.concatenate([e.y[:, 0] for e in self.data.experiments])
-        return float(np.nansum((y - np.nanmean(y)) ** 2))
-
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
-        return linearise(self.data, self.unknowns, self.unknowns.unpack(x), gauge=self.gauge_rows(x),
-                         functions=self.functions, method=method)
+        return self.compress(self.unknowns.unpack(x), self.gauge_rows(x), method)
 
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""
@@ -84,8 +61,7 @@ class TransferErrors(Criterion):
     def innovations(self, x: Array) -> list[Array]:
         """Return the innovations (N,) of every experiment, NaN where there is none."""
         point = self.unknowns.unpack(x)
-        simulated = simulate(self.data, self.unknowns, point)
-        found = [predict(self.data, self.unknowns, point, i, y) for i, y in enumerate(simulated)]
+        found = [self.predict(point, i, y) for i, y in enumerate(self.simulate(point))]
         return [np.where(one.state == noise_filter.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
@@ -138,69 +114,44 @@ class TransferErrors(Criterion):
         return total[:, None] @ np.ones((1, self.unknowns.experiments))
 
 
-def plant_record(data: Data, na: int, nb: Sequence[int], nk: Sequence[int], basis: Any, offset: bool, *,
-                 states: bool = True) -> tuple[Data, Layout, Transform]:
-    """Return the record in its own units (`optid.program.units`), the columns of the plant, and the way back.
+def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None, gauge: str | None,
+                    offset: bool) -> TransferErrors:
+    """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
-    Args:
-        data: the record; one output.
-        na: number of poles.
-        nb: number of coefficients of B, one per input.
-        nk: delays, one per input.
-        basis: one per input or one for all.
-        offset: whether the model has a constant; without one nothing is centred.
-        states: whether the initial states are unknown. Then the record is cut where inputs are missing: every stretch
-            is an experiment with an initial state of its own.
+    Unless D is A the initial states are unknown, and the record is cut where inputs are missing: every stretch is an
+    experiment with an initial state of its own.
 
-    Raises:
-        DataError: no stretch with every input is long enough.
-        RankError: an experiment that its initial state would explain, a basis function that no sample excites, or
-            inputs that the record does not tell apart.
+    Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge``
+    for a linear model. Without ``offset`` nothing is centred.
     """
-    def layout(bases: Sequence[Any]) -> Layout:
-        return Layout(na, tuple(nb), tuple(nk), tuple(bases), tuple(data.outputs), tuple(data.inputs))
-
-    reach = layout([Linear()] * data.m).first_row
+    if gauge is not None:
+        one_of("gauge", gauge, FIXED)
+    data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
+    layout = Layout(check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
+                    per_channel("nk", nk, data.inputs, low=0), (Linear(),) * data.m, data.outputs, data.inputs)
+    states = nd is not None
     if states:
-        _check_lengths(data, reach)
-        data = with_whole_inputs(data, 2 * reach + 1)
+        check_lengths([e.n_samples for e in data.experiments], layout)
+        data = with_whole_inputs(data, 2 * layout.first_row + 1)
     bases = fitted_bases(data, basis)
     units = own_units(data, [isinstance(one, Linear) for one in bases], bool(offset))
-    record, found = in_units(data, units), layout(inner_bases(bases, units))
+    record, layout = in_units(data, units), replace(layout, bases=tuple(inner_bases(bases, units)))
     if states:
-        if not all(isinstance(one, Linear) for one in bases):
-            _check_excited(record, found)
-        _check_inputs_differ(record, found)
-    return record, found, units
+        _check_inputs(record, layout)
+    unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, bool(offset),
+                                check_integer(nc, "nc", 0), nd)
+    if states:
+        enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
+    return TransferErrors(record, unknowns, gauge or "none", units)
 
 
-def _check_lengths(data: Data, reach: int) -> None:
-    for number, e in enumerate(data.experiments, start=1):
-        label = f"experiment {number}: " if data.n_experiments > 1 else ""
-        if e.n_samples <= reach:
-            raise RankError(f"{label}{e.n_samples} samples, but the lags reach back {reach}: its initial "
-                            "state would explain them all. Leave it out, or use fewer lags")
-
-
-def _check_excited(data: Data, layout: Layout) -> None:
-    """Refuse a basis function without energy, by name."""
-    for c, (channel, basis) in enumerate(zip(layout.inputs, layout.bases)):
-        energy = np.zeros(basis.size)
-        for e in data.experiments:
-            for k in range(0, e.n_samples, CHUNK):
-                energy += np.sum(basis.values(e.u[k : k + CHUNK, c]) ** 2, axis=0)
-        silent = np.flatnonzero(energy <= 1e-14 * energy.mean())
-        if silent.size:
-            raise RankError(f"function {silent[0] + 1} of the basis of input {channel!r} is never excited: no sample "
-                            "lies in its part of the interval. Use fewer functions, or an interval that the input "
-                            "visits")
-
-
-def _check_inputs_differ(data: Data, layout: Layout) -> None:
-    """Refuse inputs of whose expansions one column depends on another, by name."""
-    columns = Layout(0, layout.nb, layout.nk, layout.bases, layout.outputs, layout.inputs)
+def _check_inputs(data: Data, layout: Layout) -> None:
+    """Refuse a basis function without energy, and inputs of whose expansions one column depends on another, by name."""
+    outputs = [e.u[:, :1] for e in data.experiments]  # any without gaps
+    complete = Data([e.u for e in data.experiments], outputs, data.dt, list(data.inputs), list(data.outputs))
+    if not all(isinstance(basis, Linear) for basis in layout.bases):
+        accumulate(complete, replace(layout, na=0, nb=(1,) * layout.m, nk=(0,) * layout.m)).check()
+    columns = replace(layout, na=0)
     rows = sum(e.n_samples - layout.first_row for e in data.experiments)
     if layout.m > 1 and rows >= ROWS_PER_COLUMN * columns.n_columns:
-        outputs = [e.u[:, :1] for e in data.experiments]  # any without gaps
-        complete = Data([e.u for e in data.experiments], outputs, data.dt, list(data.inputs), list(data.outputs))
         _ = collect(complete, columns).root
