@@ -9,7 +9,7 @@ import optid
 from optid.bases import BSpline, Polynomial, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
-from optid.errors import OptidError, StructureError
+from optid.errors import DataWarning, OptidError, StructureError
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.state_unknowns import beyond_affine
 
@@ -216,6 +216,29 @@ def test_a_free_run_that_leaves_the_record_is_told():
     assert "criterion='simulation'" in fit.figures["free run"]
     calm = optid.fit(Data(u, 0.1 * u), "hammerstein_ss.exact", criterion="prediction", **arguments)
     assert "free run" not in calm.figures and "free run" not in calm.solution.reason
+
+
+def test_tables_figures_and_checks_show_the_latent_function():
+    u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 150), 4)
+    data = Data(u, oscillator(u, 0.02))
+    fit = optid.fit(data, "lfr.exact", nx=2, latent="states", latent_basis="polynomial:3")
+    text = str(fit)
+    assert "Latent nonlinearity h, basis polynomial with 3 functions on [-1, 1]" in text
+    (z,) = fit.model.latent_run(data)
+    inside = np.mean(np.abs(z) <= 1)
+    assert z.shape == (600, 1) and inside > 0.9
+    with pytest.warns(DataWarning, match="of latent signal 'z' lies outside"):
+        found = optid.validate(fit.model, Data(2.0 * u, oscillator(2.0 * u)))
+    (further,) = fit.model.latent_run(Data(2.0 * u, oscillator(2.0 * u)))
+    share = np.mean(np.abs(further) > 1)
+    assert found.outside["z"] == pytest.approx(share) and share > 0.02
+    assert any("of latent signal 'z' lies outside the interval [-1, 1]" in note for note in found.notes)
+    band = fit.uncertainty.band(0, family="latent")
+    assert np.all(np.isfinite(band.error)) and np.all(band.lower <= band.value)
+    from optid.show.plots import nonlinearity
+
+    titles = [ax.get_title(loc="left") for ax in nonlinearity(fit).axes]
+    assert titles == ["Nonlinearity of u", "Latent nonlinearity of z"]
 
 
 def test_words_are_refused():

@@ -89,7 +89,7 @@ def test_feedback_functions_have_bands():
     y = plant.simulate(u[:, None])[:, 0]
     fit = optid.fit(Data(u, y + 0.02 * np.random.default_rng(1).normal(size=600)), "hammerstein_ss.exact", nx=2,
                     basis="linear", feedback_basis="polynomial:3", feedthrough=False)
-    band = fit.uncertainty.band(0, np.linspace(-0.5, 0.5, 5), fed_back=True)
+    band = fit.uncertainty.band(0, np.linspace(-0.5, 0.5, 5), family="feedback")
     assert np.all(band.error > 0) and np.all(band.error < 0.5)
     gain = fit.uncertainty.of(lambda m: m.static_gain(0.1))
     assert abs(gain.value - plant.static_gain(0.1)) < 5 * gain.error

@@ -106,10 +106,9 @@ class Uncertainty:
         """Coefficients of the nonlinearities, one per input, in the gauge of the model."""
         return tuple(self.coefficients(c) for c in range(self.model.m))
 
-    def coefficients(self, index: int, fed_back: bool = False) -> Interval:
-        """Return those of the coefficients of a function of the inputs, or of the outputs."""
-        functions = "feedback" if fed_back else "nonlinearities"
-        return self.of(lambda model: getattr(model, functions)[index].mu)
+    def coefficients(self, index: int, family: str = "nonlinearities") -> Interval:
+        """Return those of the coefficients of a function; the family is "nonlinearities", "feedback" or "latent"."""
+        return self.of(lambda model: getattr(model, family)[index].mu)
 
     @cached_property
     def offset(self) -> Interval:
@@ -123,22 +122,22 @@ class Uncertainty:
         """Band of every nonlinearity on the grid of its basis; see `band`."""
         return tuple(self.band(c) for c in range(self.model.m))
 
-    def band(self, channel: int = 0, at: ArrayLike | None = None, offset: bool = True, *, fed_back: bool = False
-             ) -> Interval:
+    def band(self, channel: int = 0, at: ArrayLike | None = None, offset: bool = True, *,
+             family: str = "nonlinearities") -> Interval:
         """Return the pointwise band of a nonlinearity in the gauge of the model.
 
         Args:
-            channel: index of the input, or of the function among those of the outputs.
+            channel: index of the input, or of the function in its family.
             at: (k,) values of the input; the 201 points of ``basis.grid()`` when not given.
             offset: include the offset of f where the model knows it (``model.c0``); where it does not, or with False,
                 the band is that of f without constant, which has no width where the basis vanishes.
-            fed_back: of a function of the outputs.
+            family: "nonlinearities", "feedback" or "latent": functions of inputs, outputs and latent signals.
         """
-        model, functions = self.model, "feedback" if fed_back else "nonlinearities"
-        basis = getattr(model, functions)[channel].basis
+        model = self.model
+        basis = getattr(model, family)[channel].basis
         points = basis.grid() if at is None else np.atleast_1d(np.asarray(at, dtype=float))
         with_offset = offset and not isinstance(basis, Linear) and model.c0 is not None
-        found = self.of(lambda model: getattr(model, functions)[channel](points) + (model.c0 if with_offset else 0.0))
+        found = self.of(lambda model: getattr(model, family)[channel](points) + (model.c0 if with_offset else 0.0))
         return replace(found, at=points)
 
     def frequency_response(self, w: ArrayLike | None = None) -> tuple[Interval, Interval]:

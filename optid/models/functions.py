@@ -1,6 +1,6 @@
 """The static functions and the responses of a model, as tables and figures name them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,12 @@ class StaticFunction:
     Attributes:
         word: its name in equations and tables: "f", "f_valve", "f2_valve", "g_level".
         nonlinearity: the function.
-        channel: index of its argument among the inputs, or the outputs for a feedback.
+        channel: index of its argument among the inputs, the outputs, or the latent signals.
         name: name of that channel.
         unit: its unit, "" where unknown.
-        index: its place among the functions of the inputs, or of the outputs.
-        fed_back: whether the argument is an output.
+        family: the attribute of the model that holds it: "nonlinearities", "feedback" or "latent".
+        index: its place there.
+        model: the model.
     """
 
     word: str
@@ -32,35 +33,52 @@ class StaticFunction:
     channel: int
     name: str
     unit: str
+    family: str
     index: int
-    fed_back: bool = False
+    model: Any = field(repr=False)
 
     @property
     def is_linear(self) -> bool:
         """Whether there is nothing to draw."""
         return self.nonlinearity.is_linear
 
+    @property
+    def what(self) -> str:
+        """What kind of function it is, as a title says it."""
+        return {"feedback": "Feedback nonlinearity", "latent": "Latent nonlinearity"}.get(self.family, "Nonlinearity")
+
     def samples(self, data: Data) -> Array:
-        """Samples (N,) of its argument in a record, all experiments; NaN = missing."""
-        return np.concatenate([(e.y if self.fed_back else e.u)[:, self.channel] for e in data.experiments])
+        """Samples (N,) of its argument in a record, all experiments; NaN = missing.
+
+        Those of a latent signal are of the free run from the initial states that fit best.
+
+        Raises:
+            DataError: a free run that leaves 100 times the range of the record.
+        """
+        if self.family == "latent":
+            return np.concatenate([z[:, self.channel] for z in self.model.latent_run(data)])
+        signals = [e.y if self.family == "feedback" else e.u for e in data.experiments]
+        return np.concatenate([signal[:, self.channel] for signal in signals])
 
 
 def static_functions(model: Any) -> list[StaticFunction]:
-    """Return the functions of the inputs, then those of the outputs that are fed back.
+    """Return the functions of the inputs, of the outputs that are fed back, and of latent signals.
 
     With one input and one function of it the word is "f"; several functions of a channel are numbered: f1_valve.
     """
     shown = model.f if isinstance(model.f, tuple) else (model.f,)  # with its offset, where the model knows it
-    groups = [("f", shown, getattr(model, "input_of", range(model.m)), model.inputs, model.input_units)]
+    places = tuple(getattr(model, "input_of", range(model.m)))
+    groups = [("f", "nonlinearities", shown, places, model.inputs, model.input_units)]
     if has_feedback(model):
-        groups.append(("g", model.feedback, model.output_of, model.outputs, model.output_units))
+        groups.append(("g", "feedback", model.feedback, model.output_of, model.outputs, model.output_units))
     found = []
-    for letter, functions, places, names, units in groups:
+    for letter, family, functions, places, names, units in groups:
         for j, (f, c) in enumerate(zip(functions, places)):
-            number = str(list(places[: j + 1]).count(c)) if list(places).count(c) > 1 else ""
+            number = str(places[: j + 1].count(c)) if places.count(c) > 1 else ""
             word = letter + number + ("" if len(names) == 1 else f"_{names[c]}")
-            found.append(StaticFunction(word, f, c, names[c], units[c], j, fed_back=letter == "g"))
-    return found
+            found.append(StaticFunction(word, f, c, names[c], units[c], family, j, model))
+    return found + [StaticFunction(word, h, i, name, "", "latent", i, model)
+                    for i, (word, name, h) in enumerate(zip(*latent_names(model), getattr(model, "latent", ())))]
 
 
 def latent_names(model: Any) -> tuple[list[str], list[str]]:
@@ -91,6 +109,6 @@ def response_pairs(model: Model) -> list[tuple[str, str]]:
 
     Where an input has several static functions there is one column for each of them, by its word.
     """
-    words = [function.word for function in static_functions(model) if not function.fed_back]
+    words = [function.word for function in static_functions(model) if function.family == "nonlinearities"]
     sources = model.inputs if len(words) == model.m else words
     return [(source, output) for output in model.outputs for source in sources]

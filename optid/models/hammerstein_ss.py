@@ -57,6 +57,18 @@ class HammersteinSS(StateSpace):
                 pass
         return simulation.fitted_state(run, y)
 
+    def latent_run(self, data: Data) -> list[Array]:
+        """Return the latent signals (N, k) of every experiment in the free run from the initial state that fits best.
+
+        Raises:
+            DataError: a run that leaves 100 times the range of the record.
+        """
+        records = records_of(self, data)[0]
+        limits = simulation.allowed_range([y for _, y, _ in records])
+        runs = [simulation.prepared(self, "free", u, y, limits, label) for u, y, label in records]
+        states = self._states("free", records, "fit")
+        return [self.latent_signals(simulation.visited(run, x), run.u) for run, x in zip(runs, states)]
+
     def to_dlti(self) -> Any:
         """Return (A, B, C, D), from every f to every output, as a `scipy.signal.dlti`."""
         from scipy.signal import dlti

@@ -62,8 +62,8 @@ def _names(model: Any) -> tuple[list[str], list[str]]:
     """Words of the functions of inputs and outputs; of a linear function that an input has alone the input's name."""
     found = static_functions(model)
     alone = [f.is_linear and model.input_of.count(f.channel) == 1 for f in found]
-    own = [f.name if linear else f.word for f, linear in zip(found, alone) if not f.fed_back]
-    return own, [f.word for f in found if f.fed_back]
+    own = [f.name if linear else f.word for f, linear in zip(found, alone) if f.family == "nonlinearities"]
+    return own, [f.word for f in found if f.family == "feedback"]
 
 
 def _equations(model: Any, digits: int) -> str:

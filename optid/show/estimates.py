@@ -60,13 +60,13 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
         else:
-            band = known.band(function.index, points, fed_back=function.fed_back)
+            band = known.band(function.index, points, family=function.family)
             numeric = zip(points, band.value, band.error, band.lower, band.upper)
             size = float(np.max(np.abs(band.value)))
             rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
-        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
-        found.append(Table(f"{what} {function.word}, basis {_basis(f.basis)}", (label, function.word, *head), rows))
+        title = f"{function.what} {function.word}, basis {_basis(f.basis)}"
+        found.append(Table(title, (label, function.word, *head), rows))
     return found
 
 
@@ -77,14 +77,14 @@ def coefficient_table(fit: "Fit") -> Table | None:
     for function in functions:
         if function.is_linear:
             continue
-        letter = "nu" if function.fed_back else "mu"
-        where = "" if function.word in "fg" else function.word if function.word[1] != "_" else function.name
+        letter = {"feedback": "nu", "latent": "c"}.get(function.family, "mu")
+        where = "" if function.word in "fgh" else function.word if function.word[1] != "_" else function.name
         for j, value in enumerate(function.nonlinearity.mu):
             label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
             if known is None:
                 rows.append((label, number(value)))
             else:
-                interval = known.coefficients(function.index, function.fed_back)
+                interval = known.coefficients(function.index, function.family)
                 rows.append(_interval_row(label, value, interval.error[j], interval.lower[j], interval.upper[j]))
     head = () if known is None else ("std. error", "95 % low", "95 % high")
     return Table("Coefficients of the basis", ("coefficient", "estimate", *head), rows) if rows else None

@@ -299,14 +299,21 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
         panels.draw_nonlinearity(
             ax,
             function.nonlinearity,
-            np.zeros(0) if record is None else function.samples(record),
+            np.zeros(0) if record is None else _samples(function, record),
             _f_band(fit, function),
             name=with_unit(function.name, function.unit),
             label=plain(function.word),
         )
         ax.set_ylabel(plain(f"{function.word}({function.name})"))
-        what = "Feedback nonlinearity" if function.fed_back else "Nonlinearity"
-        ax.set_title(what if len(functions) == 1 else with_unit(f"{what} of {function.name}", ""))
+        ax.set_title(function.what if len(functions) == 1 else with_unit(f"{function.what} of {function.name}", ""))
+
+
+def _samples(function: StaticFunction, record: Data) -> Array:
+    """Where the argument of a function has been; nowhere where the simulation of a latent one runs away."""
+    try:
+        return function.samples(record)
+    except DataError:
+        return np.zeros(0)
 
 
 def _checked(fit: "Fit", record: Data) -> Validation:
@@ -348,7 +355,7 @@ def _f_band(fit: "Fit", function: StaticFunction) -> tuple[Array, Array, Array] 
     known, _ = uncertainty(fit)
     if known is None:
         return None
-    band = known.band(function.index, fed_back=function.fed_back)
+    band = known.band(function.index, family=function.family)
     return np.asarray(band.at), band.lower, band.upper
 
 

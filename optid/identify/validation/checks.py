@@ -19,6 +19,9 @@ from optid.registry import render
 
 LAGS = 25
 
+KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}
+"""What the argument of a static function is, by the family of the function."""
+
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
@@ -171,15 +174,19 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
         if function.is_linear:  # known everywhere
             shares[function.name] = 0.0
             continue
-        name, basis, samples = function.name, function.nonlinearity.basis, function.samples(data)
+        name, basis = function.name, function.nonlinearity.basis
+        try:
+            samples = function.samples(data)
+        except DataError:  # the simulation says so
+            continue
         shares[name] = np.count_nonzero(basis.is_outside(samples)) / max(int(np.sum(~np.isnan(samples))), 1)
-        found = list_outside("output" if function.fed_back else "input", name, shares[name], basis)
+        found = list_outside(KINDS[function.family], name, shares[name], basis)
         notes.extend(note for note in found if note not in notes)
     return shares
 
 
 def _structure(model: Any, data: Data, notes: list[str]) -> Structure | None:
-    if has_feedback(model):  # in closed loop the test says nothing
+    if has_feedback(model) or getattr(model, "latent", ()):  # in closed loop the test says nothing, and these are more
         return None
     try:
         with warnings.catch_warnings():

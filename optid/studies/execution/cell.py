@@ -290,7 +290,7 @@ def _parameters(model: Any) -> Mapping[str, Any]:
 
     named: dict[str, Any] = {name: float(value) for name, value in model.coefficients()}
     for function in static_functions(model):
-        word = function.word.partition("_")[0].replace("f", "mu", 1).replace("g", "nu", 1)
+        word = function.word.partition("_")[0].replace("f", "mu", 1).replace("g", "nu", 1).replace("h", "c", 1)
         named[f"{word}[{function.name}]"] = function.nonlinearity.mu.tolist()
     return named
 
