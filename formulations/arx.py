@@ -1,4 +1,4 @@
-"""Linear ARX with constraints: the smallest example of a formulation.
+"""Linear ARX and impulse responses with constraints: the smallest example of a formulation.
 
 ``A(q) y = sum_c B_c(q) u_c + d + e``. Named variables: ``a``, ``b`` (``b[input]`` with several inputs), ``offset``.
 """
@@ -20,7 +20,8 @@ from optid.structures.least_squares import LeastSquaresStructure
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
-        constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0) -> Program | Procedure:
+        constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none"
+        ) -> Program | Procedure:
     """Pose ``min ‖Y - Phi_y a - Phi_u b - d‖²``.
 
     Named variables: ``a``, ``b``, ``offset``.
@@ -33,13 +34,36 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``.
         loss: "squares", "huber[:threshold]" or "l1".
         ridge: weight of ``‖b‖²``.
+        prior: of the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
+            (smooth); its hyperparameters maximise the marginal likelihood of the record.
 
     Raises:
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
     return pose_with_loss(loss, data, lambda problem: _programme(problem).subject_to(*constraints), convex=True,
-                          na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge)
+                          na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior)
+
+
+def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
+        constraints: Sequence[Any] = ()) -> Program | Procedure:
+    """Pose ``min ‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
+
+    Named variables: ``b``, ``offset``.
+
+    Args:
+        data: the record.
+        nb: number of coefficients of the impulse response, one per input or one for all.
+        nk: delay of the first coefficient in samples, one per input or one for all.
+        prior: of the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
+            (smooth); its hyperparameters maximise the marginal likelihood of the record.
+        constraints: builders of CVXPY constraints in ``b``, ``offset``.
+
+    Raises:
+        StructureError: impossible orders or nonconvex constraints.
+        RankError: the record does not determine the parameters.
+    """
+    return arx(data, na=0, nb=nb, nk=nk, prior=prior, constraints=constraints)
 
 
 def _programme(problem: EquationError) -> Program:

@@ -31,7 +31,7 @@ from optid.structures.least_squares import RankOneStructure
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
-          curvature: float = 0.0, gauge: str = "norm") -> Program | Procedure:
+          curvature: float = 0.0, prior: str = "none", gauge: str = "norm") -> Program | Procedure:
     """Pose the bilinear least-squares problem ``min ‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``.
@@ -46,6 +46,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (reweighted passes; no proof).
         ridge: weight of ``‖mu‖² ‖b‖²``.
         curvature: weight of ``‖b‖²`` times the integral of ``f''²``.
+        prior: of A and of every row of Theta along the lags: "none", "tc" (decaying, rough), "dc" (with a correlation
+            of neighbours) or "ss" (smooth); its hyperparameters maximise the marginal likelihood of the record.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
 
     Returns:
@@ -57,7 +59,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
     """
     one_of("gauge", gauge, FIXED)
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
-                          nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
+                          nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
 
 
 def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:

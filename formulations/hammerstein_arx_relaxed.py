@@ -33,7 +33,7 @@ from optid.structures.rank_one import Core
 def nuclear(  # noqa: D417 - the other arguments by reference
     data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
     nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
-    ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm"
+    ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm"
 ) -> Program | Procedure:
     """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
@@ -58,13 +58,13 @@ def nuclear(  # noqa: D417 - the other arguments by reference
     if not weight >= 0:
         raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, weight=float(weight)),
-                          convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
+                          convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
 
 
 def overparametrised(  # noqa: D417 - the other arguments by reference
     data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
     nk: int | Sequence[int] = 0, svd: str = "whitened", constraints: Sequence[Any] = (), loss: str = "squares",
-    ridge: float = 0.0, curvature: float = 0.0, gauge: str = "norm"
+    ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm"
 ) -> Program | Procedure:
     """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
@@ -81,7 +81,7 @@ def overparametrised(  # noqa: D417 - the other arguments by reference
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge, svd=svd), convex=True,
-                          na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature)
+                          na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
 
 
 def _programme(problem: EquationError, builders: Sequence[Any], gauge: str, weight: float | None = None,

@@ -430,7 +430,7 @@ def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
     # no model with its poles inside the same circle, nearby, has smaller errors by more than the boundary's curvature
     plant = fit.model
     unknowns = TransferUnknowns(Layout(3, (2,), (0,), (plant.f.basis,), record.outputs, record.inputs), 1, (True,))
-    criterion = TransferErrors(record, unknowns, "norm")
+    criterion = TransferErrors(record, unknowns, "norm", Transform.identity(1, 1))
     at_rest = np.zeros((1, unknowns.memory))
     x = unknowns.pack(TransferPoint(plant.a, (plant.f.mu,), plant.b, float(plant.offset[0]), at_rest))
     rng = np.random.default_rng(0)

@@ -30,11 +30,13 @@ def positions(layout: Layout) -> NDArray[np.intp]:
 
 
 def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: float = 0.0, curvature: float = 0.0,
-                   scales: Sequence[float] = (), weights: Array | float = 1.0) -> RankOne:
+                   scales: Sequence[float] = (), weights: Array | float = 1.0,
+                   prior: Array | None = None) -> RankOne:
     """Order the triangular system of the statistics by z, by the `positions` of its columns, and penalise Theta.
 
     The penalties are ridge times ``‖Theta‖²``, and curvature times the integral of ``f''²``; Theta in the units of the
-    record is Theta / scale, with one scale an input. The weights (l,) are those of the residuals of every output.
+    record is Theta / scale, with one scale an input. The weights (l,) are those of the residuals of every output; the
+    rows (k, n l) of a prior act on z.
     """
     layout, (n, ny), root = statistics.layout, columns.shape, statistics.root.copy()
     root[:, n:] *= weights
@@ -50,6 +52,8 @@ def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: flo
                      for basis, scale in zip(layout.bases, scales)]
         roots = [np.kron(np.eye(q), _square_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
         system = np.vstack([system, np.pad(np.asarray(block_diag(*roots)), ((0, 0), (linear, 1)))])
+    if prior is not None:
+        system = np.vstack([system, np.pad(prior, ((0, 0), (0, 1)))])
     triangle = np.triu(np.linalg.qr(system, mode="r"))
     triangle = triangle * np.where(np.diag(triangle[:, : len(triangle)]) < 0, -1.0, 1.0)[:, None]  # one of many signs
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0

@@ -19,7 +19,7 @@ from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.identify.arguments import per_channel
+from optid.identify.arguments import one_of, per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.compressed import Spread, white_spread
@@ -159,7 +159,8 @@ class EquationError:
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
-             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2) -> EquationError:
+             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2, prior: str = "none"
+             ) -> EquationError:
     """Read the record once and return the compressed problem, posed in the record's own units (`optid.program.units`).
 
     Args:
@@ -173,6 +174,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         weights: nonnegative row weights per experiment, or None.
         own: False for a record that is in its own units already.
         degree: of the loss in the residuals: 2 for squares, 1 for the sum of magnitudes.
+        prior: of the impulse responses, "none", "tc", "dc" or "ss", see `optid.identify.equation_error.priors`.
 
     Raises:
         StructureError: impossible orders.
@@ -187,6 +189,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     if own:
         units = own_units(data, [isinstance(one, Linear) for one in bases])
         data = in_units(data, units)
+    one_of("prior", prior, ("none", "tc", "dc", "ss"))
     layout = Layout(na=order, nb=nbs, nk=nks, bases=inner_bases(bases, units), outputs=tuple(outputs),
                     inputs=tuple(inputs))
     if ridge < 0 or curvature < 0:
@@ -195,5 +198,17 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit
     columns = positions(layout)
-    problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale)
+    rows = None if prior == "none" else _prior_rows(prior, statistics, columns)
+    problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
+
+
+def _prior_rows(word: str, statistics: Statistics, columns: np.ndarray) -> np.ndarray:
+    """Rows on z, those of every output below one another."""
+    from optid.identify.equation_error.priors import likeliest
+
+    prior = likeliest(word, statistics)
+    found = np.zeros((prior.columns.size * columns.shape[1], columns.size))
+    for o, rows in enumerate(np.split(found, columns.shape[1])):
+        rows[:, columns[prior.columns, o]] = prior.rows(o)
+    return found

@@ -72,12 +72,15 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
         data: the record.
         pose: states the programme of a compressed record.
         convex: whether a dual bound exists.
-        structure: arguments of `compress`: na, nb, nk, basis, ridge and curvature.
+        structure: arguments of `compress`: na, nb, nk, basis, ridge, curvature and prior.
     """
     kind, threshold = parse_loss(loss)
     structure["degree"] = 1 if kind == "l1" else 2
     if kind == "squares":
         return pose(compress(data, **structure))
+    if structure.get("prior", "none") != "none":
+        raise StructureError(f"loss {loss!r}: a prior takes its strength from the likelihood of Gaussian noise; use "
+                             "loss='squares', or prior='none' with a ridge")
     if isinstance(data, Stream):
         raise StructureError(f"loss {loss!r} needs row weights, which a stream larger than memory does not keep; "
                              "use loss='squares' or read the record")

@@ -1,0 +1,141 @@
+"""Gaussian priors on impulse responses: smooth and decaying, their strength by marginal likelihood.
+
+The lags of every past output and of every function of every input are a priori normal with covariance c K(decay)
+(Chen, Ohlsson and Ljung, On the estimation of transfer functions, Automatica 48, 2012). The hyperparameters, and the
+variance of the noise, maximise the likelihood of the outputs with all coefficients integrated out; the constant has a
+flat prior. The triangular factor of the record is all that this needs.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from optid.arrays import Array
+from optid.models.layout import Layout
+from optid.statistics import Statistics
+
+DECAYS, NOISES = (0.3, 0.6, 0.9), (-4.0, -1.0)
+"""Decays per lag, and logarithms of the noise, from which the likelihood is climbed; from small sizes a climb may end
+where nothing but noise is left."""
+
+FLOOR = 1e-9
+"""Variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular."""
+
+BOUNDS = {"size": (-25.0, 12.0), "decay": (0.05, 0.998), "correlation": (-0.98, 0.98), "noise": (-30.0, 3.0)}
+"""Of logarithms of variances relative to the output's, decays and correlations."""
+
+
+def tuned_correlated(lags: int, decay: float, correlation: float = 0.0) -> Array:
+    """Return K[i, j] = decay^max(i, j), "tc"."""
+    i = np.arange(1, lags + 1)
+    return decay ** np.maximum.outer(i, i).astype(float)
+
+
+def diagonal_correlated(lags: int, decay: float, correlation: float = 0.0) -> Array:
+    """Return K[i, j] = decay^((i + j) / 2) correlation^|i - j|, "dc"."""
+    i = np.arange(1, lags + 1)
+    return decay ** (np.add.outer(i, i) / 2) * correlation ** np.abs(np.subtract.outer(i, i))
+
+
+def stable_spline(lags: int, decay: float, correlation: float = 0.0) -> Array:
+    """Return the second-order stable spline 3 (d^(i + j + max) / 2 - d^(3 max) / 6) with d^3 = decay, "ss"."""
+    i = np.arange(1, lags + 1)
+    most = np.maximum.outer(i, i)
+    return 3 * (decay ** ((np.add.outer(i, i) + most) / 3.0) / 2 - decay ** most.astype(float) / 6)
+
+
+KERNELS: dict[str, Callable[..., Array]] = {
+    "tc": tuned_correlated, "dc": diagonal_correlated, "ss": stable_spline}
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of the coefficients before the record.
+
+    Attributes:
+        columns: (n,) columns of the regressor it is about.
+        covariance: (n, n) of their coefficients.
+        noise: (l,) variance of the noise of every output.
+    """
+
+    columns: np.ndarray
+    covariance: Array
+    noise: Array
+
+    def rows(self, output: int) -> Array:
+        """Return rows (n, n) W: ``‖W theta‖²`` is what it adds to the squared errors of an output."""
+        root = np.linalg.cholesky(self.covariance)
+        return np.sqrt(self.noise[output]) * solve_triangular(root, np.eye(len(root)), lower=True)
+
+
+def families(layout: Layout) -> list[list[np.ndarray]]:
+    """Return groups of columns that share hyperparameters, each of arrays of columns lag by lag.
+
+    The past of every output, then the functions of every input.
+    """
+    found = [[np.arange(layout.na) * layout.l + o] for o in range(layout.l)] if layout.na else []
+    for c, (basis, lags) in enumerate(zip(layout.bases, layout.nb)):
+        start = layout.block(c).start
+        found.append([start + j + basis.size * np.arange(lags) for j in range(basis.size)])
+    return found
+
+
+def likeliest(word: str, statistics: Statistics) -> Prior:
+    """Return the prior of a kernel under which the record is most likely.
+
+    Args:
+        word: one of `KERNELS`.
+        statistics: of the record.
+    """
+    from scipy.optimize import minimize
+
+    layout, n = statistics.layout, statistics.layout.n_columns
+    groups = families(layout)
+    columns = np.concatenate([part for group in groups for part in group])
+    edges = np.cumsum([0, *(len(part) for group in groups for part in group)])
+    free = np.r_[layout.offset, columns]  # the constant first: what it explains is projected out
+    whole = np.hstack([statistics.root[:, free], statistics.root[:, n:]])
+    factor = np.asarray(np.linalg.qr(whole, mode="r"))[1:, 1:]
+    inner, right, rest = factor[: n - 1, : n - 1], factor[: n - 1, n - 1 :], factor[n - 1 :, n - 1 :]
+    energy = np.sum(factor[:, n - 1 :] ** 2, axis=0) / statistics.rows
+    sizes = np.array([np.sum(inner[:, edges[i] : edges[i + 1]] ** 2) for i in range(len(edges) - 1)]) / statistics.rows
+    most = [float(np.mean(energy)) / max(float(np.max(sizes[start : start + len(group)])), 1e-300)
+            for start, group in zip(np.cumsum([0, *map(len, groups)]), groups)]
+    each = 3 if word == "dc" else 2
+
+    def covariance(x: Array) -> Array:
+        found, at = np.zeros((n - 1, n - 1)), 0
+        for group, size, own in zip(groups, most, x[: each * len(groups)].reshape(-1, each)):
+            kernel = size * np.exp(own[0]) * KERNELS[word](len(group[0]), *own[1:])
+            kernel += FLOOR * kernel[0, 0] * np.eye(len(kernel))
+            for part in group:
+                found[at : at + len(part), at : at + len(part)] = kernel
+                at += len(part)
+        return found
+
+    def unlikelihood(x: Array) -> float:
+        spread, total = inner @ covariance(x) @ inner.T, 0.0
+        for o, level in enumerate(x[each * len(groups) :]):
+            noise = np.exp(level) * energy[o]
+            try:
+                root = cho_factor(spread + noise * np.eye(n - 1))
+            except np.linalg.LinAlgError:
+                return 1e300
+            explained = right[:, o] @ cho_solve(root, right[:, o])
+            total += 2 * np.sum(np.log(np.diag(root[0]))) + explained + (statistics.rows - n) * level + float(
+                np.sum(rest[:, o] ** 2)) / noise
+        return float(total) / statistics.rows
+
+    words = ["size", "decay", "correlation"][:each] * len(groups) + ["noise"] * layout.l
+    ends = [minimize(unlikelihood, _start(words, *start), method="L-BFGS-B", bounds=[BOUNDS[w] for w in words])
+            for start in product(DECAYS, NOISES)]
+    x = min(ends, key=lambda end: end.fun).x
+    return Prior(columns, covariance(x), np.exp(x[each * len(groups) :]) * energy)
+
+
+def _start(words: Sequence[str], decay: float, noise: float) -> Array:
+    values = {"size": 1.0, "decay": decay, "correlation": 0.7, "noise": noise}
+    return np.array([values[word] for word in words])
