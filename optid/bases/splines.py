@@ -5,6 +5,7 @@ outside the interval). The other coefficients are then differences to the droppe
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ class _Splines(Basis):
         """Number of control points, p + degree: cells, nodes, or more."""
         return self.p + self.degree
 
-    @property
+    @cached_property
     def knots(self) -> Array:
         """(p + 2 degree + 1,) ends of the cells, those of the interval repeated."""
         return np.pad(np.linspace(*span(self), self.p + 1), self.degree, mode="edge")
@@ -36,7 +37,7 @@ class _Splines(Basis):
         """Where the functions sit, one point each: the Greville abscissae of the control points."""
         return np.lib.stride_tricks.sliding_window_view(self.knots[1:-1], self.degree).mean(axis=1)
 
-    @property
+    @cached_property
     def dropped(self) -> int:
         """Index of the function nearest 0, or nearest the middle when 0 is outside the interval."""
         lo, hi = span(self)
