@@ -67,6 +67,7 @@ def _states(name: str, structure: Mapping[str, Any] | None = None, outputs: tupl
 FED = {"feedback_basis": [FEEDBACK, None], **CUBIC}
 CELLS = [
     Cell("arx", "equation", ORDERS),
+    Cell("fir", "output", {"nb": 40}),
     *(Cell(name, "equation", {**ORDERS, **CUBIC}, curved=True) for name in
       ("hammerstein_arx.exact", "hammerstein_arx.nuclear", "hammerstein_arx.overparametrised")),
     Cell("oe.exact", "output", ORDERS),

@@ -128,10 +128,13 @@ def _wild(parts: Sequence[Array]) -> list[np.ndarray]:
     count = int(MOST * d.size) + below + 1
     middle, fifth = d.size // 2, int(0.8 * d.size)
     ordered = np.partition(d, np.unique([middle, fifth, d.size - count]))
-    top = np.sort(ordered[d.size - count :])[::-1]
     scale = max(float(ordered[middle]) / NORMAL_MEDIAN, float(ordered[fifth]) / 1.2816)
+    top = ordered[d.size - count :]
     if scale <= 8 * np.finfo(float).eps * max(float(np.max(np.abs(x), initial=0.0)) for x in parts):
         return none  # at rest but for pulses: they are the signal
+    if not np.max(top) > FAR * scale:
+        return none
+    top = np.sort(top)[::-1]
     for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
         size = float(top[k - 1]) / STEP
         found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], edges))]
