@@ -70,7 +70,7 @@ def sid(
     return in_record_units(identified(plan), plan)
 
 
-def sivid(
+def sivid(  # noqa: D417 - the other arguments by reference
     data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
     feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection", tolerance: float = 0.05,
     weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
@@ -81,25 +81,14 @@ def sivid(
     With past instruments the correlation of instruments and regressors loses rank as the record grows; the directions
     below `tolerance` are dropped (pseudo-inverse), which is what distinguishes the method from `asivid`.
 
-    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in `sid`.
 
     Args:
-        data: the record.
-        nx: as in `sid`.
-        block_rows: as in `sid`.
-        basis: as in `sid`.
         feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
         instruments: "past", "inputs" or "inputs+past".
         form: "projection" or "correlation".
         tolerance: singular value of the projected regressors, relative to the largest, below which a direction is
             dropped.
-        weighting: as in `sid`.
-        offset: as in `sid`.
-        feedthrough: as in `sid`.
-        observer: as in `sid`.
-        split: as in `sid`.
-        stability: as in `sid`.
-        constraints: as in `sid`.
 
     Raises:
         StructureError, RankError, DataError: as `sid`; RankError also where the feedback basis is linear in y.
@@ -117,7 +106,7 @@ def sivid(
     return in_record_units(identified(plan), plan)
 
 
-def asivid(
+def asivid(  # noqa: D417 - the other arguments by reference
     data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
     feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
     weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
@@ -125,26 +114,13 @@ def asivid(
 ) -> Procedure:
     """Identify a system with nonlinear feedback with instruments augmented by simulated, noise-free feedback.
 
-    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in `sivid`.
 
     Args:
-        data: the record.
-        nx: as in `sid`.
-        block_rows: as in `sid`.
-        basis: as in `sid`.
-        feedback_basis: as in `sivid`.
         noise: "coloured" keeps measured outputs out of the instruments; "white" adds the past of the outputs and of
             their feedback functions.
         iterations: simulations of the feedback with a preliminary model, each with the model of the one before; 0 uses
             past and future inputs (and with noise="white" the past outputs) alone.
-        form: as in `sivid`.
-        weighting: as in `sid`.
-        offset: as in `sid`.
-        feedthrough: as in `sid`.
-        observer: as in `sid`.
-        split: as in `sid`.
-        stability: as in `sid`.
-        constraints: as in `sid`.
 
     Raises:
         StructureError, RankError, DataError: as `sivid`.

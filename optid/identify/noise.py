@@ -27,7 +27,8 @@ from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.state_space import StateSpace
-from optid.statistics.hankel import complete_runs, hankel_statistics
+from optid.statistics.coloured import long_autoregression, response_of
+from optid.statistics.hankel import complete_runs
 
 ROUNDING = 1e-10
 """Residuals below this share of the outputs are rounding: there is no noise to describe."""
@@ -214,19 +215,16 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     """
     n, l = gain.shape  # noqa: E741
     lags = regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
-    statistics, past = hankel_statistics([r for r in errors if len(r) > lags], lags + 1), lags * l
-    root = statistics.triangle(statistics.at(range(l)))
-    spread = np.linalg.norm(root[past:, past:], axis=0)
+    autoregression, root = long_autoregression(errors, lags)
+    spread = np.linalg.norm(root, axis=0)
     if not np.all(spread > 0):
         raise StructureError("an output is predicted exactly: the covariance of the innovations is singular.")
-    regressive = np.linalg.lstsq(root[:past, :past], root[:past, past:], rcond=None)[0].reshape(lags, l, l)[::-1]
-    response, powers = [np.eye(l)], [C]
-    for i in range(1, lags + 1):
-        response.append(np.sum([regressive[j].T @ response[i - 1 - j] for j in range(i)], axis=0))
+    response, powers = response_of(autoregression, lags + 1, fade=False), [np.asarray(C)]
+    for _ in range(lags - 1):
         powers.append(powers[-1] @ (A - gain @ C))
     unit = np.tile(spread, lags)[:, None]
-    change = np.linalg.lstsq(np.vstack(powers[:-1]) / unit, np.vstack(response[1:]) / unit, rcond=None)[0]
-    K, covariance = gain + change, root[past:, past:].T @ root[past:, past:] / statistics.windows
+    change = np.linalg.lstsq(np.vstack(powers) / unit, response[1:].reshape(-1, l) / unit, rcond=None)[0]
+    K, covariance = gain + change, root.T @ root
     return np.array(kalman_gain(A, C, K @ covariance @ K.T, covariance, K @ covariance).K)
 
 

@@ -32,13 +32,13 @@ def long_autoregression(errors: Sequence[Array], lags: int) -> tuple[Array, Arra
             root[past:, past:] / np.sqrt(statistics.windows))
 
 
-def response_of(autoregression: Array, length: int = LONGEST) -> Array:
-    """Return the response (M + 1, l, l) of e to w, from one at M = 0 to where it has faded, at most so long."""
+def response_of(autoregression: Array, length: int = LONGEST, *, fade: bool = True) -> Array:
+    """Return the response (M + 1, l, l) of e to w, from one at M = 0, so long or to where it has faded."""
     lags, outputs = autoregression.shape[:2]
     found = [np.eye(outputs)]
     while len(found) < length:
         found.append(sum((a @ h for a, h in zip(autoregression, reversed(found))), np.zeros((outputs, outputs))))
-        if len(found) > lags and max(np.abs(h).max() for h in found[-lags:]) < FADED:
+        if fade and len(found) > lags and max(np.abs(h).max() for h in found[-lags:]) < FADED:
             return np.array(found[:-lags])
     return np.array(found)
 
