@@ -14,7 +14,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import optid
+from optid.identify.design.rules import check_lines
 from optid.show.panels import styled as styled
+from optid.statistics.expansion import expand
+
+SERIES = {"basis": "polynomial:4", "feedback_basis": "polynomial:4"}
+BASES = {"LSID": {"basis": "linear"}, "SIVID": SERIES, "ASIVID": SERIES}
+"""Functions of the pendulum's methods."""
 
 BETA = 0.75
 """Gauge of the dissertation: b = v_1 / beta, so that b has norm 4/3."""
@@ -46,9 +52,9 @@ def table(title: str, rows: Sequence[tuple[str, Any, str]]) -> None:
         print(f"{name:<46}{text:>22}  {reference}")
 
 
-def panels(rows: int, columns: int, **settings: Any) -> tuple[Figure, Any]:
-    """A figure with rows x columns panels."""
-    figure = Figure(figsize=(4.2 * columns, 2.7 * rows), layout="constrained")
+def panels(rows: int, columns: int, size: tuple[float, float] = (4.2, 2.7), **settings: Any) -> tuple[Figure, Any]:
+    """A figure with rows x columns panels of a size in inches."""
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **settings)
 
 
@@ -70,8 +76,48 @@ def feedback_error(model: Any, data: optid.Data) -> Any:
     return 100 * np.sqrt(np.sum((data.y - simulated) ** 2, axis=0) / np.sum(data.y**2, axis=0))
 
 
-def subspace(data: optid.Data, method: str, quiet: bool = True, **settings: Any) -> Any:
-    """Model of a subspace method: "sid" (linear unless a basis is given), "sivid" or "asivid"; without the proof."""
+def subspace(data: optid.Data, method: str, quiet: bool = True, **settings: Any) -> optid.Fit:
+    """Fit of a subspace method: "sid" (linear unless a basis is given), "sivid" or "asivid"; without the proof."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore" if quiet else "default", optid.errors.DataWarning)
-        return optid.fit(data, f"hammerstein_ss.{method}", prove=False, **settings).model
+        return optid.fit(data, f"hammerstein_ss.{method}", prove=False, **settings)
+
+
+def pendulum_fit(kind: str, method: str, train: optid.Data, nx: int) -> optid.Fit:
+    """Fit of the pendulum by LSID, SIVID or ASIVID, without feedthrough: the command acts on the next sample.
+
+    Of a sinusoid LSID and SIVID leave singular directions out, and ASIVID has the fewest block rows there can be.
+    """
+    rows = nx + 1 if (kind, method) == ("sinusoid", "ASIVID") else 10
+    settings = {"nx": nx, "block_rows": rows, "feedthrough": False, **BASES[method]}
+    if method == "SIVID" or (kind, method) == ("sinusoid", "LSID"):
+        return subspace(train, "sivid", instruments="inputs+past", tolerance=0.1, **settings)
+    return subspace(train, "sid" if method == "LSID" else "asivid", noise="white", **settings,
+                    **({"weighting": "cva"} if method == "ASIVID" else {}))
+
+
+def rank(method: str, train: optid.Data, nx: int) -> str:
+    """Return how many of the unknowns of a method a sinusoid determines, as "rank 9 of 12".
+
+    Through functions with L spectral lines it excites 2 L + 1 regressors, and amplitudes and phases of the l outputs
+    are 2 L l numbers. ASIVID needs every regressor: functions times block rows. LSID and SIVID do without, but solve
+    for the response of every state to every function before they split it into B and f.
+    """
+    basis = expand(train, BASES[method]["basis"]).inputs[0]
+    excited = int(check_lines("command", [train.u[:, 0]], basis, 10).number)
+    if method == "ASIVID":
+        return f"rank {excited} of {(nx + 1) * basis.size}"
+    return f"rank {train.l * (excited - 1)} of {nx * basis.size}"
+
+
+def judged(kind: str, method: str, train: optid.Data, test: optid.Data, nx: int) -> tuple[Any, np.ndarray, str]:
+    """Return the fit of the pendulum, its errors of angle and speed in %, and the two as text.
+
+    Where the record does not determine the model: None, inf and the `rank`.
+    """
+    try:
+        fit = pendulum_fit(kind, method, train, nx)
+    except optid.errors.DataError:
+        return None, np.full(2, np.inf), rank(method, train, nx)
+    error = feedback_error(fit.model, test)
+    return fit, error, f"{error[0]:.3g}/{error[1]:.3g}"
