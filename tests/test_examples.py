@@ -11,7 +11,8 @@ import pytest
 FOLDER = Path(__file__).parent.parent / "examples"
 SCRIPTS = {
     str(path.relative_to(FOLDER).with_suffix("")): path for path in FOLDER.rglob("*.py")
-    if path.stem != "common" and path.parent.name != "studies"  # those are run by test_study_examples.py
+    if path.stem not in ("common", "drawing")
+    and path.parent.name != "studies"  # those are run by test_study_examples.py
 }
 
 Range = tuple[float, float]
@@ -24,6 +25,25 @@ def about(value: float, tolerance: float) -> Range:
 def both(ranges: dict[str, Range]) -> dict[str, Range]:
     return {f"{basis} {key}": limits for basis in ("triangular", "trigonometric") for key, limits in ranges.items()}
 
+
+def sinusoid(method: str, *references: tuple[float, float], open_from: int) -> dict[str, Range]:
+    """Ranges of a column of table 5.1: within half of the references at order 2 and above; inf where it is open."""
+    found = {f"sinusoid {method} {nx} {name}": (value / 1.5, 1.5 * value)
+             for nx, values in enumerate(references, 2) for name, value in zip(("angle", "speed"), values)}
+    found |= {f"sinusoid {method} {nx} angle": (np.inf, np.inf) for nx in range(open_from, 9)}
+    return found | {f"sinusoid {method} 1 {name}": (90, 110) for name in ("angle", "speed")}
+
+
+FIGURES = {  # numbers of the dissertation
+    "thesis/ch4_example1": ("4.2", "4.3", "4.4", "4.5", "4.6"), "thesis/ch4_vanderpol": ("4.7", "4.8", "4.9"),
+    "thesis/ch4_efficiency": ("4.10",), "thesis/ch5_tables": ("5.3", "5.4", "5.5", "5.6"),
+    "thesis/ch5_experiments": ("5.7", "5.8", "5.9", "5.10", "5.11", "5.12", "5.13", "5.14"),
+}
+PRINTED = {  # table 5.1: why an order is open
+    "thesis/ch5_tables": (*(f"rank 4 of {nx}" for nx in range(5, 9)), *(f"rank 16 of {4 * nx}" for nx in range(5, 9)),
+                          *(f"rank 9 of {4 * nx + 4}" for nx in range(2, 9))),
+    "thesis/ch5_experiments": ("rank 9 of 16",),
+}
 
 EXPECTED: dict[str, dict[str, Range]] = {
     "quickstart": {"one-step fit": (90, 93), "simulation fit": (80, 85), "gap": (0, 1e-8), "proved": (1, 1)},
@@ -91,10 +111,11 @@ EXPECTED: dict[str, dict[str, Range]] = {
            for n, share in ((300, 0.85), (1000, 0.95))},
         "deterministic, N = 300": (1, 1), "deterministic, N = 1000": (1, 1), "slope of the threshold": (-0.6, -0.4),
     },
-    # reference at order 3: LSID 6.8 / 3.5 %, ASIVID 0.7 / 2.5 %; a sinusoid determines no order above 2
+    # reference at order 3: LSID 6.8 / 3.5 %, ASIVID 0.7 / 2.5 %; a sinusoid determines no order above 4
     "thesis/ch5_tables": {
         "chirp LSID 3 angle": (4, 8), "chirp ASIVID 3 angle": (0, 1.5), "chirp ASIVID 3 speed": (0, 2.9),
-        "chirp ASIVID 8 angle": (0, 2), "sinusoid LSID 2 angle": (0, 1), "sinusoid ASIVID 4 angle": (np.inf, np.inf),
+        "chirp ASIVID 8 angle": (0, 2), **sinusoid("LSID", (9.6, 106), (0.6, 6.4), (0.6, 2.3), open_from=5),
+        **sinusoid("SIVID", (6.4, 104), (0.7, 9.5), (0.8, 1.3), open_from=5), **sinusoid("ASIVID", open_from=2),
     },
     "thesis/ch5_experiments": {
         "1 sinusoid ASIVID angle": (np.inf, np.inf), "3 noise ASIVID angle": (0, 3.2),
@@ -139,13 +160,17 @@ EXPECTED: dict[str, dict[str, Range]] = {
 def test_script_runs_and_gives_its_figures(name, tmp_path, monkeypatch, capsys):
     path = SCRIPTS[name]
     monkeypatch.syspath_prepend(path.parent)
-    monkeypatch.delitem(sys.modules, "common", raising=False)
+    for module in ("common", "drawing"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
     main = runpy.run_path(str(path))["main"]
     figures = main(tmp_path) if inspect.signature(main).parameters else main()
     printed = capsys.readouterr().out
     for key, (low, high) in EXPECTED[name].items():
         assert low <= figures[key] <= high, f"{key}: {figures[key]} is not in [{low}, {high}]"
     assert len(printed.splitlines()) >= 3
+    assert all(printed.count(text) == 1 for text in PRINTED.get(name, ()))
+    numbers = sorted(".".join(picture.stem.split("_")[1:3]) for picture in tmp_path.glob("fig_*.png"))
+    assert numbers == sorted(FIGURES.get(name, ()))
     for picture in tmp_path.glob("*.png"):
         assert picture.stat().st_size > 20_000
     assert bool(list(tmp_path.glob("*.png"))) == bool(inspect.signature(main).parameters)

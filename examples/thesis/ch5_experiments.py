@@ -48,11 +48,10 @@ def main(folder: Path) -> dict[str, float]:
             found |= {f"{name} {method} {output}": float(e) for output, e in zip(data.outputs, error)}
         print(line + f"{'few' if rule.severity == 'error' else 'enough':>8}{condition:>10.2g}")
         if name in FIGURES:
-            draw_experiment(folder, FIGURES[name], f"experiment_{name[2:].partition(',')[0]}", name, test.raw(), fits)
-    for number, i, word in (("5.7", "3", "inputs"), ("5.11", "4", "scaled_inputs")):
-        draw_excitations(folder, number, word, f"inputs of experiment {i}",
-                         {name[2:]: data for name, data in records.items() if name[0] == i})
-    draw_frequency_response(folder, "5.10", "frequency_response", "response to the chirp", records["2 chirp"])
+            draw_experiment(folder, FIGURES[name], name, test.raw(), fits)
+    draw_excitations(folder, "5.7", 3, records)
+    draw_excitations(folder, "5.11", 4, records)
+    draw_frequency_response(folder, "5.10", "experiment 2, chirp: frequency response", records["2 chirp"])
     return found
 
 

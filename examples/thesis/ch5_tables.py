@@ -1,7 +1,7 @@
 """Tables 5.1 and 5.2: linear (LSID) and Hammerstein (SIVID, ASIVID) models of the pendulum, orders 1 to 8.
 
-Error of angle / speed in % with measured feedback, or why the sinusoid does not determine the model: "rank 9 of 12", see
-`rank` in common.py. The numbers of the source are lost, the reference is a replacement of its experiments.
+Error of angle / speed in % with measured feedback, or the rank that the sinusoid leaves too small: `rank` in common.py.
+The numbers of the source are lost, the reference is a replacement of its experiments.
 Run: python ch5_tables.py [folder for the figures]
 """
 
@@ -21,6 +21,10 @@ REFERENCES = {
     ("chirp", "ASIVID"): {2: "99/21", 3: "0.7/2.5", 4: "0.5/1.9", 6: "0.9/1.9", 8: "0.5/1.8"},
 }
 TABLES = {"5.1": ("sinusoid", ("LSID", "SIVID", "ASIVID"), 250), "5.2": ("chirp", ("LSID", "ASIVID"), 1000)}
+REASON = """\
+rank r of s: the sinusoid excites r of the s regressors that ASIVID needs with the fewest block rows, or gives r numbers
+for the s responses of states to functions that LSID and SIVID solve for (singular directions left out).
+"""
 
 
 def record(kind: str) -> tuple[optid.Data, optid.Data]:
@@ -34,7 +38,7 @@ def main(folder: Path) -> dict[str, float]:
     found = {}
     for (table, (kind, methods, shown)), number in zip(TABLES.items(), (3, 5)):
         (train, test), fits = record(kind), {}
-        print(f"\nTable {table}: {kind}\n{'order':<6}" + "".join(f"{m:>16}{'reference':>12}" for m in methods))
+        print(f"Table {table}: {kind}\n{'order':<6}" + "".join(f"{m:>16}{'reference':>12}" for m in methods))
         for nx in range(1, 9):
             line = f"{nx:<6}"
             for method in methods:
@@ -42,8 +46,10 @@ def main(folder: Path) -> dict[str, float]:
                 line += f"{text:>16}{REFERENCES.get((kind, method), {}).get(nx, ''):>12}"
                 found |= {f"{kind} {method} {nx} {name}": float(e) for name, e in zip(train.outputs, error)}
             print(line)
-        draw_record(folder, f"5.{number}", f"{kind}_record", f"experiment with a {kind}: record", test.window(0, shown))
-        draw_responses(folder, f"5.{number + 1}", f"{kind}_responses", f"experiment with a {kind}, order 3", [
+        print(REASON * (table == "5.1"))
+        title = f"experiment {table[-1]}, {kind}"
+        draw_record(folder, f"5.{number}", f"{kind}_record", f"{title}: record", test.window(0, shown))
+        draw_responses(folder, f"5.{number + 1}", f"{kind}_responses", f"{title}, order 3", [
             ("", test, {method: fits[method, 3].model for method in methods[:2]})], shown)
     return found
 

@@ -89,35 +89,38 @@ def pendulum_fit(kind: str, method: str, train: optid.Data, nx: int) -> optid.Fi
     Of a sinusoid LSID and SIVID leave singular directions out, and ASIVID has the fewest block rows there can be.
     """
     rows = nx + 1 if (kind, method) == ("sinusoid", "ASIVID") else 10
-    settings = {"nx": nx, "block_rows": rows, "feedthrough": False, **BASES[method]}
+    settings: dict[str, Any] = {"nx": nx, "block_rows": rows, "feedthrough": False, **BASES[method]}
     if method == "SIVID" or (kind, method) == ("sinusoid", "LSID"):
         return subspace(train, "sivid", instruments="inputs+past", tolerance=0.1, **settings)
-    return subspace(train, "sid" if method == "LSID" else "asivid", noise="white", **settings,
-                    **({"weighting": "cva"} if method == "ASIVID" else {}))
+    weighting = {"LSID": "moesp", "ASIVID": "cva"}[method]
+    return subspace(train, "sid" if method == "LSID" else "asivid", noise="white", weighting=weighting, **settings)
 
 
-def rank(method: str, train: optid.Data, nx: int) -> str:
-    """Return how many of the unknowns of a method a sinusoid determines, as "rank 9 of 12".
+def rank(method: str, train: optid.Data, nx: int) -> tuple[float, int]:
+    """Return how many numbers the lines of a sinusoid give a method, and how many it asks for.
 
-    Through functions with L spectral lines it excites 2 L + 1 regressors, and amplitudes and phases of the l outputs
-    are 2 L l numbers. ASIVID needs every regressor: functions times block rows. LSID and SIVID do without, but solve
+    Through functions with L spectral lines it excites 2 L + 1 regressors; amplitudes and phases of the l outputs are
+    2 L l numbers. ASIVID needs every regressor: functions times block rows. LSID and SIVID do without, but solve
     for the response of every state to every function before they split it into B and f.
     """
     basis = expand(train, BASES[method]["basis"]).inputs[0]
-    excited = int(check_lines("command", [train.u[:, 0]], basis, 10).number)
+    excited = check_lines("command", [train.u[:, 0]], basis, 10).number
     if method == "ASIVID":
-        return f"rank {excited} of {(nx + 1) * basis.size}"
-    return f"rank {train.l * (excited - 1)} of {nx * basis.size}"
+        return excited, (nx + 1) * basis.size
+    return train.l * (excited - 1), nx * basis.size
 
 
 def judged(kind: str, method: str, train: optid.Data, test: optid.Data, nx: int) -> tuple[Any, np.ndarray, str]:
     """Return the fit of the pendulum, its errors of angle and speed in %, and the two as text.
 
-    Where the record does not determine the model: None, inf and the `rank`.
+    Where the sinusoid does not determine the model: None, inf and the `rank`.
     """
     try:
         fit = pendulum_fit(kind, method, train, nx)
     except optid.errors.DataError:
-        return None, np.full(2, np.inf), rank(method, train, nx)
+        given, asked = rank(method, train, nx)
+        if given >= asked:  # another reason
+            raise
+        return None, np.full(2, np.inf), f"rank {given:g} of {asked}"
     error = feedback_error(fit.model, test)
     return fit, error, f"{error[0]:.3g}/{error[1]:.3g}"

@@ -11,10 +11,11 @@ import numpy as np
 from common import feedback_error, panels, save
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.signal import welch
 
 import optid
 from optid.plants import ReactionWheelPendulum
-from optid.show.panels import BLUE, INK, MUTED, ORANGE, styled, with_unit
+from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, styled, with_unit
 
 Cases = Sequence[tuple[str, optid.Data, dict[str, Any]]]
 
@@ -99,16 +100,17 @@ def draw_function(axis: Axes, x_label: str, y_label: str, x: np.ndarray, truth: 
     axis.plot(x, truth, color=MUTED, alpha=0.5, linewidth=2.5, label="truth")
     for (name, values), (colour, dash) in zip(found.items(), LOOKS):
         axis.plot(x, values, dash, color=colour, label=name)
+    axis.margins(y=0.25)  # room for the legend
     axis.set(xlabel=x_label, ylabel=y_label)
-    axis.legend()
+    axis.legend(loc="upper center", ncols=3)
 
 
 @styled
 def draw_times(folder: Path, number: str, name: str, title: str, lengths: Sequence[int], times: np.ndarray) -> None:
     """Save the times (2, lengths) in ms of SIVID and ASIVID against the lengths of the records."""
     figure, ((axis,),) = panels(1, 1, (5.6, 3.6))
-    for label, values, marker in zip(("SIVID, explicit projectors", "ASIVID, triangular form"), times, "os"):
-        axis.loglog(lengths, values, marker + "-", label=label)
+    for label, values, (colour, _) in zip(("SIVID, explicit projectors", "ASIVID, triangular form"), times, LOOKS):
+        axis.loglog(lengths, values, "o-", color=colour, label=label)
     axis.set(xlabel="samples N", ylabel="processor time (ms)", xticks=lengths, xticklabels=lengths, ylim=(1, None))
     axis.minorticks_off()
     axis.legend()
@@ -124,55 +126,63 @@ def draw_orders(folder: Path, number: str, name: str, title: str, cases: dict[st
     save_numbered(figure, folder, number, name, title)
 
 
-def draw_singular_values(axis: Axes, title: str, fits: dict[str, optid.Fit]) -> None:
+def draw_singular_values(axis: Axes, title: str, fits: dict[str, optid.Fit],
+                         colours: Sequence[str] = (BLUE, ORANGE, GREEN)) -> None:
     """Draw the singular values of the projected outputs, from which the order is read."""
-    for (name, fit), marker in zip(fits.items(), "os^"):
+    for (name, fit), marker, colour in zip(fits.items(), "os^", colours):
         values = fit.figures["singular values"][:10]
-        axis.semilogy(range(1, values.size + 1), np.maximum(values / values[0], 1e-16), marker + "-", label=name)
+        axis.semilogy(range(1, values.size + 1), np.maximum(values / values[0], 1e-16), marker + "-", color=colour,
+                      label=name)
     axis.set(title=title, xlabel="index", ylabel="relative to the first", xticks=range(1, 11))
     axis.legend()
 
 
 @styled
-def draw_excitations(folder: Path, number: str, name: str, title: str, records: dict[str, optid.Data]) -> None:
-    """Save command, its spectrum and the outputs, divided by their root mean squares, one row per record."""
+def draw_excitations(folder: Path, number: str, experiment: int, records: dict[str, optid.Data]) -> None:
+    """Save the commands of an experiment, their spectra and the outputs, divided by their root mean squares."""
+    records = {name[2:]: data for name, data in records.items() if name.startswith(str(experiment))}
     figure, axes = panels(len(records), 3, (4.6, 2.3))
-    for (label, data), (time, spectrum, outputs) in zip(records.items(), axes):
-        shown = slice(0, 400 if "chirp" not in label else 1000)
+    for (name, data), (time, spectrum, outputs) in zip(records.items(), axes):
+        shown = slice(0, 1000 if "chirp" in name else 400)
         time.plot(data.time[shown], data.u[shown, 0], linewidth=1.0)
-        time.set(title=label, xlabel="time (s)", ylabel="command")
-        spectrum.psd(data.u[:, 0], NFFT=512, Fs=1 / data.dt)
-        spectrum.set(title="spectrum", xlabel="frequency (Hz)", ylabel="power (dB/Hz)", xlim=(0, 10))
-        outputs.plot(data.time[shown], (data.y / np.sqrt(np.mean(data.y**2, axis=0)))[shown], label=data.outputs)
-        outputs.set(title="outputs", xlabel="time (s)", ylabel="relative to the r.m.s.")
-    figure.legend(*axes[0, 2].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    save_numbered(figure, folder, number, name, title)
+        time.set(title=name, xlabel="time (s)", ylabel="command")
+        frequency, power = welch(data.u[:, 0], 1 / data.dt, nperseg=512)
+        spectrum.plot(frequency, 10 * np.log10(power))
+        spectrum.set(title="spectrum of the command", xlabel="frequency (Hz)", ylabel="power (dB/Hz)", xlim=(0, 10),
+                     ylim=(-60, 10))
+        relative = data.y / np.sqrt(np.mean(data.y**2, axis=0))
+        outputs.plot(data.time[shown], relative[shown], linewidth=1.0, label=[f"output: {one}" for one in data.outputs])
+        outputs.set(title="outputs", xlabel="time (s)", ylabel="relative to r.m.s.")
+    figure.legend(*axes[0, 2].get_legend_handles_labels(), loc="outside lower right", ncols=2)
+    save_numbered(figure, folder, number, f"experiment_{experiment}_inputs", f"experiment {experiment}: inputs")
 
 
 @styled
-def draw_frequency_response(folder: Path, number: str, name: str, title: str, data: optid.Data) -> None:
-    """Save the measured frequency response of every output to the first input, and its coherence."""
+def draw_frequency_response(folder: Path, number: str, title: str, data: optid.Data) -> None:
+    """Save the measured frequency response of every output to the first input up to 5 Hz, and its coherence."""
     found = optid.frequency_response(data)
+    shown = found.frequency <= 5
     figure, ((left, right),) = panels(1, 2, (4.6, 3.0))
     for o, (output, unit) in enumerate(zip(data.outputs, data.output_units)):
-        gain = np.abs(found.response[:, o, 0])
-        left.plot(found.frequency, 20 * np.log10(gain / np.nanmax(gain)),
-                  label=f"{output}, largest {np.nanmax(gain):.2g} {unit} per unit")
-        right.plot(found.frequency, found.coherence[:, o], label=output)
-    left.set(xlabel="frequency (Hz)", ylabel="gain relative to the largest (dB)", xlim=(0, 5))
-    right.set(xlabel="frequency (Hz)", ylabel="coherence", xlim=(0, 5), ylim=(0, 1.05))
+        gain = np.abs(found.response[shown, o, 0])
+        left.plot(found.frequency[shown], 20 * np.log10(gain / np.nanmax(gain)),
+                  label=f"{output}, largest {np.nanmax(gain):.2g} {unit} per unit of {data.inputs[0]}")
+        right.plot(found.frequency[shown], found.coherence[shown, o], label=output)
+    left.set(xlabel="frequency (Hz)", ylabel="gain relative to the largest (dB)", ylim=(None, 12))
+    right.set(xlabel="frequency (Hz)", ylabel="coherence", ylim=(0, 1.05))
     left.legend()
     right.legend()
-    save_numbered(figure, folder, number, name, title)
+    save_numbered(figure, folder, number, "frequency_response", title)
 
 
-def draw_experiment(folder: Path, number: str, name: str, title: str, test: optid.Data,
-                    fits: dict[str, optid.Fit]) -> None:
-    """Save the responses of the pendulum, the identified curves of its motor and the singular values."""
-    u = np.linspace(-8, 8, 201)
+def draw_experiment(folder: Path, number: str, name: str, test: optid.Data, fits: dict[str, optid.Fit]) -> None:
+    """Save responses to an experiment such as "3 noise", the curves of the motor less a line, and singular values."""
+    kind, u = name[2:].partition(",")[0], np.linspace(-8, 8, 201)
     torque = 1e3 * ReactionWheelPendulum().torque(u)
-    curves = {method: onto(torque, fit.model.nonlinearities[0](u)) for method, fit in fits.items()}
-    draw_responses(folder, number, name, title, [("", test, {method: fit.model for method, fit in fits.items()})],
-                   1000 if "chirp" in title else 300, more=(
-        lambda axis: draw_function(axis, "command", "motor torque (mN m)", u, torque, curves),
-        lambda axis: draw_singular_values(axis, "singular values", fits)))
+    line = onto(torque, u)
+    curves = {method: onto(torque, fit.model.nonlinearities[0](u)) - line for method, fit in fits.items()}
+    draw_responses(
+        folder, number, f"experiment_{name[0]}_{kind}", f"experiment {name[0]}, {name[2:]}, order 3",
+        [("", test, {method: fit.model for method, fit in fits.items()})], 1000 if kind == "chirp" else 300,
+        more=(lambda axis: draw_function(axis, "command", "torque - line (mN m)", u, torque - line, curves),
+              lambda axis: draw_singular_values(axis, "singular values", fits, [colour for colour, _ in LOOKS])))
