@@ -100,7 +100,7 @@ def draw_function(axis: Axes, x_label: str, y_label: str, x: np.ndarray, truth: 
     axis.plot(x, truth, color=MUTED, alpha=0.5, linewidth=2.5, label="truth")
     for (name, values), (colour, dash) in zip(found.items(), LOOKS):
         axis.plot(x, values, dash, color=colour, label=name)
-    axis.margins(y=0.25)  # room for the legend
+    axis.margins(y=0.4)  # room for the legend
     axis.set(xlabel=x_label, ylabel=y_label)
     axis.legend(loc="upper center", ncols=3)
 
