@@ -29,6 +29,12 @@ CUBIC = {"basis": "polynomial:3"}
 FEEDBACK = Triangular(9, interval=(-4.0, 4.0))
 """Of the first output; its values at the nodes are those of sin(2 y)."""
 
+OBSERVER = optid.Equations(
+    lambda v: {"x1": v["b1"] * v["u"] - v["a1"] * v["x1"] + v["x2"], "x2": v["b2"] * v["u"] - v["a2"] * v["x1"],
+               "y": v["x1"]},
+    states={"x1": 0.1, "x2": 0.1}, parameters={"a1": -1.0, "a2": 0.5, "b1": 1.0, "b2": 0.5}, time="discrete")
+"""The linear system as equations of one's own."""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -92,6 +98,7 @@ CELLS = [
              outputs=(2,)),
     *_states("hammerstein_ss.exact", structure={**FED, "criterion": "prediction"}, curved=True, fed=True, outputs=(2,)),
     *(cell for name in ("lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact") for cell in _states(name)),
+    Cell("physical", "output", {"equations": OBSERVER}, samples=600),
     Cell("subspace.nuclear", "states", {"nx": 2, "block_rows": 5}, samples=300),
     Cell("subspace.nuclear", "states", {"nx": 2, "block_rows": 5, "weight": 1e3}, outputs=2, samples=200),
 ]

@@ -21,6 +21,7 @@ _HOME = {
     "identify.selection": ["path", "fit_by_holdout"],
     "identify.validation": ["validate", "compare_models", "fit_by_horizon"],
     "identify.order": ["order", "OrderStudy"],
+    "models.equations": ["Equations"],
     "models.files": ["load"],
     "identify.recursive": ["RecursiveARX"],
     "faults": ["Fault"],

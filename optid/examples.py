@@ -114,8 +114,23 @@ def vanderpol(seed: int = 0, n: int = 6000) -> Example:
     return Example(data, {"n": 2, "f": (plants.van_der_pol_drive,)}, suggestion)
 
 
+def two_tanks(seed: int = 0, n: int = 600) -> Example:
+    """Return two simulated tanks with square-root outflow: pump voltage to the level of the lower one.
+
+    Levels of 0.5 to 3 V, held 20 samples of 1 s, measurement noise 0.02 (`optid.plants.two_tanks`). The equations with
+    unknown parameters are `optid.plants.TWO_TANKS`, for the formulation "physical".
+    """
+    u = signals.uniform_levels(n, 0.5, 3.0, hold=20, seed=seed)
+    truth = {"n": 2, "parameters": {"pump": 0.4, "upper": 0.3, "lower": 0.25},
+             "noise_free": plants.two_tanks(u, seed).y}
+    suggestion = {"na": 2, "nb": 2, "nk": 1, "basis": "polynomial:2", "nx": 2,
+                  "equations": "optid.plants:TWO_TANKS"}
+    return Example(plants.two_tanks(u, seed, measurement=0.02), truth, suggestion)
+
+
 EXAMPLES: dict[str, Callable[..., Example]] = {
-    function.__name__: function for function in (thruster, broken_thruster, dead_zone, two_inputs, pendulum, vanderpol)
+    function.__name__: function for function in (
+        thruster, broken_thruster, dead_zone, two_inputs, pendulum, vanderpol, two_tanks)
 }
 """The built-in records by the name that the command line takes."""
 

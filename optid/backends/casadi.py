@@ -9,7 +9,7 @@ infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import mul
 from typing import Any
@@ -60,6 +60,27 @@ def translate(form: Smooth) -> dict[str, Any]:
     rows = [ca.densify(column(row.expression)) for row in form.rows]
     return {"x": x, "p": p, "f": ca.densify(column(form.problem.objective.expr)),
             "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
+
+
+def function_of(groups: Sequence[Sequence[cp.Variable]], results: Sequence[Sequence[Any]]) -> Any:
+    """Return plain expressions of scalar variables as a `casadi.Function` of one vector per group.
+
+    Args:
+        groups: the variables of every argument.
+        results: the expressions of every result, CVXPY's or numbers.
+
+    Raises:
+        StructureError: an atom without a translation, by name.
+    """
+    arguments = [ca.MX.sym(f"v{i}", len(group)) for i, group in enumerate(groups)]
+    known = {leaf.id: vector[i] for group, vector in zip(groups, arguments) for i, leaf in enumerate(group)}
+
+    def column(expr: Any) -> Any:
+        return _column(expr, known, column)
+
+    rows = [ca.vertcat(*(ca.densify(column(cp.Constant(one) if np.isscalar(one) else one)) for one in result))
+            for result in results]
+    return ca.Function("equations", arguments, rows).expand()
 
 
 def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> Any:
@@ -153,6 +174,11 @@ def _prod(expr: Any, columns: list) -> Any:
     return reduce(mul, ca.vertsplit(columns[0]))
 
 
+def _softplus(x: Any) -> Any:
+    """log(1 + exp x) that does not overflow."""
+    return ca.fmax(x, 0) + ca.log1p(ca.exp(-ca.fabs(x)))
+
+
 def _of_one(function: str) -> Callable[[Any, list], Any]:
     return lambda _, columns: getattr(ca, function)(ca.densify(columns[0]))
 
@@ -169,7 +195,7 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
     "QuadForm": lambda expr, columns: ca.dot(columns[0], _matrix(columns[1], expr.args[1].shape) @ columns[0]),
     "entr": lambda _, columns: -columns[0] * ca.log(columns[0]),
     "rel_entr": lambda _, columns: columns[0] * ca.log(columns[0] / columns[1]),
-    "logistic": lambda _, columns: ca.log1p(ca.exp(ca.densify(columns[0]))),
+    "logistic": lambda _, columns: _softplus(ca.densify(columns[0])),
     "normcdf": lambda _, columns: 0.5 * (1.0 + ca.erf(ca.densify(columns[0]) / np.sqrt(2.0))),
     **{name: _of_one(name) for name in ("exp", "log", "log1p", "sin", "cos", "tan", "sinh", "tanh", "asinh", "atanh")},
 }
@@ -210,6 +236,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     chosen = options(name, settings)
     if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
         chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
+    if name == "ipopt" and program.settled and settings.warm:  # a large barrier would throw away the start
+        chosen = {"ipopt.mu_init": 1e-6} | chosen
     graph = kept(program.problem, "casadi", lambda: translate(form))
     solver = kept(program.problem, (name, repr(sorted(chosen.items()))),
                   lambda: ca.nlpsol("solver", name, graph, chosen))

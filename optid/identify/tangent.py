@@ -109,10 +109,10 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     """
     _refuse(fit)
     program, compressed, found = fit.program, fit.program.compressed, fit.solution.values
-    shapes = {name: v.shape for name, v in program.variables.items() if name not in program.derived}
+    shapes = {name: v.shape for name, v in program.variables.items() if name not in program.implied}
     x = np.concatenate([np.ravel(found[name], order="F") for name in shapes])
     program.assign(found)
-    equalities, inequalities, slack = _constraint_rows(program, tuple(shapes))
+    equalities, inequalities, slack = constraint_rows(program, tuple(shapes))
 
     lift, lifted = _differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
     problem = compressed.problem
@@ -195,14 +195,17 @@ def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]
     return free, triangle, basis
 
 
-def _constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
-    """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at the point."""
-    variables, derived = ([program.variables[name] for name in group] for group in (names, program.derived))
+def constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at the point.
+
+    Constraints about variables that the others imply are left out.
+    """
+    variables, implied = ([program.variables[name] for name in group] for group in (names, program.implied))
     nothing = np.zeros((0, sum(variable.size for variable in variables)))
     equal, above, slack = [nothing], [nothing], [np.zeros(0)]
     for name, group in program.constraints.items():
         for member in group:
-            level = None if {v.id for v in member.variables()} & {v.id for v in derived} else _level(name, member)
+            level = None if {v.id for v in member.variables()} & {v.id for v in implied} else _level(name, member)
             if level is None:
                 continue
             if (slopes := jacobians(level)) is None:

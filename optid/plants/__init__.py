@@ -16,7 +16,15 @@ A missing input, a wrong shape and a run that leaves all bounds raise a `DataErr
 """
 
 from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem, two_mode_plant
-from optid.plants.physical import ReactionWheelPendulum, pendulum, pendulum_input, van_der_pol, van_der_pol_drive
+from optid.plants.physical import (
+    TWO_TANKS,
+    ReactionWheelPendulum,
+    pendulum,
+    pendulum_input,
+    two_tanks,
+    van_der_pol,
+    van_der_pol_drive,
+)
 
-__all__ = ["EXAMPLE1", "NOISE_CASES", "TWO_MODES", "FeedbackSystem", "ReactionWheelPendulum", "pendulum",
-           "pendulum_input", "two_mode_plant", "van_der_pol", "van_der_pol_drive"]
+__all__ = ["EXAMPLE1", "NOISE_CASES", "TWO_MODES", "TWO_TANKS", "FeedbackSystem", "ReactionWheelPendulum", "pendulum",
+           "pendulum_input", "two_mode_plant", "two_tanks", "van_der_pol", "van_der_pol_drive"]

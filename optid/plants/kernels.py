@@ -5,18 +5,22 @@ from numba import njit
 
 from optid.arrays import Array
 
-PENDULUM, VAN_DER_POL = 0, 1
+PENDULUM, VAN_DER_POL, TANKS = 0, 1, 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -> None:
-    """Write the time derivative of the state; p as `ReactionWheelPendulum.coefficients`, or (eps,)."""
+    """Write the time derivative of the state; p as `ReactionWheelPendulum.coefficients`, (eps,), or of the tanks."""
     if plant == PENDULUM:  # angle, rate, wheel speed, driven by a torque
         inertia, weight, wheel, damping, viscous, coulomb, threshold = p
         friction = viscous * x[2] + coulomb * np.tanh(x[2] / threshold)
         out[0] = x[1]
         out[1] = (-weight * np.sin(x[0]) - drive + friction - damping * x[1]) / inertia
         out[2] = (drive - friction) / wheel - out[1]
+    elif plant == TANKS:  # levels
+        between, out_flow = p[1] * np.sqrt(max(x[0], 0.0)), p[2] * np.sqrt(max(x[1], 0.0))
+        out[0] = p[0] * drive - between
+        out[1] = between - out_flow
     else:  # the measured output x1 + v is fed back
         out[0] = x[1] + p[0] * (x[0] - (x[0] + v) ** 3 / 3)
         out[1] = drive - x[0]
@@ -25,7 +29,7 @@ def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -
 @njit(cache=True, nogil=True, error_model="numpy")
 def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, dt: float, substeps: int,
               stages: int) -> Array:
-    """Return the states (N, n) of `PENDULUM` or `VAN_DER_POL` at the sampling instants, from x0 (n,).
+    """Return the states (N, n) of `PENDULUM`, `VAN_DER_POL` or `TANKS` at the sampling instants, from x0 (n,).
 
     The classical Runge-Kutta method has 4 stages, Euler's 1. The drive (N,) and the measurement noise v (N,), which is
     fed back, are held over a sample; the process noise w (N, n) is added at its end. The parameters p are those of

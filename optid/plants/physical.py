@@ -1,9 +1,11 @@
-"""The reaction wheel pendulum and the Van der Pol oscillator: plants of known physics with known imperfections.
+"""The reaction wheel pendulum, the Van der Pol oscillator and two tanks: plants of known physics.
 
 The arguments that they share are those of `optid.plants`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +14,7 @@ from optid import signals
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import StructureError, nearest
+from optid.models.equations import Equations
 from optid.plants.sampling import as_input, as_state, check_bounded, check_parameters, gaussian
 
 STAGES = {"euler": 1, "rk4": 4}
@@ -179,3 +182,41 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
                        float(dt), int(substeps) if method == "rk4" else 1, STAGES[method])
     check_bounded(states, "Van der Pol oscillator")
     return Data(u, states[:, 0] + v, dt, name="vanderpol")
+
+
+def two_tanks(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: float = 0.0, pump: float = 0.4,
+              upper: float = 0.3, lower: float = 0.25, dt: float = 1.0, substeps: int = 10,
+              x0: ArrayLike = (1.0, 1.0)) -> Data:
+    """Simulate two tanks, the upper one emptying into the lower one; the level of the lower one is measured.
+
+    h1' = pump u - upper sqrt h1, h2' = upper sqrt h1 - lower sqrt h2, y = h2 + v (Torricelli's law). `TWO_TANKS` are
+    these equations with the parameters unknown.
+
+    Further arguments:
+        u: (N,) voltage of the pump, held over a sample.
+        measurement: standard deviation of v.
+        pump: flow per volt.
+        upper: coefficient of the outlet of the upper tank.
+        lower: coefficient of the outlet of the lower tank.
+        x0: levels at the first sample.
+    """
+    from optid.plants.kernels import TANKS, integrate
+
+    u = as_input(u, 1)
+    check_parameters(dt=dt, substeps=substeps, pump=pump, upper=upper, lower=lower)
+    v = gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
+    still = np.zeros(len(u)), np.zeros((len(u), 2))
+    levels = integrate(TANKS, u[:, 0], *still, as_state(x0, 2), np.array([pump, upper, lower]), float(dt),
+                       int(substeps), STAGES["rk4"])
+    check_bounded(levels, "pair of tanks")
+    return Data(u, levels[:, 1] + v, dt, name="two_tanks")
+
+
+def _torricelli(v: Mapping[str, Any]) -> dict[str, Any]:
+    between, out = v["upper"] * v["h1"] ** 0.5, v["lower"] * v["h2"] ** 0.5
+    return {"h1": v["pump"] * v["u"] - between, "h2": between - out, "y": v["h2"]}
+
+
+TWO_TANKS = Equations(_torricelli, states={"h1": 1.0, "h2": 1.0}, bounds={"h1": (0.0, None), "h2": (0.0, None)},
+                      parameters={"pump": 1.0, "upper": 1.0, "lower": 1.0})
+"""The equations of `two_tanks`, their parameters started at one."""

@@ -16,6 +16,9 @@ Map = Callable[[np.ndarray], np.ndarray]
 DENSE = 100_000
 """Entries of the Jacobian up to which an expression is small."""
 
+MOST = 30_000_000
+"""Entries up to which a large expression is differentiated here where CVXPY knows no gradient."""
+
 MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "Concatenate", "Promote", "broadcast_to",
          "diag_vec", "diag_mat", "upper_tri", "squeeze", "Stack", "nonneg_wrap", "nonpos_wrap", "symmetric_wrap",
          "psd_wrap", "nsd_wrap", "real"}
@@ -37,14 +40,13 @@ def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
     Small expressions are differentiated here, with the common atoms by their own rules: CVXPY composes sparse
     matrices atom by atom, which takes ten times as long. Large ones are left to it, and their Jacobians are sparse.
     """
-    variables = expression.variables()
-    if expression.size * sum(variable.size for variable in variables) <= DENSE:
-        node = _differentiate(expression, {})
+    entries = expression.size * sum(variable.size for variable in expression.variables())
+    gradients: Any = expression.grad if entries > DENSE else {None: None}
+    if None in gradients.values():  # CVXPY knows no gradient of an odd power where it is negative
+        node = _differentiate(expression, {}) if entries <= MOST else None
         return None if node is None else dict(node.slopes)
     found = {}
-    for variable, part in expression.grad.items():
-        if part is None:
-            return None
+    for variable, part in gradients.items():
         matrix = part if sp.issparse(part) else np.reshape(np.asarray(part, dtype=float),
                                                            (variable.size, expression.size))
         found[variable] = sp.csr_array(sp.csr_array(matrix).T)
@@ -138,6 +140,13 @@ def _product(expression: Any, values: list[Any]) -> list[Map]:
             lambda slope: np.matmul(left, slope.reshape(columns, inner, -1)).reshape(rows * columns, -1)]
 
 
+def _power(expression: Any, values: list[Any]) -> list[Map | None]:
+    exponent = float(expression.p.value)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factors = exponent * np.power(values[0], exponent - 1)
+    return [_scaled(factors) if np.all(np.isfinite(factors)) else None]
+
+
 def _sum(expression: Any, values: list[Any]) -> list[Map]:
     shape, axis = values[0].shape, expression.axis
     axes = range(len(shape)) if axis is None else [axis] if isinstance(axis, int) else axis
@@ -152,12 +161,12 @@ def _squares(expression: Any, values: list[Any]) -> list[Map]:
             lambda slope: -total(np.ravel((above / below) ** 2, order="F")[:, None] * slope)]
 
 
-RULES: dict[str, Callable[[Any, list[Any]], list[Map]]] = {
+RULES: dict[str, Callable[[Any, list[Any]], Any]] = {
     "AddExpression": lambda _, values: [lambda slope: slope] * len(values),
     "NegExpression": lambda _, values: [np.negative],
     "multiply": lambda _, values: [_scaled(value) for value in reversed(values)],
     "DivExpression": lambda _, values: [_scaled(1 / values[1]), _scaled(-values[0] / values[1] ** 2)],
-    "MulExpression": _product, "Sum": _sum, "quad_over_lin": _squares}
+    "Power": _power, "PowerApprox": _power, "MulExpression": _product, "Sum": _sum, "quad_over_lin": _squares}
 """By atom, from its arguments' values, what maps the Jacobian of every argument; arguments have the atom's shape."""
 
 

@@ -65,6 +65,8 @@ class Program:
         note: why there can be no proof, where that is known beforehand.
         compressed: the compressed data the programme was built from, for prices, intervals and figures.
         unit: what one unit of the objective is in units of the record; solutions report their values in the latter.
+        settled: whether the start is close to an optimum, from which a solver should not wander.
+        courses: variables besides the derived ones that the structural constraints determine from the others.
         limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
     """
 
@@ -85,6 +87,13 @@ class Program:
     compressed: Compressed | None = field(default=None, repr=False)
     unit: float = 1.0
     limits: Mapping[str, tuple[Limit, ...]] = field(default_factory=dict, repr=False)
+    courses: frozenset[str] = frozenset()
+    settled: bool = False
+
+    @property
+    def implied(self) -> frozenset[str]:
+        """Variables that the others determine."""
+        return self.courses | self.derived.keys()
 
     @cached_property
     def problem(self) -> cp.Problem:

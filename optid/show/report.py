@@ -11,6 +11,7 @@ from optid import __version__, plots
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.validation import Validation, validate
+from optid.models.functions import static_functions
 from optid.show import checks, comparing, estimates, summary, wording
 from optid.show.page import figure, template, versions
 from optid.show.printing import describe
@@ -194,13 +195,14 @@ def _figures(fit: "Fit") -> list[dict[str, Any]]:
                 "the estimation record; the simulation starts from the initial state that fits best.",
             )
         )
-    found.append(
-        figure(
-            "nonlinearity",
-            lambda: plots.nonlinearity(fit),
-            "Static nonlinearity, with its 95 % band where there is one. The bars show where the samples lie.",
+    if static_functions(fit.model):
+        found.append(
+            figure(
+                "nonlinearity",
+                lambda: plots.nonlinearity(fit),
+                "Static nonlinearity, with its 95 % band where there is one. The bars show where the samples lie.",
+            )
         )
-    )
     if plots.theta_singular_values(fit):
         found.append(
             figure(

@@ -186,7 +186,8 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
 
 
 def _structure(model: Any, data: Data, notes: list[str]) -> Structure | None:
-    if has_feedback(model) or getattr(model, "latent", ()):  # in closed loop the test says nothing, and these are more
+    # in closed loop the test says nothing, and the others are more than Hammerstein models
+    if has_feedback(model) or getattr(model, "latent", ()) or not static_functions(model):
         return None
     try:
         with warnings.catch_warnings():
