@@ -15,7 +15,6 @@ import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.zero import Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
@@ -24,7 +23,7 @@ from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.backends.back_end import Answer
 from optid.errors import StructureError
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, rows_of
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -240,10 +239,8 @@ class _SmoothChain(Dnlp2Smooth):
 
 
 def _row(constraint: Constraint) -> Row:
-    if isinstance(constraint, EQUALITIES | INEQUALITIES):
-        return Row(constraint.expr, isinstance(constraint, EQUALITIES), constraint.id)
-    if isinstance(constraint, NonNeg):
-        return Row(-constraint.args[0], False, constraint.id)
+    if (expression := rows_of(constraint)) is not None:
+        return Row(expression, isinstance(constraint, EQUALITIES), constraint.id)
     raise StructureError(
         f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
         "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
-from optid.program.gradients import flat_value
+from optid.program.gradients import differences, flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
@@ -107,21 +107,20 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> tuple[f
 def _hessian(program: Program) -> Array:
     """Second derivatives of a quadratic objective: differences of its gradient, which are exact."""
     variables = list(program.variables.values())
+    point = np.concatenate([flat_value(v) for v in variables])
 
-    def gradient() -> Array:
+    def assign(x: Array) -> None:
+        for v, part in zip(variables, np.split(x, np.cumsum([v.size for v in variables])[:-1])):
+            v.save_value(part.reshape(v.shape, order="F"))
+
+    def gradient(x: Array) -> Array:
+        assign(x)
         lagrangian = Lagrangian(program)
         lagrangian.add(program.objective.expr, np.ones(1))
         return np.concatenate([lagrangian.total[v.id] for v in variables])
 
-    columns, base = [], gradient()
-    for variable in variables:
-        value = np.array(variable.value, dtype=float)
-        size = float(np.max(np.abs(value), initial=0.0)) or 1.0
-        for step in size * np.eye(variable.size):
-            variable.save_value(value + step.reshape(variable.shape, order="F"))
-            columns.append((gradient() - base) / size)
-        variable.save_value(value)
-    matrix = np.array(columns)
+    matrix, _ = differences(gradient, point)
+    assign(point)
     return (matrix + matrix.T) / 2
 
 

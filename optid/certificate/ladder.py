@@ -8,7 +8,6 @@ recomputed in closed form from its multipliers after a Cholesky check; nothing i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 
@@ -69,7 +68,6 @@ class Case:
         nu: KKT multipliers (r_i,) of the cones, by block.
         lam: KKT multipliers (r,) of the linear constraints.
         linear: constraints on the lifted vector.
-        began: clock at the start.
     """
 
     core: Core
@@ -80,7 +78,6 @@ class Case:
     nu: dict[int, Array]
     lam: Array
     linear: Linear
-    began: float
 
     @property
     def blocks(self) -> list[Block]:
@@ -176,7 +173,6 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
 
 def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear) -> Case:
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
-    began = perf_counter()
     keep_linear = bool(linear.rows[:, :problem.linear].any())
     keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
     core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
@@ -196,7 +192,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     else:
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear, began)
+    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
 
 
 def instant_cuts(case: Case) -> dict[int, Array]:
@@ -295,5 +291,4 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     else:
         reason = f"not proved, no finite bound: {how}"
     evidence = Multipliers(case.core, minors, cuts, case.lam if linear is None else linear)
-    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence),
-                         () if proved else better)
+    return Certification(Bound(bound, proved, method, reason, evidence), () if proved else better)

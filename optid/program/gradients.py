@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 Map = Callable[[np.ndarray], np.ndarray]
-"""From the Jacobian of an argument to its part of that of an atom."""
+"""Of arrays, such as from the Jacobian of an argument to its part of that of an atom."""
 
 DENSE = 100_000
 """Entries of the Jacobian up to which an expression is small."""
@@ -159,6 +159,18 @@ RULES: dict[str, Callable[[Any, list[Any]], list[Map]]] = {
     "DivExpression": lambda _, values: [_scaled(1 / values[1]), _scaled(-values[0] / values[1] ** 2)],
     "MulExpression": _product, "Sum": _sum, "quad_over_lin": _squares}
 """By atom, from its arguments' values, what maps the Jacobian of every argument; arguments have the atom's shape."""
+
+
+def differences(function: Map, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Jacobian and value of a function that is affine in each entry of x alone: its differences are exact."""
+    base = function(x)
+    jacobian = np.empty((base.size, x.size))
+    steps = np.maximum(np.abs(x), 1e-3 * float(np.max(np.abs(x), initial=0.0)) or 1.0)
+    for j, step in enumerate(steps):
+        moved = x.copy()
+        moved[j] += step
+        jacobian[:, j] = (function(moved) - base) / (moved[j] - x[j])
+    return jacobian, base
 
 
 def side_by_side(slopes: Mapping[cp.Variable, Any], variables: Iterable[cp.Variable], rows: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
 from optid.program.judging import term_size
-from optid.program.limits import EQUALITIES, INEQUALITIES, Limit, slope_of
+from optid.program.limits import EQUALITIES, Limit, rows_of, slope_of
 from optid.program.program import Program
 from optid.program.solution import Solution
 
@@ -102,8 +102,8 @@ def _slacks(member: Constraint) -> np.ndarray:
     """Distance of every row from its bound; zero for equalities."""
     if isinstance(member, EQUALITIES):
         return np.zeros(member.size)
-    if isinstance(member, INEQUALITIES):
-        return -np.ravel(member.expr.value)
+    if (rows := rows_of(member)) is not None:
+        return -np.ravel(rows.value)
     if isinstance(member, PSD):
         return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
     if isinstance(member, SOC):

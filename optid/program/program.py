@@ -11,7 +11,7 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.errors import StructureError, nearest
 from optid.program.compressed import Compressed
-from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
+from optid.program.limits import Limit
 from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
@@ -212,32 +212,6 @@ class Program:
                        structure=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
-
-    def soften(self, name: str, weight: float) -> "Program":
-        """Return the programme with a user's equality or inequality turned into a quadratic penalty on its violation.
-
-        The weight is the penalty per squared unit of violation.
-
-        Raises:
-            StructureError: unknown name, or a constraint that is neither an equality nor an inequality.
-        """
-        if name not in self.user_constraints:
-            raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
-        penalty: Any = 0.0
-        said = [limit.member for limit in self.limits.get(name, ())] or self.constraints[name]
-        for member in said:
-            if isinstance(member, EQUALITIES):
-                penalty = penalty + cp.sum_squares(member.expr)
-            elif isinstance(member, INEQUALITIES):
-                penalty = penalty + cp.sum_squares(cp.pos(member.expr))
-            else:
-                raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
-                                     "only equalities and inequalities can be softened")
-        rest = {key: group for key, group in self.constraints.items() if key != name}
-        objective = cp.Minimize(self.objective.expr + weight / self.unit * penalty)
-        return replace(self, objective=objective, constraints=rest,
-                       structure=None, certify=None,
-                       note=f"constraint {name!r} is a penalty here")
 
     def without(self, *names: str) -> "Program":
         """Return the programme without the named constraints."""

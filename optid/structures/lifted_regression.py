@@ -13,7 +13,7 @@ from optid.arrays import Array
 from optid.models.layout import Layout
 from optid.statistics import Statistics
 from optid.structures.rank_one import Core, RankOne
-from optid.structures.whitening import leading_pair
+from optid.structures.whitening import leading_pair, symmetric_root
 
 
 def positions(layout: Layout) -> NDArray[np.intp]:
@@ -50,7 +50,7 @@ def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: flo
     if ridge or curvature:
         penalties = [ridge / scale**2 * np.eye(basis.size) + curvature * np.asarray(basis.penalty(2))
                      for basis, scale in zip(layout.bases, scales)]
-        roots = [np.kron(np.eye(q), _square_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
+        roots = [np.kron(np.eye(q), symmetric_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
         system = np.vstack([system, np.pad(np.asarray(block_diag(*roots)), ((0, 0), (linear, 1)))])
     if prior is not None:
         system = np.vstack([system, np.pad(prior, ((0, 0), (0, 1)))])
@@ -59,11 +59,6 @@ def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: flo
     remainder += float(triangle[total, total] ** 2) if triangle.shape[0] > total else 0.0
     return RankOne(root=triangle[:total, :total], target=triangle[:total, total], remainder=remainder, linear=linear,
                    blocks=blocks, scale=float(np.sum(root[:, n:] ** 2)))
-
-
-def _square_root(matrix: Array) -> Array:
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
 def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) -> list[tuple[Array, Array]]:

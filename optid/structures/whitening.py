@@ -51,6 +51,12 @@ def invert_triangular(factor: Array, lower: bool = True) -> Array:
     return inverse
 
 
+def symmetric_root(matrix: Array) -> Array:
+    """Return the symmetric square root of a matrix without negative eigenvalues, which is unique."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
 def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
     """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
 
