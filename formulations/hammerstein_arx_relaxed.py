@@ -30,11 +30,10 @@ from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import Core
 
 
-def nuclear(  # noqa: D417 - the other arguments by reference
-    data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
-    nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
-    ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm"
-) -> Program | Procedure:
+def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
+            nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
+            ridge: float = 0.0, curvature: float = 0.0, prior: str = "none",
+            gauge: str = "norm") -> Program | Procedure:
     """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
@@ -61,11 +60,10 @@ def nuclear(  # noqa: D417 - the other arguments by reference
                           convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
 
 
-def overparametrised(  # noqa: D417 - the other arguments by reference
-    data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
-    nk: int | Sequence[int] = 0, svd: str = "whitened", constraints: Sequence[Any] = (), loss: str = "squares",
-    ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm"
-) -> Program | Procedure:
+def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
+                     basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
+                     constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, curvature: float = 0.0,
+                     prior: str = "none", gauge: str = "norm") -> Program | Procedure:
     """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
     Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `nuclear`.

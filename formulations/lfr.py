@@ -12,8 +12,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from formulations.state_space import StateSpaceFit
-from formulations.state_space_procedure import state_space_fit
+from formulations.state_space import state_space_fit
 from optid.arrays import check_integer
 from optid.bases import Bases, Basis, Polynomial, parse
 from optid.data.record import Data
@@ -32,26 +31,17 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the error of a model with functions of latent signals.
 
-    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`.
 
     Args:
-        data: the record.
-        nx: number of states, or "auto".
         channels: number of latent signals.
         latent_basis: basis of every h, on z in [-1, 1]; beyond, polynomials go on as they are, splines straight.
         latent: what z is made of, "states+inputs" or "states".
         direct: whether h acts on the outputs, too.
-        basis: basis of the inputs.
         criterion: "simulation" (the free run) or "prediction" (K estimated).
-        block_rows: as in `formulations.state_space.hammerstein_ss`, as are the arguments below.
-        weighting: of the outputs.
-        offset: estimate a constant.
-        feedthrough: whether the inputs act on the outputs at once.
-        stability: "stable" or "free", of A.
         initial: models to start from besides, without latent signals.
-        iterations: Gauss-Newton steps per descent at most.
         seed: of the directions of z that are tried.
-        constraints: rules about poles, builders of CVXPY constraints in the named variables.
 
     Raises:
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
@@ -63,7 +53,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
     extend = partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations)
     return state_space_fit(
-        "lfr.exact", data, nx, StateSpaceFit, basis=basis, criterion=criterion, block_rows=block_rows,
+        "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
         weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
         iterations=iterations, constraints=constraints, extend=extend)
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from formulations.lfr import on_latent
-from formulations.state_space import StateSpaceFit
-from formulations.state_space_procedure import state_space_fit
+from formulations.state_space import state_space_fit
 from optid.bases import Bases
 from optid.data.record import Data
 from optid.identify.arguments import in_memory
@@ -30,22 +29,13 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
               constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Wiener model.
 
-    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``.
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`, as are the errors raised.
 
     Args:
-        data: the record.
-        nx: number of states, or "auto".
         output_basis: basis of every h, on z in [-1, 1].
-        block_rows: as in `formulations.state_space.hammerstein_ss`, as are the arguments below.
-        weighting: of the outputs.
         feedthrough: whether the inputs act on z at once.
-        stability: "stable" or "free", of A.
         initial: linear models to start from besides.
-        iterations: Gauss-Newton steps per descent at most.
-        constraints: rules about poles, builders of CVXPY constraints in the named variables.
-
-    Raises:
-        StructureError, DataError, RankError: as `formulations.state_space.hammerstein_ss`.
     """
     return _fit("wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
                 weighting=weighting, feedthrough=feedthrough, stability=stability, initial=initial,
@@ -59,22 +49,12 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
                           constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Hammerstein-Wiener model whose inputs act on the outputs a sample later.
 
-    Named variables: ``Bu``, ``Du``, ``Theta``, ``offset``, ``x0``.
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`, as are the errors raised.
 
     Args:
-        data: the record.
-        nx: number of states, or "auto".
-        basis: basis of the input nonlinearity, one per input or one for all.
         output_basis: basis of every h, on z in [-1, 1].
-        block_rows: as in `formulations.state_space.hammerstein_ss`, as are the arguments below.
-        weighting: of the outputs.
-        stability: "stable" or "free", of A.
         initial: Hammerstein models to start from besides.
-        iterations: Gauss-Newton steps per descent at most.
-        constraints: rules about poles, builders of CVXPY constraints in the named variables.
-
-    Raises:
-        StructureError, DataError, RankError: as `formulations.state_space.hammerstein_ss`.
     """
     return _fit("hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
                 block_rows=block_rows, weighting=weighting, feedthrough=False, stability=stability, initial=initial,
@@ -87,5 +67,5 @@ def _fit(name: str, data: Data, nx: int | str, output_basis: Any, moved: bool, i
     functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=moved)
                       for o in range(in_memory(data, "simulation errors").l))
     extend = partial(add_output_functions, functions=functions, iterations=iterations)
-    return state_space_fit(name, data, nx, StateSpaceFit, criterion="simulation", iterations=iterations, extend=extend,
+    return state_space_fit(name, data, nx, criterion="simulation", iterations=iterations, extend=extend,
                            **settings)
