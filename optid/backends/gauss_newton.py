@@ -38,8 +38,7 @@ def run(program: Program, settings: Settings) -> Answer:
     ``descents`` (how many of these are then followed to their end, default 2).
     """
     form = rank_one_of(program)
-    if form is None:
-        return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
+    assert form is not None
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
     if not program.user_constraints:

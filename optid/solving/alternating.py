@@ -36,8 +36,7 @@ def run(program: Program, settings: Settings) -> Answer:
         StructureError: a constraint that is not convex even with one factor held.
     """
     form = rank_one_of(program)
-    if form is None:
-        return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
+    assert form is not None
     options = dict(settings.options)
     inner, steps = str(options.pop("inner", "clarabel")), int(options.pop("steps", STEPS))
     if options:

@@ -103,20 +103,18 @@ class GroupProblem:
 
 @dataclass(frozen=True, eq=False)
 class GroupSparseStructure(Structure):
-    """``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
+    """P(a) with lambda as the parameter ``lambda``; the constraint ``residual`` defines r - M a as a variable.
 
     Attributes:
         problem: the numbers.
         blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
-        penalty: name of the parameter that holds lambda.
-        residual: name of the variable of the residual, and of the constraint that defines it.
     """
 
     word: ClassVar[str] = "group-sparse"
+    penalty: ClassVar[str] = "lambda"
+    residual: ClassVar[str] = "residual"
     problem: GroupProblem
     blocks: Mapping[str, tuple[int, ...]]
-    penalty: str = "lambda"
-    residual: str = "residual"
 
     @property
     def about(self) -> str:

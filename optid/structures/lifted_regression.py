@@ -13,7 +13,7 @@ from optid.arrays import Array
 from optid.models.layout import Layout
 from optid.statistics import Statistics
 from optid.structures.rank_one import Core, RankOne
-from optid.structures.whitening import leading_pair, symmetric_root
+from optid.structures.whitening import invert_triangular, symmetric_root
 
 
 def positions(layout: Layout) -> NDArray[np.intp]:
@@ -68,9 +68,10 @@ def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) ->
     """
     pairs = []
     for c, theta in enumerate(thetas):
-        left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
+        of_mu, of_b = np.eye(theta.shape[0]), np.eye(theta.shape[1])
         if whitened and c in core.kept:
             position = core.kept.index(c)
-            left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
-        pairs.append(leading_pair(theta, left, right))
+            of_mu, of_b = core.whitening.factors_mu[position], core.whitening.factors_b[position]
+        left, sizes, right = np.linalg.svd(of_mu.T @ theta @ of_b, full_matrices=False)
+        pairs.append((invert_triangular(of_mu).T @ (sizes[0] * left[:, 0]), invert_triangular(of_b).T @ right[0]))
     return pairs

@@ -57,15 +57,6 @@ def symmetric_root(matrix: Array) -> Array:
     return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
-def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
-    """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
-
-    Theta is (P, nb); the factors (P, P) and (nb, nb) are lower triangular.
-    """
-    left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
-    return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
-
-
 def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slice]:
     """Columns of every block in a lifted vector whose first block begins at a column."""
     edges = first + np.cumsum([0, *(p * nb for p, nb in shapes)])
