@@ -82,7 +82,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> P
         derived={"residual": residual},
         structure=RankOneStructure(problem.problem, tuple(linear), pairs, gauge), certify=certify_rank_one,
         scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
-    signed = gauge == "norm" and _has_signed_factors(program, {one.id for one in factors.values()})
+    signed = gauge == "norm" and bool(builders) and _has_signed_factors(program, {one.id for one in factors.values()})
 
     def recover(values: Values) -> HammersteinTF:
         return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,

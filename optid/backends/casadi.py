@@ -44,9 +44,10 @@ def translate(form: Smooth) -> dict[str, Any]:
         StructureError: an atom without a translation, by name.
     """
     x = ca.MX.sym("x", sum(v.size for v in form.variables))
-    p = ca.MX.sym("p", sum(v.size for v in form.parameters))
+    parameters = form.problem.parameters()
+    p = ca.MX.sym("p", sum(v.size for v in parameters))
     known: dict[int, Any] = {}
-    for vector, leaves in ((x, form.variables), (p, form.parameters)):
+    for vector, leaves in ((x, form.variables), (p, parameters)):
         edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
         known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
     done: dict[int, tuple[Any, Any]] = {}
@@ -111,14 +112,12 @@ def _matmul(expr: Any, columns: list) -> Any:
 def _sum(expr: Any, columns: list) -> Any:
     if expr.axis is None:
         return ca.sum1(columns[0])
-    shape = expr.args[0].shape
-    axes = {axis % len(shape) for axis in (expr.axis if isinstance(expr.axis, tuple) else (expr.axis,))}
-    kept = tuple(1 if i in axes else n for i, n in enumerate(shape))
-    group = np.broadcast_to(np.reshape(np.arange(int(np.prod(kept))), kept, order="F"), shape)
-    group = np.ravel(group, order="F")
-    kept_size = int(np.prod(kept))
-    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(kept_size, group.size))
-    return ca.mtimes(constant(adding, (kept_size, group.size)), columns[0])
+    argument = expr.args[0]
+    entries = np.reshape(np.arange(argument.size), argument.shape, order="F")  # by the entry of the sum they add to
+    group = np.ravel(np.broadcast_to(np.max(entries, axis=expr.axis, keepdims=True), argument.shape), order="F")
+    names, group = np.unique(group, return_inverse=True)
+    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(names.size, group.size))
+    return ca.mtimes(constant(adding, (names.size, group.size)), columns[0])
 
 
 def _cumsum(expr: Any, columns: list) -> Any:

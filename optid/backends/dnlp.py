@@ -59,14 +59,9 @@ class Smooth:
     inverse: tuple[Any, Any]
 
     @cached_property
-    def variables(self) -> tuple[cp.Variable, ...]:
+    def variables(self) -> list[cp.Variable]:
         """Variables of the smooth problem, in the order of its flat vector of unknowns."""
-        return tuple(self.problem.variables())
-
-    @cached_property
-    def parameters(self) -> tuple[cp.Parameter, ...]:
-        """Parameters of the smooth problem, in the order of its flat vector of parameters."""
-        return tuple(self.problem.parameters())
+        return self.problem.variables()
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -100,7 +95,7 @@ class Smooth:
     def parameter_values(self) -> np.ndarray:
         """Return the flat vector of the values the parameters hold now."""
         self.attributes.update_parameters(self.original)
-        return _flat([parameter.value for parameter in self.parameters])
+        return _flat([parameter.value for parameter in self.problem.parameters()])
 
     def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
         """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
@@ -162,11 +157,14 @@ class Derivatives:
         self.jacobian_pattern = self._oracles.jacobianstructure()
         self.hessian_pattern = self._oracles.hessianstructure()
 
-    def update(self) -> None:
-        """Take over the values the parameters hold now."""
-        if self._problem.parameters():
-            self._oracles.update_params(self._problem)
-        self._x = None
+    @classmethod
+    def of(cls, form: Smooth) -> "Derivatives":
+        """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
+        found = kept(form.original, "derivatives", lambda: cls(form))
+        if found._problem.parameters():
+            found._oracles.update_params(found._problem)
+        found._x = None
+        return found
 
     def at(self, x: Any) -> Any:
         """Return the engine at a point: its gradient(x), jacobian(x) and hessian(x, multipliers, factor)."""
@@ -176,13 +174,6 @@ class Derivatives:
             if self.rows.size:
                 self.rows = np.array(self._oracles.constraints(self._x))
         return self._oracles
-
-
-def derivatives(form: Smooth) -> Derivatives:
-    """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
-    found = kept(form.original, "derivatives", lambda: Derivatives(form))
-    found.update()
-    return found
 
 
 def _apply(problem: cp.Problem) -> Smooth:

@@ -235,7 +235,7 @@ class _Constrained:
         A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
         """
         self.at.assign(x)
-        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes()
+        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes
         slope = 2.0 * tangent.T @ (self.problem.root.T @ self._residual(x))
         units = 1.0 / np.maximum(np.linalg.norm(self.problem.root @ tangent, axis=0), 1e-12)
         rows, given, equal, touched, sizes = [], [], [], [], {}

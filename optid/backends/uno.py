@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Smooth, derivatives, smooth
+from optid.backends.dnlp import Derivatives, Smooth, smooth
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -61,7 +61,7 @@ def options(settings: Settings) -> dict[str, Any]:
 
 def _model(unopy: Any, form: Smooth) -> Any:
     start, _ = form.start(), form.parameter_values()
-    engine = derivatives(form)
+    engine = Derivatives.of(form)
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:

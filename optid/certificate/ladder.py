@@ -8,6 +8,7 @@ recomputed in closed form from its multipliers after a Cholesky check; nothing i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -79,18 +80,18 @@ class Case:
     lam: Array
     linear: Linear
 
-    @property
+    @cached_property
     def blocks(self) -> list[Block]:
         """Position and shape of every block of the core."""
         return list(zip(block_slices(self.core.shapes, self.core.linear), self.core.shapes))
 
-    @property
+    @cached_property
     def vanishing(self) -> list[bool]:
         """Whether a block is zero: its minors are then all free, and its gradient must vanish by itself."""
         size = float(np.linalg.norm(self.objective.z))
         return [bool(np.linalg.norm(mu) <= 1e-10 * size) for mu in self.mus]
 
-    @property
+    @cached_property
     def masks(self) -> list[np.ndarray]:
         """Entries of the minors that do not touch the gradient at the point, in rotated coordinates, by block."""
         return [np.ones((p * nb, p * nb), bool) if vanishes else free_mask((p, nb))
@@ -150,7 +151,8 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
     case = prepare(problem, point, cones, linear)
     if not case.core.shapes and not len(linear.right):
         return conclude(case, "exact", "linear least squares", case.objective.gram, {})
-    cuts = instant_cuts(case)
+    cuts = {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]), np.outer(case.bs[i], case.bs[i]))
+            for i, cone in case.cones.items()}  # they cancel what the constraints leave of the gradient
     minors = tangent(case, cuts)
     found = conclude(case, "instant", "one Cholesky factorisation", minors, cuts)
     if found.bound.proved or effort == "instant":
@@ -193,12 +195,6 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
     return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
-
-
-def instant_cuts(case: Case) -> dict[int, Array]:
-    """Sign-free cuts at the KKT multipliers: they cancel what the constraints leave of the gradient."""
-    return {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]),
-                                 np.outer(case.bs[i], case.bs[i])) for i, cone in case.cones.items()}
 
 
 def tangent(case: Case, cuts: dict[int, Array]) -> Array:

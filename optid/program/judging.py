@@ -52,7 +52,7 @@ def measure_violation(program: Program) -> tuple[float, str]:
 
     Bounds that variables carry as attributes count as well, under the name of the variable.
     """
-    worst, name, usual = 0.0, "", program.usual_sizes()
+    worst, name, usual = 0.0, "", program.usual_sizes
     for key, group in program.constraints.items():
         if key in program.derived:
             continue  # recomputed, hence exact
@@ -144,7 +144,7 @@ class Lagrangian:
 
     def __init__(self, program: Program) -> None:
         self.variables = list(program.variables.values())
-        self.usual = program.usual_sizes()
+        self.usual = program.usual_sizes
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
         self.terms = {v.id: np.zeros(v.size) for v in self.variables}
         self.value, self.complementarity = 0.0, 0.0

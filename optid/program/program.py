@@ -138,7 +138,7 @@ class Program:
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual = self.usual_sizes()
+        usual = self.usual_sizes
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -169,8 +169,9 @@ class Program:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
         return replace(self, constraints=constraints, variables=variables, limits=limits)
 
+    @cached_property
     def usual_sizes(self) -> dict[int, float]:
-        """Return the largest entry of every variable at the start, by id; variables that vanish there are left out."""
+        """The largest entry of every variable at the start, by id; variables that vanish there are left out."""
         sizes = {self.variables[name].id: float(np.max(np.abs(value), initial=0.0))
                  for name, value in self.start.items() if name in self.variables}
         return {key: size for key, size in sizes.items() if size > 0}

@@ -43,7 +43,7 @@ class LeastSquaresStructure(Structure):
 
     def measure(self, program: Any) -> tuple[float, float]:
         """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
-        problem, usual = self.problem, program.usual_sizes()
+        problem, usual = self.problem, program.usual_sizes
         point = self.point({name: variable.value for name, variable in program.variables.items()})
         r = problem.root @ point.lift() - problem.target
         value = float(r @ r) + problem.remainder

@@ -13,7 +13,9 @@ from scipy.linalg import get_lapack_funcs
 
 from optid.arrays import Array
 
-_trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
+_potrf, _trtri, _trtrs = get_lapack_funcs(("potrf", "trtri", "trtrs"), dtype=float)
+
+TINY = np.finfo(float).tiny
 
 
 def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
@@ -36,9 +38,11 @@ def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array
 
 def _factor(matrix: Array) -> tuple[Array, Array]:
     """Lower Cholesky factor and inverse; a whisper of the identity keeps the coordinates invertible."""
-    size = len(matrix)
-    ridge = 1e-13 * max(float(np.trace(matrix)) / size, np.finfo(float).tiny)
-    factor = np.linalg.cholesky(matrix + ridge * np.eye(size))
+    shifted = matrix.copy()
+    shifted.flat[:: len(matrix) + 1] += 1e-13 * max(float(matrix.trace()) / len(matrix), TINY)
+    factor, info = _potrf(shifted, lower=1)
+    if info:
+        raise np.linalg.LinAlgError("the Gram matrix of a block is not positive definite")
     inverse = invert_triangular(factor)
     return factor, inverse.T @ inverse
 
