@@ -50,9 +50,6 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
             of neighbours) or "ss" (smooth); its hyperparameters maximise the marginal likelihood of the record.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
 
-    Returns:
-        The programme, or a procedure of reweighted programmes for a loss other than squares.
-
     Raises:
         StructureError: impossible orders, unknown gauge, constraints that do not fit.
         RankError: the record does not determine the parameters.

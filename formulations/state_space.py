@@ -119,15 +119,10 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
 
 @dataclass(frozen=True, eq=False)
 class StateSpaceFit(TangentFit):
-    """The programmes of a state-space model, and the model of their values.
-
-    Attributes:
-        criterion: the errors.
-        units: from those of the programme to those of the record.
-    """
+    """The programmes of a state-space model, and the model of their values."""
 
     criterion: StateErrors
-    units: Transform
+    units: Transform  # from those of the programme to those of the record
 
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
         """State the programme of the step from z0."""
@@ -195,8 +190,7 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none.
     The other arguments are those of `hammerstein_ss`, as are the errors raised.
     """
-    words = {"criterion": criterion, "stability": stability, "weighting": weighting}
-    for what, word in words.items():
+    for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
         one_of(what, word, WORDS[what])
     check_integer(iterations, "iterations")
     in_memory(data, f"{criterion} errors")

@@ -27,12 +27,7 @@ from optid.structures.rank_one import Point
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The unknowns of a bilinear programme as one vector x = [linear variables; mu_1; b_1; mu_2; ...].
-
-    Attributes:
-        program: the programme.
-        form: its rank-one structure.
-    """
+    """The unknowns of a bilinear programme as one vector x = [linear variables; mu_1; b_1; mu_2; ...]."""
 
     program: Program
     form: RankOneStructure
@@ -102,25 +97,15 @@ class Coordinates:
 
 @dataclass(eq=False)
 class _Rows:
-    """A constraint of a step, ``slope @ x + level <= 0`` or ``= 0`` in the units of the programme.
+    """A constraint of a step, ``slope @ x + level <= 0`` or ``= 0`` in the units of the programme."""
 
-    Attributes:
-        name: of its group.
-        span: its rows in the multipliers of the group.
-        member: the constraint of the programme.
-        unit: the rows are divided by it.
-        slope: (r, size).
-        level: (r,).
-        lifted: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
-    """
-
-    name: str
-    span: slice
+    name: str  # of its group
+    span: slice  # its rows in the multipliers of the group
     member: cp.Constraint
-    unit: float
-    slope: np.ndarray
-    level: np.ndarray
-    lifted: tuple[np.ndarray, np.ndarray] | None = None
+    unit: float  # the rows are divided by it
+    slope: np.ndarray  # (r, size)
+    level: np.ndarray  # (r,)
+    lifted: tuple[np.ndarray, np.ndarray] | None = None  # (E, f) where it reads E z <= f: its curvature is known
 
     @property
     def equality(self) -> bool:

@@ -108,13 +108,9 @@ def sources(expression: Any) -> np.ndarray:
 
 def _moved(expression: Any) -> list[Map]:
     source, edges = sources(expression), np.cumsum([0, *(arg.size for arg in expression.args)])
-    return [partial(_gather, np.where((source >= low) & (source < high), source - low, -1))
-            for low, high in zip(edges, edges[1:])]
-
-
-def _gather(source: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Take the rows of a Jacobian by number; zero where the number is -1."""
-    return np.where(source[:, None] >= 0, slope[source], 0.0)
+    inside = [(source >= low) & (source < high) for low, high in zip(edges, edges[1:])]
+    return [lambda slope, low=low, own=own: np.where(own[:, None], slope[np.where(own, source - low, 0)], 0.0)
+            for low, own in zip(edges, inside)]
 
 
 def _of_atom(part: Any, value: np.ndarray) -> Map | None:

@@ -8,6 +8,7 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
+from optid.program.gradients import flat_value
 from optid.program.judging import term_size
 from optid.program.limits import EQUALITIES, Limit, rows_of, slope_of
 from optid.program.program import Program
@@ -102,7 +103,7 @@ def _slacks(member: Constraint) -> np.ndarray:
     if isinstance(member, EQUALITIES):
         return np.zeros(member.size)
     if (rows := rows_of(member)) is not None:
-        return -np.ravel(rows.value)
+        return -flat_value(rows)
     if isinstance(member, PSD):
         return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
     if isinstance(member, SOC):

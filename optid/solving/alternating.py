@@ -24,13 +24,10 @@ STEPS = 1000
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Alternate from the programme's start until the objective stops falling.
+    """Alternate from the start until the objective stops falling; the multipliers are those of the last two half-steps.
 
     Options: ``inner`` (word of the convex back end of the half-steps, default "clarabel"), ``steps`` (largest number of
     pairs of half-steps, default 1000).
-
-    Returns:
-        The last point, with the multipliers of the last two half-steps.
 
     Raises:
         StructureError: a constraint that is not convex even with one factor held.

@@ -19,12 +19,10 @@ TINY = np.finfo(float).tiny
 
 
 def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)``.
+    """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)`` for a shape (P, nb).
 
     Flip-flop iteration, the maximum-likelihood fit of a separable covariance (Dutilleul, J. Stat. Comput. Simul. 64,
     1999): each factor in turn is the average of the other one's whitened blocks.
-
-    The Gram matrix is (P nb, P nb), the shape (P, nb).
     """
     p, nb = shape
     paired = gram.reshape(nb, p, nb, p).transpose(0, 2, 1, 3).reshape(nb * nb, p * p)
