@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Smooth, kept, smooth
 from optid.errors import StructureError
-from optid.program.gradients import MOVES, sources
+from optid.program.expressions import MOVES, sources
 from optid.program.program import Program
 from optid.program.solution import Status
 

@@ -15,7 +15,7 @@ from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
-from optid.program.gradients import flat_value
+from optid.program.expressions import flat_value
 from optid.program.judging import measure_violation, term_size
 from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values

@@ -16,8 +16,7 @@ import numpy as np
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.clarabel import solve_least_squares
 from optid.certificate.lifting import places
-from optid.program.expressions import flat
-from optid.program.gradients import affine_parts, flat_value, jacobians, side_by_side
+from optid.program.expressions import affine_parts, flat, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status

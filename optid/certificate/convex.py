@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
-from optid.program.gradients import differences, flat_value
+from optid.program.expressions import differences, flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
@@ -59,23 +59,19 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
 
 
 def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float
-                         ) -> tuple[float, str] | None:
-    words = "least-squares dual"
-    best = _quadratic_bound(program, form, duals, objective)
-    if best is not None and relative_gap(objective, best, program.scale) <= CLOSED:
-        return best, f"{words} of the solver's multipliers"
-    own = _own_multipliers(program, form)
-    mine = None if own is None else _quadratic_bound(program, form, own, objective)
-    if mine is not None and (best is None or mine > best):
-        return mine, f"{words} of multipliers by least-distance programming"
-    return None if best is None else (best, f"{words} of the solver's multipliers")
+                         ) -> tuple[float, str]:
+    best = _quadratic_bound(program, form, duals, objective), "least-squares dual of the solver's multipliers"
+    if relative_gap(objective, best[0], program.scale) > CLOSED and (own := _own_multipliers(program, form)):
+        value = _quadratic_bound(program, form, own, objective)
+        best = max(best, (value, "least-squares dual of multipliers by least-distance programming"))
+    return best
 
 
-def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float | None:
-    """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
+def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float:
+    """Minimum over all z of the Lagrangian of least squares, whose constraints are the user's; -inf without one."""
     lagrangian = Lagrangian.of(program, duals, program.user_constraints)
     if lagrangian is None:
-        return None
+        return -np.inf
     root = form.problem.root
     z = form.flat({name: program.variables[name].value for name in form.linear})
     pull = 2.0 * root.T @ (root @ z - form.problem.target)

@@ -58,26 +58,15 @@ class Certification:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What the stages share, in whitened coordinates; block indices are those of the core.
-
-    Attributes:
-        core: reduction of the problem.
-        mus: (P_i,) each, oriented so that C mu >= 0.
-        bs: (nb_i,) each, of unit length.
-        objective: the objective around the point.
-        cones: constraint matrices by block.
-        nu: KKT multipliers (r_i,) of the cones, by block.
-        lam: KKT multipliers (r,) of the linear constraints.
-        linear: constraints on the lifted vector.
-    """
+    """What the stages share, in whitened coordinates around the point; block indices are those of the core."""
 
     core: Core
-    mus: list[Array]
-    bs: list[Array]
+    mus: list[Array]  # (P_i,) each, oriented so that C mu >= 0
+    bs: list[Array]  # (nb_i,) each, of unit length
     objective: Quadratic
     cones: dict[int, Array]
-    nu: dict[int, Array]
-    lam: Array
+    nu: dict[int, Array]  # KKT multipliers (r_i,) of the cones
+    lam: Array  # and (r,) of the linear constraints
     linear: Linear
 
     @cached_property

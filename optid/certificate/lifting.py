@@ -13,7 +13,7 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
-from optid.program.gradients import affine_parts, side_by_side
+from optid.program.expressions import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.gradients import differences, flat_value, jacobians, side_by_side
+from optid.program.expressions import differences, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, rows_of
 from optid.program.program import Program
 from optid.structures.whitening import symmetric_root

@@ -8,7 +8,7 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
-from optid.program.gradients import flat_value, jacobians
+from optid.program.expressions import flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES, rows_of, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals

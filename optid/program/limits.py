@@ -10,7 +10,7 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
 from cvxpy.constraints.zero import Equality, Zero
 
-from optid.program.gradients import flat_value, row_sizes
+from optid.program.expressions import flat_value, row_sizes
 
 EQUALITIES = Equality | Zero
 INEQUALITIES = Inequality | NonPos

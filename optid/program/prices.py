@@ -8,7 +8,7 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
-from optid.program.gradients import flat_value
+from optid.program.expressions import flat_value
 from optid.program.judging import term_size
 from optid.program.limits import EQUALITIES, Limit, rows_of, slope_of
 from optid.program.program import Program

@@ -31,16 +31,15 @@ def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
         groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
     else:
         groups = {default: built}
-    result: dict[str, tuple[Limit, ...]] = {}
-    for name, item in groups.items():
-        members = tuple(item) if isinstance(item, list | tuple) else (item,)
-        for member in members:
-            if not isinstance(member, Constraint | Limit):
-                raise StructureError(
-                    f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1"
-                )
-        result[name] = tuple(one if isinstance(one, Limit) else Limit.of(one) for one in members)
-    return result
+    return {name: tuple(_limit(name, one) for one in (item if isinstance(item, list | tuple) else [item]))
+            for name, item in groups.items()}
+
+
+def _limit(name: str, member: Any) -> Limit:
+    if not isinstance(member, Constraint | Limit):
+        raise StructureError(
+            f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1")
+    return member if isinstance(member, Limit) else Limit.of(member)
 
 
 @dataclass(frozen=True)

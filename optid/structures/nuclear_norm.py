@@ -263,23 +263,14 @@ class NuclearProblem:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Outputs solved for together, measured ones in the eigenvectors of their Gram matrix with the free ones removed.
+    """Outputs solved for together, measured ones in eigenvectors of their Gram matrix with the free ones removed."""
 
-    Attributes:
-        measured: positions of the measured outputs in the flattened array.
-        free: positions of the missing ones.
-        values: eigenvalues.
-        vectors: eigenvectors, as columns.
-        cross: (measured, free) part of the Gram matrix.
-        free_inverse: pseudo-inverse of the free part.
-    """
-
-    measured: np.ndarray
-    free: np.ndarray
+    measured: np.ndarray  # positions of the measured outputs in the flattened array
+    free: np.ndarray  # and of the missing ones
     values: Array
-    vectors: Array
-    cross: Array
-    free_inverse: Array
+    vectors: Array  # as columns
+    cross: Array  # (measured, free) part of the Gram matrix
+    free_inverse: Array  # pseudo-inverse of the free part
 
     @classmethod
     def of(cls, where: np.ndarray, gram: Array, known: np.ndarray) -> "Group":
