@@ -14,7 +14,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.backends.back_end import Answer, BackEnd, Settings
-from optid.backends.clarabel import solve_least_squares
+from optid.backends.conic import solve_least_squares
 from optid.certificate.lifting import places
 from optid.program.expressions import affine_parts, flat, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES, spans
