@@ -128,11 +128,6 @@ def _cumsum(expr: Any, columns: list) -> Any:
     return ca.vec(ca.cumsum(ca.densify(_matrix(columns[0], shape)), axis % max(len(shape), 1)))
 
 
-def _kron(expr: Any, columns: list) -> Any:
-    left, right = (_matrix(column, arg.shape) for column, arg in zip(columns, expr.args))
-    return ca.vec(ca.kron(ca.densify(left), ca.densify(right)))
-
-
 def _convolve(expr: Any, columns: list) -> Any:
     short, long = (columns[0], columns[1]) if expr.args[0].size <= expr.args[1].size else (columns[1], columns[0])
     terms = [ca.vertcat(ca.MX(i, 1), short[i] * long, ca.MX(short.numel() - 1 - i, 1)) for i in range(short.numel())]
@@ -161,7 +156,9 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
     "NegExpression": lambda _, columns: -columns[0],
     "multiply": lambda _, columns: columns[0] * columns[1],
     "DivExpression": lambda _, columns: columns[0] / columns[1],
-    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "kron": _kron, "convolve": _convolve, "conv": _convolve,
+    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "convolve": _convolve, "conv": _convolve,
+    "kron": lambda expr, columns: ca.vec(ca.kron(*(ca.densify(_matrix(column, arg.shape))
+                                                   for column, arg in zip(columns, expr.args)))),
     "Power": _power, "PowerApprox": _power, "Prod": _prod,
     "Trace": lambda expr, columns: ca.trace(_matrix(columns[0], expr.args[0].shape)),
     "quad_over_lin": lambda _, columns: ca.sumsqr(columns[0]) / columns[1],
