@@ -31,7 +31,6 @@ from optid.solving.solve import Procedure
 from optid.structures.bilinear import starts
 from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
 from optid.structures.lifted_regression import leading_pairs
-from optid.structures.rank_one import Core
 
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
@@ -200,14 +199,14 @@ def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight
     name = "overparametrised" if weight is None else "nuclear"
     return Program(
         f"hammerstein_arx.{name}", objective, constraints, {**linear, **theta, "residual": r}, {},
-        partial(_rank_one_model, problem, problem.problem.core, gauge, svd),
-        problem.view({**linear, **theta}), structural=frozenset(constraints), derived={"residual": residual},
-        scale=problem.problem.scale, unit=problem.unit, compressed=problem, **form).subject_to(*builders)
+        partial(_rank_one_model, problem, gauge, svd), problem.view({**linear, **theta}),
+        structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
+        unit=problem.unit, compressed=problem, **form).subject_to(*builders)
 
 
-def _rank_one_model(problem: EquationError, core: Core, gauge: str, svd: str, values: Values) -> HammersteinTF:
+def _rank_one_model(problem: EquationError, gauge: str, svd: str, values: Values) -> HammersteinTF:
     """Return the model of the leading singular pair of every Theta."""
-    pairs = [in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), problem.layout.inputs[c])
-             for c, (mu, b) in enumerate(leading_pairs(core, problem.matrices(values), svd == "whitened"))]
-    mus, bs = zip(*pairs)
+    pairs = leading_pairs(problem.problem.core, problem.matrices(values), svd == "whitened")
+    mus, bs = zip(*(in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), channel)
+                    for c, ((mu, b), channel) in enumerate(zip(pairs, problem.layout.inputs))))
     return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")

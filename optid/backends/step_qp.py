@@ -32,14 +32,9 @@ class Coordinates:
     form: RankOneStructure
 
     @cached_property
-    def names(self) -> list[str]:
-        """Names of the variables in the order of x."""
-        return [*self.form.linear, *(name for pair in self.form.blocks for name in pair)]
-
-    @cached_property
     def variables(self) -> list[cp.Variable]:
         """The variables in the order of x."""
-        return [self.program.variables[name] for name in self.names]
+        return [self.program.variables[name] for name in self.form.names]
 
     @property
     def size(self) -> int:
@@ -48,7 +43,7 @@ class Coordinates:
 
     def pack(self, values: Values) -> np.ndarray:
         """Return x for named values."""
-        return np.concatenate([np.ravel(values[name], order="F") for name in self.names]).astype(float)
+        return np.concatenate([np.ravel(values[name], order="F") for name in self.form.names]).astype(float)
 
     def unpack(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return named values for x."""
@@ -128,9 +123,10 @@ class StepQP:
         self.at, self.sizes = at, dict(sizes)
         self.rows: list[_Rows] = []
         self.cones: list[tuple[str, slice, cp.Constraint]] = []
-        self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
+        named = list(zip(at.form.names, at.variables))
+        self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in named])
         bs = [b for _, b in at.form.blocks] if pinned else []
-        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in zip(at.names, at.variables)])
+        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in named])
         self._slopes: dict[int, np.ndarray] = {}
         self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
@@ -232,8 +228,8 @@ class StepQP:
     def _programme(self) -> tuple[Program, list[cp.Parameter]]:
         """The step in CVXPY, and its parameters in the order of `_matrices`."""
         at = self.at
-        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
-        swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
+        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.form.names, at.variables)}
+        swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.form.names, at.variables)}
         x = cp.hstack([flat(v) for v in stand_ins.values()])
         matrices = [cp.Parameter(value.shape, value=value) for value in self._matrices()]
         r = cp.Variable(at.size)

@@ -43,7 +43,6 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     estimates = matrices(core.least_squares, core.shapes)
     factors = list(zip(estimates, core.whitening.factors_mu, core.whitening.factors_b))
     white = [np.linalg.svd(left.T @ theta @ right, full_matrices=False) for theta, left, right in factors]
-    plain = [np.linalg.svd(theta, full_matrices=False) for theta in estimates]
     rank = [min(shape) for shape in core.shapes]
     rng = np.random.default_rng(seed)
 
@@ -53,7 +52,8 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     found = []
     for k in range(count):
         if k == 1:
-            mus, bs = core.whitening.forward(*zip(*(pair(svd, 0) for svd in plain)))
+            plain = [pair(np.linalg.svd(theta, full_matrices=False), 0) for theta in estimates]
+            mus, bs = core.whitening.forward(*zip(*plain))
         elif k < 4:
             mus, bs = zip(*(pair(svd, max(k - 1, 0) % r) for svd, r in zip(white, rank)))
         else:

@@ -33,6 +33,11 @@ class LeastSquaresStructure(Structure):
     blocks: tuple[tuple[str, str], ...] = ()
     gauge: str = "norm"
 
+    @property
+    def names(self) -> list[str]:
+        """Names of all variables: the linear ones, then mu and b of every block."""
+        return [*self.linear, *chain.from_iterable(self.blocks)]
+
     def flat(self, values: Mapping[str, Any]) -> Array:
         """Return the linear variables among named values as they follow one another in z."""
         return np.concatenate([*(np.ravel(values[name], order="F") for name in self.linear), np.zeros(0)])
@@ -52,7 +57,7 @@ class LeastSquaresStructure(Structure):
         if self.blocks:
             slope = point.tangent()
             pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
-        variables = [program.variables[name] for name in (*self.linear, *chain.from_iterable(self.blocks))]
+        variables = [program.variables[name] for name in self.names]
         edges = np.cumsum([variable.size for variable in variables])[:-1]
         yardstick, worst = max(value, program.scale), 0.0
         for variable, gradient, terms in zip(variables, np.split(pull, edges), np.split(effort, edges)):
