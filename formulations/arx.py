@@ -1,7 +1,4 @@
-"""Linear ARX and impulse responses with constraints: the smallest example of a formulation.
-
-``A(q) y = sum_c B_c(q) u_c + d + e``. Named variables: ``a``, ``b`` (``b[input]`` with several inputs), ``offset``.
-"""
+"""Linear ARX ``A(q) y = sum_c B_c(q) u_c + d + e`` with constraints: the smallest example of a formulation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -29,9 +26,9 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
     Args:
         data: the record.
         na: number of past outputs in A.
-        nb: number of coefficients of B, one per input or one for all.
+        nb: number of coefficients of B, or of the impulse response, one per input or one for all.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
-        constraints: builders of CVXPY constraints in ``a``, ``b``, ``offset``.
+        constraints: builders of CVXPY constraints in the named variables.
         loss: "squares", "huber[:threshold]" or "l1".
         ridge: weight of ``‖b‖²``.
         prior: of the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
@@ -49,19 +46,7 @@ def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence
         constraints: Sequence[Any] = ()) -> Program | Procedure:
     """Pose ``min ‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
 
-    Named variables: ``b``, ``offset``.
-
-    Args:
-        data: the record.
-        nb: number of coefficients of the impulse response, one per input or one for all.
-        nk: delay of the first coefficient in samples, one per input or one for all.
-        prior: of the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
-            (smooth); its hyperparameters maximise the marginal likelihood of the record.
-        constraints: builders of CVXPY constraints in ``b``, ``offset``.
-
-    Raises:
-        StructureError: impossible orders or nonconvex constraints.
-        RankError: the record does not determine the parameters.
+    Named variables: ``b``, ``offset``. Arguments as in `arx`, as are the errors raised.
     """
     return arx(data, na=0, nb=nb, nk=nk, prior=prior, constraints=constraints)
 

@@ -28,11 +28,10 @@ from optid.solving.solve import Procedure
 NOISES = ("white", "coloured")
 
 
-def sid(
-    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
-    noise: str = "white", weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-    observer: str = "auto", split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
-) -> Procedure:
+def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
+        noise: str = "white", weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+        observer: str = "auto", split: str = "exact", stability: str = "auto",
+        constraints: Sequence[Any] = ()) -> Procedure:
     """Identify an open-loop system from projections on past inputs and outputs.
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
@@ -70,12 +69,11 @@ def sid(
     return in_record_units(identified(plan), plan)
 
 
-def sivid(  # noqa: D417 - the other arguments by reference
-    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
-    feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection", tolerance: float = 0.05,
-    weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
-    split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
-) -> Procedure:
+def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
+          feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection",
+          tolerance: float = 0.05, weighting: str = "moesp", offset: bool = True,
+          feedthrough: bool | Sequence[bool] = True, observer: str = "auto", split: str = "exact",
+          stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a system with nonlinear feedback by instrumental variables, singular directions left out.
 
     With past instruments the correlation of instruments and regressors loses rank as the record grows; the directions
@@ -106,12 +104,11 @@ def sivid(  # noqa: D417 - the other arguments by reference
     return in_record_units(identified(plan), plan)
 
 
-def asivid(  # noqa: D417 - the other arguments by reference
-    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
-    feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
-    weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
-    split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
-) -> Procedure:
+def asivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
+           feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
+           weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+           observer: str = "auto", split: str = "exact", stability: str = "auto",
+           constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a system with nonlinear feedback with instruments augmented by simulated, noise-free feedback.
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in `sivid`.

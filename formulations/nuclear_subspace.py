@@ -42,13 +42,11 @@ WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
 """Weights tried by default, each the inverse of a noise variance relative to the variance of the outputs."""
 
 
-def nuclear(  # noqa: D417 - the other arguments by reference
-    data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
-    feedback_basis: FeedbackBases = None, form: str = "predictor", weight: float | str | Sequence[float] = "auto",
-    noise: float | None = None, hold_out: float = 0.3, offset: bool = True,
-    feedthrough: bool | Sequence[bool] = True, observer: str = "auto", split: str = "exact", stability: str = "auto",
-    constraints: Sequence[Any] = ()
-) -> Procedure:
+def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
+            feedback_basis: FeedbackBases = None, form: str = "predictor",
+            weight: float | str | Sequence[float] = "auto", noise: float | None = None, hold_out: float = 0.3,
+            offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
+            split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a state-space model from a low-rank Hankel matrix found by convex optimisation.
 
     Named variables: ``output``, ``yhat``. Other arguments as in `formulations.hammerstein_ss.sid`.

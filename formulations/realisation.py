@@ -8,7 +8,7 @@ R and s are the record, compressed (`optid.identify.subspace.realisation`). Two 
   ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``,
   ``b feedback``.
 * lumped: ``Theta_i`` as it comes, convex; the factors are split off afterwards in the metric of the least squares.
-  Named variables: ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels always take this form.
+  Named variables: ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels alone always take this form.
 
 With several inputs the per-channel names carry the input, as in ``mu[valve]``. Expressions for constraints in either
 form: ``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (n, q); where every channel is linear

@@ -27,17 +27,9 @@ from optid.solving.solve import Evidence, Procedure
 
 
 def identified(plan: Plan, found: Observability | None = None) -> Procedure:
-    """Run the steps of a plan.
+    """Run the steps of a plan and return the model with singular values, condition of R11 and further figures.
 
-    Args:
-        plan: what was asked for.
-        found: the observability matrix, with what was measured before; None for that of projections.
-
-    Yields:
-        The programmes of the steps under constraints and of the step in B, D, E and x0.
-
-    Returns:
-        The model with singular values, condition of R11 and further figures.
+    The observability matrix, with what was measured before, is that of projections where it is None.
     """
     found = estimate_observability(plan) if found is None else found
     a, gamma, l, figures = found.least_squares(), found.scaled, plan.data.l, dict(found.figures)  # noqa: E741

@@ -289,6 +289,7 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     problem = function(data, **{key: value for key, value in offered.items() if key in parameters})
     view = problem.view if hasattr(problem, "view") else next(problem).view
     assert set(found.variables) == set(view) - ({*plant.states, *plant.parameters} if name == "physical" else set())
+    assert set(found.arguments()) >= set(found.options)
 
 
 def test_formulations_name_their_variables():

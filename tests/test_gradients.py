@@ -4,7 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from optid.program.gradients import affine_parts, jacobians
+from optid.program.expressions import affine_parts, jacobians
 
 
 def random_expression(rng, variables, depth):

@@ -1,4 +1,4 @@
-"""Program: named parts, further constraints, freezing, softening, values and duals by name."""
+"""Program: named parts, further constraints, freezing, values and duals by name."""
 
 import cvxpy as cp
 import numpy as np
@@ -99,7 +99,7 @@ def test_program_itself_never_changes():
     assert set(extended.user_constraints) == {"sign"} and set(extended.without("sign").constraints) == {"gauge"}
 
 
-# freeze and soften
+# freeze
 
 def test_frozen_bilinear_programme_is_least_squares():
     program, target = bilinear()
@@ -128,26 +128,6 @@ def test_freezing_what_is_not_there_or_of_another_shape():
         program.freeze(mu2=[1.0])
     with pytest.raises(StructureError, match=r"'b' has shape \(2,\).*\(3,\)"):
         program.freeze(b=[1.0, 0.0, 0.0])
-
-
-def test_softened_constraint_is_a_penalty():
-    program = case("qp_equality").build()  # min ‖x‖² on n.x = 1, ‖n‖² = 9: penalty w gives n.x = 9w / (1 + 9w)
-    soft = program.soften("plane", 2.0)
-    found = solve(soft, "clarabel")
-    assert "plane" not in soft.constraints and "penalty" in soft.note
-    assert np.array([1.0, 2.0, 2.0]) @ found.values["x"] == pytest.approx(18 / 19, abs=1e-6)
-    box = case("qp_box").build().soften("upper", 1.0)  # min (x-2)² + pos(x-1)²: x = 1.5
-    assert solve(box, "clarabel").values["x"][0] == pytest.approx(1.5, abs=1e-5)
-
-
-def test_softening_what_cannot_be_softened():
-    program, _ = bilinear()
-    with pytest.raises(StructureError, match="gauge"):
-        program.soften("gauge", 1.0)
-    with pytest.raises(StructureError, match="'plain'.*'plane'"):
-        case("qp_equality").build().soften("plain", 1.0)
-    with pytest.raises(StructureError, match="PSD"):
-        case("sdp_largest_eigenvalue").build().soften("psd", 1.0)
 
 
 # values and duals

@@ -1,6 +1,7 @@
 """What a solution keeps of the solver's claim, and the times of compiling."""
 
 import math
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -35,6 +36,12 @@ def test_a_claim_that_is_taken_back_is_false(status, x, false):
     values = {} if x is None else {"x": np.array(x)}
     solution = solve(_program(), _claiming(status, values))
     assert solution.claim is status and solution.false_claim is false
+
+
+@pytest.mark.parametrize("values", [{}, {"x": np.array([math.nan, 1.0])}, {"y": np.ones(2)}])
+def test_an_answer_without_a_usable_point_is_in_units_of_the_record(values):
+    solution = solve(replace(_program(), scale=3.0, unit=4.0), _claiming(Status.LOCAL, values))
+    assert solution.status is Status.FAILED and solution.scale == 12.0
 
 
 @pytest.mark.parametrize("x, words", [([1e200, 1.0], "inf"), ([1.0, 2.0, 3.0], "cannot be judged: cannot reshape")])

@@ -43,15 +43,10 @@ LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of
 
 @dataclass(frozen=True)
 class Side:
-    """One inequality ``L + z M + conj(z) Mᵀ >= 0`` of a region.
+    """One inequality ``L + z M + conj(z) Mᵀ >= 0`` of a region."""
 
-    Attributes:
-        constant: L, symmetric (k, k).
-        linear: M, (k, k).
-    """
-
-    constant: np.ndarray
-    linear: np.ndarray
+    constant: np.ndarray  # L, symmetric (k, k)
+    linear: np.ndarray  # M, (k, k)
 
     def slack(self, z: complex) -> float:
         """Return the smallest eigenvalue at a point: negative outside."""
@@ -61,8 +56,7 @@ class Side:
 
 def disc_side(radius: float, centre: float = 0.0) -> Side:
     """|z - centre| <= radius, by the Schur complement of ``radius² - |z - centre|²``."""
-    constant = np.array([[radius, -centre], [-centre, radius]])
-    return Side(constant, np.array([[0.0, 1.0], [0.0, 0.0]]))
+    return Side(np.array([[radius, -centre], [-centre, radius]]), np.array([[0.0, 1.0], [0.0, 0.0]]))
 
 
 def wedge_side(angle: float, level: float) -> Side:
@@ -128,11 +122,8 @@ def strip(low: float | None = None, high: float | None = None) -> Rule:
 def sector(angle: float) -> Rule:
     """Every pole has an argument of at most ``angle`` radians: no oscillation above angle / dt rad per second.
 
-    Args:
-        angle: in (0, pi/2].
-
     Raises:
-        StructureError: an angle outside that range, beyond which the region is not convex.
+        StructureError: an angle outside (0, pi/2], where the region is convex.
     """
     if not 0 < angle <= np.pi / 2 + 1e-12:
         raise StructureError(f"the angle of a sector lies in (0, pi/2], where it is convex; got {angle!r}")
@@ -146,9 +137,6 @@ def damped(ratio: float) -> Rule:
     In discrete time that is the inside of a logarithmic spiral, ``|z| <= exp(-k |arg z|)`` with
     ``k = ratio / sqrt(1 - ratio²)``. Right of its crossing with the negative real axis the inside is convex, and a
     polygon inscribed there is what is imposed: an inner region. Poles left of the crossing are excluded with it.
-
-    Args:
-        ratio: in (0, 1).
 
     Raises:
         StructureError: a ratio outside (0, 1).
@@ -235,8 +223,8 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (rows, levels, centre) such that every a with ``rows @ a >= levels`` has its roots in the disc.
 
-    The region is centred on a reference polynomial (na,). With ``keep`` the centre is
-    pulled inwards no further than the reference, whose roots are inside, allows.
+    The region is centred on a reference polynomial (na,). With ``keep`` the centre is pulled inwards no further than
+    the reference, whose roots are inside, allows.
     """
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius

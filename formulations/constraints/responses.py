@@ -2,7 +2,7 @@
 
 With ``Theta_c = functions x [B_c; D_c]`` the effect of an input on an output after k samples is linear in Theta:
 ``C A^(k-1) B`` and, at once, D. Positive realness is a linear matrix inequality in (B, D) and a matrix P of its own
-when it is stated on the transposed system.
+when it is stated on the transposed system. ``channel`` and ``output`` are names, needed where there are several.
 """
 
 from typing import Any
@@ -30,8 +30,6 @@ def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float
         sign: "positive" or "negative".
         horizon: samples over which it is imposed.
         at: operating point; default the middle of the interval.
-        channel: name of the input, where there are several.
-        output: name of the output, where there are several.
 
     Raises:
         StructureError: unknown sign, or a horizon below one.
@@ -44,13 +42,8 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
                   high: float | None = None, channel: str | None = None, output: str | None = None) -> Rule:
     """The response to a step of the input from ``low`` up to ``high`` has one sign at every sample: no undershoot.
 
-    Args:
-        low: where the step starts; default the lower end of the interval.
-        high: where it ends; default the upper end.
-        sign: as in `impulse_response`, as are the errors raised.
-        horizon: as there.
-        channel: as there.
-        output: as there.
+    By default the step goes over the interval of the basis. Other arguments as in `impulse_response`, as are the errors
+    raised.
     """
 
     def rows(basis: Any) -> np.ndarray:
@@ -62,12 +55,7 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
 
 
 def no_effect(channel: str, output: str | None = None) -> Rule:
-    """An input acts on no output, or not on a given one: its column of the transfer matrix is zero there.
-
-    Args:
-        channel: name of the input.
-        output: name of the output; None means all of them.
-    """
+    """An input acts on no output, or not on a given one: its column of the transfer matrix is zero there."""
 
     def build(view: View) -> Any:
         _needs_realisation(view, "no_effect")
@@ -86,10 +74,8 @@ def no_effect(channel: str, output: str | None = None) -> Rule:
 def positive_real(margin: float = 0.0) -> Rule:
     """The transfer matrix is positive real: ``G + G* >= 2 margin`` on and outside the unit circle.
 
-    Needs as many inputs as outputs, one function per input (a linear model, or known nonlinearities), and a stable A.
-
-    Args:
-        margin: least passivity, in units of the gain.
+    The margin, in units of the gain, is the least passivity. Needs as many inputs as outputs, one function per input (a
+    linear model, or known nonlinearities), and a stable A.
 
     Raises:
         StructureError: a negative margin.

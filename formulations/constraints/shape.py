@@ -13,6 +13,9 @@ Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kind
 For state-space models they act in the step that chooses B and D ("realisation"), where the static characteristic
 ``C (I - A)^-1 B f(u) + D f(u) + d`` is linear in the unknowns; an output that is fed back through a nonlinearity or an
 observer gain is held at its mean there. The rules of `formulations.constraints.responses` belong to that step alone.
+
+Every rule takes the name of an input as ``channel`` (None means every input, or the only one where a static
+characteristic is meant) and, about a static characteristic, that of an output, where there are several.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,13 +39,9 @@ SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; 
 
 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
-    """The nonlinearity is increasing or decreasing over the interval of its basis.
+    """The nonlinearity is "increasing" or "decreasing" over the interval of its basis.
 
     Exact for piecewise linear and constant bases, sufficient for splines (control points), on a dense grid otherwise.
-
-    Args:
-        direction: "increasing" or "decreasing".
-        channel: name of the input; None means every input.
 
     Raises:
         StructureError: unknown direction or channel.
@@ -131,8 +130,6 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
     Args:
         u: input values inside the interval of the basis.
         y: output values in steady state.
-        channel: name of the input.
-        output: name of the output, where there are several.
 
     Raises:
         StructureError: different numbers of u and y.
@@ -152,8 +149,6 @@ def gain(value: float | None = None, low: float | None = None, high: float | Non
         low: lower bound instead of a value.
         high: upper bound instead of a value.
         at: operating point; default the middle of the interval.
-        channel: name of the input.
-        output: name of the output, where there are several.
 
     Raises:
         StructureError: neither value nor bound given.

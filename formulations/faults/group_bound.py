@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 import cvxpy as cp
 import numpy as np
 
-from optid.program.gradients import flat_value, jacobians
+from optid.program.expressions import flat_value, jacobians
 from optid.program.judging import multiplier_terms
 from optid.program.limits import spans
 from optid.program.program import Program, Values

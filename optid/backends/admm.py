@@ -10,7 +10,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
 from optid.program.program import Program
-from optid.program.solution import Status, tolerance
+from optid.program.solution import tolerance
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
 
 RELAXATION = 1.7
@@ -26,9 +26,8 @@ def run(program: Program, settings: Settings) -> Answer:
     Options: ``limit`` (iterations at most, default 20,000).
     """
     form = program.structure
-    if not isinstance(form, NuclearNormStructure):
-        return Answer(Status.FAILED, "the programme carries no nuclear-norm structure")
-    weight = float(np.asarray(program.parameters[form.weight].value))
+    assert isinstance(form, NuclearNormStructure)
+    weight = float(np.asarray(program.parameters["weight"].value))
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     v, theta = found.point

@@ -81,10 +81,9 @@ class Minimum:
 
     def answer(self, allowed: float, values: Mapping[str, np.ndarray], duals: Mapping[str, np.ndarray]) -> Answer:
         """Return the claim that this is the minimum, where the gap is at most the allowed one."""
-        if self.gap <= allowed:
-            return Answer(Status.LOCAL, "duality gap closed", values, duals, self.iterations)
-        return Answer(Status.LIMIT, f"iteration limit at a relative gap of {self.gap:.1e}", values, duals,
-                      self.iterations)
+        status, word = (Status.LOCAL, "duality gap closed") if self.gap <= allowed else (
+            Status.LIMIT, f"iteration limit at a relative gap of {self.gap:.1e}")
+        return Answer(status, word, values, duals, self.iterations)
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ def run(program: Program, settings: Settings) -> Answer:
     Options: ``limit`` (rounds at most, default 2,000).
     """
     form = program.structure
-    if not isinstance(form, GroupSparseStructure):
-        return Answer(Status.FAILED, "the programme carries no group-sparse structure")
+    assert isinstance(form, GroupSparseStructure)
     penalty = float(np.asarray(program.parameters[form.penalty].value))
     if not penalty > 0:
         return Answer(Status.FAILED, f"the penalty is {penalty}; this method needs a positive one")

@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Smooth, kept, smooth
 from optid.errors import StructureError
-from optid.program.gradients import MOVES, sources
+from optid.program.expressions import MOVES, sources
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -44,9 +44,10 @@ def translate(form: Smooth) -> dict[str, Any]:
         StructureError: an atom without a translation, by name.
     """
     x = ca.MX.sym("x", sum(v.size for v in form.variables))
-    p = ca.MX.sym("p", sum(v.size for v in form.parameters))
+    parameters = form.problem.parameters()
+    p = ca.MX.sym("p", sum(v.size for v in parameters))
     known: dict[int, Any] = {}
-    for vector, leaves in ((x, form.variables), (p, form.parameters)):
+    for vector, leaves in ((x, form.variables), (p, parameters)):
         edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
         known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
     done: dict[int, tuple[Any, Any]] = {}
@@ -132,14 +133,12 @@ def _matmul(expr: Any, columns: list) -> Any:
 def _sum(expr: Any, columns: list) -> Any:
     if expr.axis is None:
         return ca.sum1(columns[0])
-    shape = expr.args[0].shape
-    axes = {axis % len(shape) for axis in (expr.axis if isinstance(expr.axis, tuple) else (expr.axis,))}
-    kept = tuple(1 if i in axes else n for i, n in enumerate(shape))
-    group = np.broadcast_to(np.reshape(np.arange(int(np.prod(kept))), kept, order="F"), shape)
-    group = np.ravel(group, order="F")
-    kept_size = int(np.prod(kept))
-    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(kept_size, group.size))
-    return ca.mtimes(constant(adding, (kept_size, group.size)), columns[0])
+    argument = expr.args[0]
+    entries = np.reshape(np.arange(argument.size), argument.shape, order="F")  # by the entry of the sum they add to
+    group = np.ravel(np.broadcast_to(np.max(entries, axis=expr.axis, keepdims=True), argument.shape), order="F")
+    names, group = np.unique(group, return_inverse=True)
+    adding = sp.csc_array((np.ones(group.size), (group, np.arange(group.size))), shape=(names.size, group.size))
+    return ca.mtimes(constant(adding, (names.size, group.size)), columns[0])
 
 
 def _cumsum(expr: Any, columns: list) -> Any:
@@ -148,11 +147,6 @@ def _cumsum(expr: Any, columns: list) -> Any:
     if len(shape) > 2 or (expr.axis is None and len(shape) == 2):
         raise StructureError(f"{expr}: a cumulative sum needs an axis and at most two dimensions")
     return ca.vec(ca.cumsum(ca.densify(_matrix(columns[0], shape)), axis % max(len(shape), 1)))
-
-
-def _kron(expr: Any, columns: list) -> Any:
-    left, right = (_matrix(column, arg.shape) for column, arg in zip(columns, expr.args))
-    return ca.vec(ca.kron(ca.densify(left), ca.densify(right)))
 
 
 def _convolve(expr: Any, columns: list) -> Any:
@@ -188,7 +182,9 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
     "NegExpression": lambda _, columns: -columns[0],
     "multiply": lambda _, columns: columns[0] * columns[1],
     "DivExpression": lambda _, columns: columns[0] / columns[1],
-    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "kron": _kron, "convolve": _convolve, "conv": _convolve,
+    "MulExpression": _matmul, "Sum": _sum, "cumsum": _cumsum, "convolve": _convolve, "conv": _convolve,
+    "kron": lambda expr, columns: ca.vec(ca.kron(*(ca.densify(_matrix(column, arg.shape))
+                                                   for column, arg in zip(columns, expr.args)))),
     "Power": _power, "PowerApprox": _power, "Prod": _prod,
     "Trace": lambda expr, columns: ca.trace(_matrix(columns[0], expr.args[0].shape)),
     "quad_over_lin": lambda _, columns: ca.sumsqr(columns[0]) / columns[1],

@@ -27,17 +27,15 @@ def back_ends() -> dict[str, BackEnd]:
             target = point.load()
             several: Iterable[BackEnd] = (target,) if isinstance(target, BackEnd) else tuple(target())
         except Exception as error:  # one broken plug-in must not take the other solvers away
-            several = (_broken(point.name, f"{point.value} fails: {type(error).__name__}: {error}"),)
+            several = (BackEnd(point.name, frozenset(), _absent, installed=False, about="cannot be loaded",
+                               broken=f"{point.value} fails: {type(error).__name__}: {error}"),)
         for back_end in several:
             found[back_end.name] = back_end
     return found
 
 
-def _broken(name: str, reason: str) -> BackEnd:
-    def run(program: "Program", settings: Settings) -> Answer:
-        return Answer(Status.FAILED, reason)
-
-    return BackEnd(name, frozenset(), run, installed=False, about="cannot be loaded", broken=reason)
+def _absent(program: "Program", settings: Settings) -> Answer:
+    return Answer(Status.FAILED, "cannot be loaded")
 
 
 def find(name: str) -> BackEnd:

@@ -15,7 +15,6 @@ import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.zero import Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
@@ -24,7 +23,7 @@ from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.backends.back_end import Answer
 from optid.errors import StructureError
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.limits import EQUALITIES, rows_of
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -60,14 +59,9 @@ class Smooth:
     inverse: tuple[Any, Any]
 
     @cached_property
-    def variables(self) -> tuple[cp.Variable, ...]:
+    def variables(self) -> list[cp.Variable]:
         """Variables of the smooth problem, in the order of its flat vector of unknowns."""
-        return tuple(self.problem.variables())
-
-    @cached_property
-    def parameters(self) -> tuple[cp.Parameter, ...]:
-        """Parameters of the smooth problem, in the order of its flat vector of parameters."""
-        return tuple(self.problem.parameters())
+        return self.problem.variables()
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -101,7 +95,7 @@ class Smooth:
     def parameter_values(self) -> np.ndarray:
         """Return the flat vector of the values the parameters hold now."""
         self.attributes.update_parameters(self.original)
-        return _flat([parameter.value for parameter in self.parameters])
+        return _flat([parameter.value for parameter in self.problem.parameters()])
 
     def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
         """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
@@ -163,11 +157,14 @@ class Derivatives:
         self.jacobian_pattern = self._oracles.jacobianstructure()
         self.hessian_pattern = self._oracles.hessianstructure()
 
-    def update(self) -> None:
-        """Take over the values the parameters hold now."""
-        if self._problem.parameters():
-            self._oracles.update_params(self._problem)
-        self._x = None
+    @classmethod
+    def of(cls, form: Smooth) -> "Derivatives":
+        """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
+        found = kept(form.original, "derivatives", lambda: cls(form))
+        if found._problem.parameters():
+            found._oracles.update_params(found._problem)
+        found._x = None
+        return found
 
     def at(self, x: Any) -> Any:
         """Return the engine at a point: its gradient(x), jacobian(x) and hessian(x, multipliers, factor)."""
@@ -177,13 +174,6 @@ class Derivatives:
             if self.rows.size:
                 self.rows = np.array(self._oracles.constraints(self._x))
         return self._oracles
-
-
-def derivatives(form: Smooth) -> Derivatives:
-    """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
-    found = kept(form.original, "derivatives", lambda: Derivatives(form))
-    found.update()
-    return found
 
 
 def _apply(problem: cp.Problem) -> Smooth:
@@ -240,10 +230,8 @@ class _SmoothChain(Dnlp2Smooth):
 
 
 def _row(constraint: Constraint) -> Row:
-    if isinstance(constraint, EQUALITIES | INEQUALITIES):
-        return Row(constraint.expr, isinstance(constraint, EQUALITIES), constraint.id)
-    if isinstance(constraint, NonNeg):
-        return Row(-constraint.args[0], False, constraint.id)
+    if (expression := rows_of(constraint)) is not None:
+        return Row(expression, isinstance(constraint, EQUALITIES), constraint.id)
     raise StructureError(
         f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
         "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")

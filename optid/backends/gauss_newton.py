@@ -15,14 +15,13 @@ from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
 from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
-from optid.program.gradients import flat_value
+from optid.program.expressions import flat_value
 from optid.program.judging import measure_violation, term_size
 from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
-from optid.structures.least_squares import RankOneStructure, rank_one_of
-from optid.structures.multipliers import fit_multipliers
+from optid.structures.least_squares import RankOneStructure, fit_multipliers, rank_one_of
 from optid.structures.rank_one import Point
 
 STEPS = 100
@@ -38,8 +37,7 @@ def run(program: Program, settings: Settings) -> Answer:
     ``descents`` (how many of these are then followed to their end, default 2).
     """
     form = rank_one_of(program)
-    if form is None:
-        return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
+    assert form is not None
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
     if not program.user_constraints:
@@ -236,7 +234,7 @@ class _Constrained:
         A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
         """
         self.at.assign(x)
-        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes()
+        tangent, usual = self.at.point(x).tangent(), self.program.usual_sizes
         slope = 2.0 * tangent.T @ (self.problem.root.T @ self._residual(x))
         units = 1.0 / np.maximum(np.linalg.norm(self.problem.root @ tangent, axis=0), 1e-12)
         rows, given, equal, touched, sizes = [], [], [], [], {}

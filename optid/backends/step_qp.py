@@ -14,10 +14,9 @@ import cvxpy as cp
 import numpy as np
 
 from optid.backends.back_end import Answer, BackEnd, Settings
-from optid.backends.clarabel import solve_least_squares
+from optid.backends.conic import solve_least_squares
 from optid.certificate.lifting import places
-from optid.program.expressions import flat
-from optid.program.gradients import affine_parts, flat_value, jacobians, side_by_side
+from optid.program.expressions import affine_parts, flat, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
@@ -27,25 +26,15 @@ from optid.structures.rank_one import Point
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The unknowns of a bilinear programme as one vector x = [linear variables; mu_1; b_1; mu_2; ...].
-
-    Attributes:
-        program: the programme.
-        form: its rank-one structure.
-    """
+    """The unknowns of a bilinear programme as one vector x = [linear variables; mu_1; b_1; mu_2; ...]."""
 
     program: Program
     form: RankOneStructure
 
     @cached_property
-    def names(self) -> list[str]:
-        """Names of the variables in the order of x."""
-        return [*self.form.linear, *(name for pair in self.form.blocks for name in pair)]
-
-    @cached_property
     def variables(self) -> list[cp.Variable]:
         """The variables in the order of x."""
-        return [self.program.variables[name] for name in self.names]
+        return [self.program.variables[name] for name in self.form.names]
 
     @property
     def size(self) -> int:
@@ -54,7 +43,7 @@ class Coordinates:
 
     def pack(self, values: Values) -> np.ndarray:
         """Return x for named values."""
-        return np.concatenate([np.ravel(values[name], order="F") for name in self.names]).astype(float)
+        return np.concatenate([np.ravel(values[name], order="F") for name in self.form.names]).astype(float)
 
     def unpack(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return named values for x."""
@@ -102,25 +91,15 @@ class Coordinates:
 
 @dataclass(eq=False)
 class _Rows:
-    """A constraint of a step, ``slope @ x + level <= 0`` or ``= 0`` in the units of the programme.
+    """A constraint of a step, ``slope @ x + level <= 0`` or ``= 0`` in the units of the programme."""
 
-    Attributes:
-        name: of its group.
-        span: its rows in the multipliers of the group.
-        member: the constraint of the programme.
-        unit: the rows are divided by it.
-        slope: (r, size).
-        level: (r,).
-        lifted: (E, f) where it reads ``E z <= f`` in the lifted vector, so that its curvature is known; otherwise None.
-    """
-
-    name: str
-    span: slice
+    name: str  # of its group
+    span: slice  # its rows in the multipliers of the group
     member: cp.Constraint
-    unit: float
-    slope: np.ndarray
-    level: np.ndarray
-    lifted: tuple[np.ndarray, np.ndarray] | None = None
+    unit: float  # the rows are divided by it
+    slope: np.ndarray  # (r, size)
+    level: np.ndarray  # (r,)
+    lifted: tuple[np.ndarray, np.ndarray] | None = None  # (E, f) where it reads E z <= f: its curvature is known
 
     @property
     def equality(self) -> bool:
@@ -144,9 +123,10 @@ class StepQP:
         self.at, self.sizes = at, dict(sizes)
         self.rows: list[_Rows] = []
         self.cones: list[tuple[str, slice, cp.Constraint]] = []
-        self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in zip(at.names, at.variables)])
+        named = list(zip(at.form.names, at.variables))
+        self._scale = np.concatenate([np.full(v.size, sizes[name]) for name, v in named])
         bs = [b for _, b in at.form.blocks] if pinned else []
-        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in zip(at.names, at.variables)])
+        self._pins = np.concatenate([np.full(v.size, name in bs) for name, v in named])
         self._slopes: dict[int, np.ndarray] = {}
         self._where = places(at.program, at.form)
         for name, group in at.program.constraints.items():
@@ -248,8 +228,8 @@ class StepQP:
     def _programme(self) -> tuple[Program, list[cp.Parameter]]:
         """The step in CVXPY, and its parameters in the order of `_matrices`."""
         at = self.at
-        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.names, at.variables)}
-        swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.names, at.variables)}
+        stand_ins = {name: cp.Variable(v.shape, name=name) for name, v in zip(at.form.names, at.variables)}
+        swap = {id(v): self.sizes[name] * stand_ins[name] for name, v in zip(at.form.names, at.variables)}
         x = cp.hstack([flat(v) for v in stand_ins.values()])
         matrices = [cp.Parameter(value.shape, value=value) for value in self._matrices()]
         r = cp.Variable(at.size)

@@ -5,13 +5,14 @@ returns no multipliers. Here the status of the *point* decides the claim.
 """
 
 import time
+from functools import partial
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Smooth, derivatives, smooth
+from optid.backends.dnlp import Derivatives, Smooth, smooth
 from optid.program.program import Program
 from optid.program.solution import Status
 
@@ -61,7 +62,7 @@ def options(settings: Settings) -> dict[str, Any]:
 
 def _model(unopy: Any, form: Smooth) -> Any:
     start, _ = form.start(), form.parameter_values()
-    engine = derivatives(form)
+    engine = Derivatives.of(form)
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:
@@ -72,20 +73,18 @@ def _model(unopy: Any, form: Smooth) -> Any:
         engine.at(x)
         out[:] = engine.rows
 
-    def gradient(x: Any, out: np.ndarray) -> None:
-        out[:] = engine.at(x).gradient(np.asarray(x))
-
-    def jacobian(x: Any, out: np.ndarray) -> None:
-        out[:] = engine.at(x).jacobian(np.asarray(x))
+    def derivative(x: Any, out: np.ndarray, kind: str) -> None:
+        out[:] = getattr(engine.at(x), kind)(np.asarray(x))
 
     def hessian(x: Any, factor: float, multipliers: Any, out: np.ndarray) -> None:
         out[:] = engine.at(x).hessian(np.asarray(x), np.asarray(multipliers), factor)
 
-    model.set_objective(unopy.MINIMIZE, objective, gradient)
+    model.set_objective(unopy.MINIMIZE, objective, partial(derivative, kind="gradient"))
     row_lower, row_upper = form.row_bounds
     if row_lower.size:
         row, column = engine.jacobian_pattern
-        model.set_constraints(row_lower.size, rows, row_lower, row_upper, len(row), row, column, jacobian)
+        model.set_constraints(row_lower.size, rows, row_lower, row_upper, len(row), row, column,
+                              partial(derivative, kind="jacobian"))
     row, column = engine.hessian_pattern
     model.set_lagrangian_hessian(len(row), unopy.LOWER_TRIANGLE, row, column, hessian)
     model.set_lagrangian_sign_convention(unopy.MULTIPLIER_POSITIVE)

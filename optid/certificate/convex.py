@@ -18,13 +18,12 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
-from optid.program.gradients import flat_value
+from optid.program.expressions import differences, flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
 from optid.program.structure import variable_size
-from optid.structures.least_squares import LeastSquaresStructure
-from optid.structures.multipliers import least_distance
+from optid.structures.least_squares import LeastSquaresStructure, least_distance
 
 CLOSED = 1e-6
 """Relative gap up to which a convex programme counts as solved to its optimum."""
@@ -59,23 +58,19 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
 
 
 def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float
-                         ) -> tuple[float, str] | None:
-    words = "least-squares dual"
-    best = _quadratic_bound(program, form, duals, objective)
-    if best is not None and relative_gap(objective, best, program.scale) <= CLOSED:
-        return best, f"{words} of the solver's multipliers"
-    own = _own_multipliers(program, form)
-    mine = None if own is None else _quadratic_bound(program, form, own, objective)
-    if mine is not None and (best is None or mine > best):
-        return mine, f"{words} of multipliers by least-distance programming"
-    return None if best is None else (best, f"{words} of the solver's multipliers")
+                         ) -> tuple[float, str]:
+    best = _quadratic_bound(program, form, duals, objective), "least-squares dual of the solver's multipliers"
+    if relative_gap(objective, best[0], program.scale) > CLOSED and (own := _own_multipliers(program, form)):
+        value = _quadratic_bound(program, form, own, objective)
+        best = max(best, (value, "least-squares dual of multipliers by least-distance programming"))
+    return best
 
 
-def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float | None:
-    """Minimum over all z of the Lagrangian of least squares, whose constraints are those of the user."""
+def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float:
+    """Minimum over all z of the Lagrangian of least squares, whose constraints are the user's; -inf without one."""
     lagrangian = Lagrangian.of(program, duals, program.user_constraints)
     if lagrangian is None:
-        return None
+        return -np.inf
     root = form.problem.root
     z = form.flat({name: program.variables[name].value for name in form.linear})
     pull = 2.0 * root.T @ (root @ z - form.problem.target)
@@ -107,21 +102,20 @@ def _tangent_bound(program: Program, duals: Values, objective: float) -> tuple[f
 def _hessian(program: Program) -> Array:
     """Second derivatives of a quadratic objective: differences of its gradient, which are exact."""
     variables = list(program.variables.values())
+    point = np.concatenate([flat_value(v) for v in variables])
 
-    def gradient() -> Array:
+    def assign(x: Array) -> None:
+        for v, part in zip(variables, np.split(x, np.cumsum([v.size for v in variables])[:-1])):
+            v.save_value(part.reshape(v.shape, order="F"))
+
+    def gradient(x: Array) -> Array:
+        assign(x)
         lagrangian = Lagrangian(program)
         lagrangian.add(program.objective.expr, np.ones(1))
         return np.concatenate([lagrangian.total[v.id] for v in variables])
 
-    columns, base = [], gradient()
-    for variable in variables:
-        value = np.array(variable.value, dtype=float)
-        size = float(np.max(np.abs(value), initial=0.0)) or 1.0
-        for step in size * np.eye(variable.size):
-            variable.save_value(value + step.reshape(variable.shape, order="F"))
-            columns.append((gradient() - base) / size)
-        variable.save_value(value)
-    matrix = np.array(columns)
+    matrix, _ = differences(gradient, point)
+    assign(point)
     return (matrix + matrix.T) / 2
 
 

@@ -32,8 +32,8 @@ class HankelBounds:
 
     Attributes:
         block_rows: the alphas that were tried.
-        values: (len(block_rows), orders) squared error, in squared units of the (weighted) outputs; column n is for
-            models of order n; zero where alpha is too small to say anything about n.
+        values: (len(block_rows), orders) squared error in squared units of the weighted outputs, by order from zero;
+            zero where alpha is too small to say anything about an order.
         energy: squared norm of the weighted outputs over the samples in complete windows, the yardstick.
     """
 
@@ -42,22 +42,14 @@ class HankelBounds:
     energy: float
 
     def value(self, n: int) -> tuple[float, int]:
-        """Return the largest bound for order n and its number of block rows.
-
-        Raises:
-            StructureError: an order the record was not examined for.
-        """
+        """Return the largest bound for order n and its number of block rows; refuse other orders (`StructureError`)."""
         if not 0 <= n < self.values.shape[1]:
             raise StructureError(f"bounds exist for the orders 0 to {self.values.shape[1] - 1}; got {n!r}")
         best = int(np.argmax(self.values[:, n]))
         return float(self.values[best, n]), self.block_rows[best]
 
     def bound(self, n: int, error: float) -> Bound:
-        """Return the certificate of a fit of order n with a squared simulation error, in the units of the bound.
-
-        Raises:
-            StructureError: an error below the bound, which then is no error of the simulator with measured feedback.
-        """
+        """Return the certificate of a fit of order n with a squared simulation error; refuse one below the bound."""
         value, rows = self.value(n)
         if error < value * (1 - 1e-9) - 1e-12 * self.energy:
             raise StructureError(f"an error of {error:.6g} lies below the bound {value:.6g} for order {n}: it was not "
@@ -126,8 +118,7 @@ def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, wei
         error: its value, a squared error of the simulator with measured feedback.
         block_rows: of the fit; the bound is the best of one, two and four times as many.
         said: what else there is to say about optimality.
-        applies: whether no observer gain corrects the state and no instruments stand for the feedback; for anything
-            else the bound does not hold and is not given.
+        applies: whether no observer gain corrects the state and no instruments stand for the feedback.
     """
     if not applies:
         return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")

@@ -6,8 +6,7 @@ from typing import Any
 import cvxpy as cp
 
 from optid.certificate.lifting import lift, places
-from optid.program.expressions import flat, solve_quietly
-from optid.program.gradients import flat_value, jacobians
+from optid.program.expressions import flat, flat_value, jacobians, solve_quietly
 from optid.program.limits import EQUALITIES
 from optid.program.program import Program
 from optid.structures.least_squares import rank_one_of

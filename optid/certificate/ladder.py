@@ -8,7 +8,7 @@ recomputed in closed form from its multipliers after a Cholesky check; nothing i
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from time import perf_counter
+from functools import cached_property
 
 import numpy as np
 
@@ -58,42 +58,29 @@ class Certification:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What the stages share, in whitened coordinates; block indices are those of the core.
-
-    Attributes:
-        core: reduction of the problem.
-        mus: (P_i,) each, oriented so that C mu >= 0.
-        bs: (nb_i,) each, of unit length.
-        objective: the objective around the point.
-        cones: constraint matrices by block.
-        nu: KKT multipliers (r_i,) of the cones, by block.
-        lam: KKT multipliers (r,) of the linear constraints.
-        linear: constraints on the lifted vector.
-        began: clock at the start.
-    """
+    """What the stages share, in whitened coordinates around the point; block indices are those of the core."""
 
     core: Core
-    mus: list[Array]
-    bs: list[Array]
+    mus: list[Array]  # (P_i,) each, oriented so that C mu >= 0
+    bs: list[Array]  # (nb_i,) each, of unit length
     objective: Quadratic
     cones: dict[int, Array]
-    nu: dict[int, Array]
-    lam: Array
+    nu: dict[int, Array]  # KKT multipliers (r_i,) of the cones
+    lam: Array  # and (r,) of the linear constraints
     linear: Linear
-    began: float
 
-    @property
+    @cached_property
     def blocks(self) -> list[Block]:
         """Position and shape of every block of the core."""
         return list(zip(block_slices(self.core.shapes, self.core.linear), self.core.shapes))
 
-    @property
+    @cached_property
     def vanishing(self) -> list[bool]:
         """Whether a block is zero: its minors are then all free, and its gradient must vanish by itself."""
         size = float(np.linalg.norm(self.objective.z))
         return [bool(np.linalg.norm(mu) <= 1e-10 * size) for mu in self.mus]
 
-    @property
+    @cached_property
     def masks(self) -> list[np.ndarray]:
         """Entries of the minors that do not touch the gradient at the point, in rotated coordinates, by block."""
         return [np.ones((p * nb, p * nb), bool) if vanishes else free_mask((p, nb))
@@ -153,7 +140,8 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
     case = prepare(problem, point, cones, linear)
     if not case.core.shapes and not len(linear.right):
         return conclude(case, "exact", "linear least squares", case.objective.gram, {})
-    cuts = instant_cuts(case)
+    cuts = {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]), np.outer(case.bs[i], case.bs[i]))
+            for i, cone in case.cones.items()}  # they cancel what the constraints leave of the gradient
     minors = tangent(case, cuts)
     found = conclude(case, "instant", "one Cholesky factorisation", minors, cuts)
     if found.bound.proved or effort == "instant":
@@ -176,7 +164,6 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
 
 def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear) -> Case:
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
-    began = perf_counter()
     keep_linear = bool(linear.rows[:, :problem.linear].any())
     keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
     core = reduce(problem, keep, keep_linear) if keep or keep_linear else problem.core
@@ -196,13 +183,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     else:
         linear = Linear.none(len(z))
     nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
-    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear, began)
-
-
-def instant_cuts(case: Case) -> dict[int, Array]:
-    """Sign-free cuts at the KKT multipliers: they cancel what the constraints leave of the gradient."""
-    return {i: np.multiply.outer(sign_free_cut(case.nu[i], cone, case.mus[i]),
-                                 np.outer(case.bs[i], case.bs[i])) for i, cone in case.cones.items()}
+    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
 
 
 def tangent(case: Case, cuts: dict[int, Array]) -> Array:
@@ -295,5 +276,4 @@ def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, A
     else:
         reason = f"not proved, no finite bound: {how}"
     evidence = Multipliers(case.core, minors, cuts, case.lam if linear is None else linear)
-    return Certification(Bound(bound, proved, method, reason, perf_counter() - case.began, evidence),
-                         () if proved else better)
+    return Certification(Bound(bound, proved, method, reason, evidence), () if proved else better)

@@ -13,7 +13,7 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
-from optid.program.gradients import affine_parts, side_by_side
+from optid.program.expressions import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
@@ -62,12 +62,9 @@ class Lifted:
 
 def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
                      ) -> tuple[Bound, Values | None]:
-    """Certify a point of a rank-one programme under its user constraints, with multipliers of the certificate's own.
+    """Return the bound at a point under user constraints, and values to restart from where it proposes a better point.
 
-    The semidefinite relaxation is not attempted above ``max_size`` multipliers.
-
-    Returns:
-        The bound, and values to restart from where the relaxation proposes a better point.
+    The multipliers are the certificate's own; the semidefinite relaxation is not attempted above ``max_size`` of them.
     """
     form = rank_one_of(program)
     if form is None:

@@ -189,13 +189,12 @@ def _nonlinear() -> list[Case]:
     ]
 
 
-def planted_fit(seed: int = 0, rows: int = 60, levels: int = 4, noise: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """Return (A, y) of ``y = A [a; vec(mu bᵀ)] + noise`` with one linear term, ``levels`` values mu and two lags b."""
-    rng = np.random.default_rng(seed)
-    matrix = rng.standard_normal((rows, 1 + 2 * levels))
-    mu = np.linspace(-1.0, 1.0, levels) ** 3
-    truth = np.concatenate([[0.5], np.kron([0.8, 0.6], mu)])
-    return matrix, matrix @ truth + noise * rng.standard_normal(rows)
+def planted_fit() -> tuple[np.ndarray, np.ndarray]:
+    """Return (A, y) of ``y = A [a; vec(mu bᵀ)] + noise`` with one linear term, four values mu and two lags b."""
+    rng = np.random.default_rng(0)
+    matrix = rng.standard_normal((60, 9))
+    truth = np.concatenate([[0.5], np.kron([0.8, 0.6], np.linspace(-1.0, 1.0, 4) ** 3)])
+    return matrix, matrix @ truth + 0.1 * rng.standard_normal(60)
 
 
 def _rank_one() -> list[Case]:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 from cvxpy.expressions.expression import Expression
@@ -21,9 +20,10 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.gradients import flat_value, jacobians, side_by_side
-from optid.program.limits import EQUALITIES, INEQUALITIES
+from optid.program.expressions import differences, flat_value, jacobians, side_by_side
+from optid.program.limits import EQUALITIES, rows_of
 from optid.program.program import Program
+from optid.structures.whitening import symmetric_root
 
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
@@ -114,7 +114,7 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     program.assign(found)
     equalities, inequalities, slack = constraint_rows(program, tuple(shapes))
 
-    lift, lifted = _differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
+    lift, lifted = differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
     problem = compressed.problem
     free, triangle, basis = whitened(problem.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
@@ -123,7 +123,7 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
 
     spread = compressed.spread(lifted + lift @ (directions @ centre), lift @ directions)
     # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
-    scatter = _square_root(spread.covariance) @ basis.T
+    scatter = symmetric_root(spread.covariance) @ basis.T
     local = LocalEstimate(centre, scatter, spread.dof, inequalities @ directions, slack, draws, seed)
     meaning = "penalised" if spread.penalised else "projected" if local.held else "gaussian"
     transform = getattr(fit.data, "transform", None)
@@ -153,18 +153,6 @@ def _refuse(fit: Any) -> None:
     if weight is not None and np.any(np.asarray(weight.value) > 0):
         raise StructureError("the nuclear norm shrinks Theta by an amount that no interval accounts for; refit with "
                              "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
-
-
-def _differences(function: Any, x: Array) -> tuple[Array, Array]:
-    """Jacobian and value of a function that is affine in each entry of x alone, so that differences are exact."""
-    base = function(x)
-    jacobian = np.empty((base.size, x.size))
-    steps = np.maximum(np.abs(x), 1e-3 * max(float(np.max(np.abs(x))), 1e-300))
-    for j, step in enumerate(steps):
-        moved = x.copy()
-        moved[j] += step
-        jacobian[:, j] = (function(moved) - base) / (moved[j] - x[j])
-    return jacobian, base
 
 
 def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
@@ -222,12 +210,8 @@ def constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Ar
 
 def _level(name: str, member: Constraint) -> Expression | None:
     """Return an expression that must be zero, or >= 0; None for a matrix or cone constraint far from active."""
-    if isinstance(member, EQUALITIES):
-        return member.expr
-    if isinstance(member, INEQUALITIES):
-        return -member.expr
-    if isinstance(member, NonNeg):
-        return member.args[0]
+    if (rows := rows_of(member)) is not None:
+        return -rows
     if isinstance(member, PSD):
         values = np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))
         if values[0] > 1e-3 * np.max(np.abs(values)):
@@ -239,8 +223,3 @@ def _level(name: str, member: Constraint) -> Expression | None:
     raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
                          "use optid.bootstrap for intervals")
 
-
-def _square_root(matrix: Array) -> Array:
-    """Return the symmetric square root, which is unique."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T

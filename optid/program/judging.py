@@ -5,12 +5,11 @@ from collections.abc import Iterable, Mapping
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import NonNeg
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
-from optid.program.gradients import flat_value, jacobians
-from optid.program.limits import EQUALITIES, INEQUALITIES, spans
+from optid.program.expressions import flat_value, jacobians
+from optid.program.limits import EQUALITIES, INEQUALITIES, rows_of, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
@@ -53,7 +52,7 @@ def measure_violation(program: Program) -> tuple[float, str]:
 
     Bounds that variables carry as attributes count as well, under the name of the variable.
     """
-    worst, name, usual = 0.0, "", program.usual_sizes()
+    worst, name, usual = 0.0, "", program.usual_sizes
     for key, group in program.constraints.items():
         if key in program.derived:
             continue  # recomputed, hence exact
@@ -116,12 +115,8 @@ def multiplier_terms(member: Constraint, dual: np.ndarray) -> list[tuple[cp.Expr
     The flat multipliers are projected on the dual cone, so that one of the wrong sign leaves a residual. None for a
     cone whose multipliers are not used here.
     """
-    if isinstance(member, EQUALITIES):
-        return [(member.expr, dual)]
-    if isinstance(member, INEQUALITIES):
-        return [(member.expr, np.maximum(dual, 0.0))]
-    if isinstance(member, NonNeg):
-        return [(member.args[0], -np.maximum(dual, 0.0))]
+    if (rows := rows_of(member)) is not None:
+        return [(rows, dual if isinstance(member, EQUALITIES) else np.maximum(dual, 0.0))]
     if isinstance(member, PSD):
         square = np.reshape(dual, member.args[0].shape, order="F")
         values, vectors = np.linalg.eigh((square + square.T) / 2)
@@ -149,7 +144,7 @@ class Lagrangian:
 
     def __init__(self, program: Program) -> None:
         self.variables = list(program.variables.values())
-        self.usual = program.usual_sizes()
+        self.usual = program.usual_sizes
         self.total = {v.id: np.zeros(v.size) for v in self.variables}
         self.terms = {v.id: np.zeros(v.size) for v in self.variables}
         self.value, self.complementarity = 0.0, 0.0

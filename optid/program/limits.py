@@ -7,13 +7,20 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.nonpos import Inequality, NonPos
+from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
 from cvxpy.constraints.zero import Equality, Zero
 
-from optid.program.gradients import flat_value, row_sizes
+from optid.program.expressions import flat_value, row_sizes
 
 EQUALITIES = Equality | Zero
 INEQUALITIES = Inequality | NonPos
+
+
+def rows_of(member: Constraint) -> cp.Expression | None:
+    """Return what an equality holds at zero and an inequality not above it; None for a cone."""
+    if isinstance(member, EQUALITIES | INEQUALITIES):
+        return member.expr
+    return -member.args[0] if isinstance(member, NonNeg) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,9 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
+from optid.program.expressions import flat_value
 from optid.program.judging import term_size
-from optid.program.limits import EQUALITIES, INEQUALITIES, Limit, slope_of
+from optid.program.limits import EQUALITIES, Limit, rows_of, slope_of
 from optid.program.program import Program
 from optid.program.solution import Solution
 
@@ -32,9 +33,8 @@ class Price:
         multiplier: change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers.
         fit_points: points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the
             constraint belongs to a step with an objective of its own.
-        step: what 1 % is in units of the bound: of the range of f where the bound is about f, else of the size of what
-            it bounds.
-        words: what the step is 1 % of, in words.
+        step: what 1 % is in units of the bound.
+        words: of what: of the range of f where the bound is about f, else of the size of what it bounds.
     """
 
     name: str
@@ -69,7 +69,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     unit = program.unit
     energy = solution.scale if program.compressed is None else unit * float(np.sum(program.compressed.energy))
     worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
-    found, usual = [], program.usual_sizes()
+    found, usual = [], program.usual_sizes
     for name, group in program.user_constraints.items():
         limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
         active, rows, slack = 0, 0, np.inf
@@ -102,8 +102,8 @@ def _slacks(member: Constraint) -> np.ndarray:
     """Distance of every row from its bound; zero for equalities."""
     if isinstance(member, EQUALITIES):
         return np.zeros(member.size)
-    if isinstance(member, INEQUALITIES):
-        return -np.ravel(member.expr.value)
+    if (rows := rows_of(member)) is not None:
+        return -flat_value(rows)
     if isinstance(member, PSD):
         return np.array([float(np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))[0])])
     if isinstance(member, SOC):

@@ -11,7 +11,7 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.errors import StructureError, nearest
 from optid.program.compressed import Compressed
-from optid.program.limits import EQUALITIES, INEQUALITIES, Limit
+from optid.program.limits import Limit
 from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
@@ -31,16 +31,15 @@ def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
         groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
     else:
         groups = {default: built}
-    result: dict[str, tuple[Limit, ...]] = {}
-    for name, item in groups.items():
-        members = tuple(item) if isinstance(item, list | tuple) else (item,)
-        for member in members:
-            if not isinstance(member, Constraint | Limit):
-                raise StructureError(
-                    f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1"
-                )
-        result[name] = tuple(one if isinstance(one, Limit) else Limit.of(one) for one in members)
-    return result
+    return {name: tuple(_limit(name, one) for one in (item if isinstance(item, list | tuple) else [item]))
+            for name, item in groups.items()}
+
+
+def _limit(name: str, member: Any) -> Limit:
+    if not isinstance(member, Constraint | Limit):
+        raise StructureError(
+            f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1")
+    return member if isinstance(member, Limit) else Limit.of(member)
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ class Program:
         demand = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual = self.usual_sizes()
+        usual = self.usual_sizes
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -178,8 +177,9 @@ class Program:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
         return replace(self, constraints=constraints, variables=variables, limits=limits)
 
+    @cached_property
     def usual_sizes(self) -> dict[int, float]:
-        """Return the largest entry of every variable at the start, by id; variables that vanish there are left out."""
+        """The largest entry of every variable at the start, by id; variables that vanish there are left out."""
         sizes = {self.variables[name].id: float(np.max(np.abs(value), initial=0.0))
                  for name, value in self.start.items() if name in self.variables}
         return {key: size for key, size in sizes.items() if size > 0}
@@ -221,32 +221,6 @@ class Program:
                        structure=None, certify=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
-
-    def soften(self, name: str, weight: float) -> "Program":
-        """Return the programme with a user's equality or inequality turned into a quadratic penalty on its violation.
-
-        The weight is the penalty per squared unit of violation.
-
-        Raises:
-            StructureError: unknown name, or a constraint that is neither an equality nor an inequality.
-        """
-        if name not in self.user_constraints:
-            raise StructureError(f"no constraint {name!r} to soften. {nearest(name, self.user_constraints)}")
-        penalty: Any = 0.0
-        said = [limit.member for limit in self.limits.get(name, ())] or self.constraints[name]
-        for member in said:
-            if isinstance(member, EQUALITIES):
-                penalty = penalty + cp.sum_squares(member.expr)
-            elif isinstance(member, INEQUALITIES):
-                penalty = penalty + cp.sum_squares(cp.pos(member.expr))
-            else:
-                raise StructureError(f"constraint {name!r} is a {type(member).__name__}; "
-                                     "only equalities and inequalities can be softened")
-        rest = {key: group for key, group in self.constraints.items() if key != name}
-        objective = cp.Minimize(self.objective.expr + weight / self.unit * penalty)
-        return replace(self, objective=objective, constraints=rest,
-                       structure=None, certify=None,
-                       note=f"constraint {name!r} is a penalty here")
 
     def without(self, *names: str) -> "Program":
         """Return the programme without the named constraints."""

@@ -34,7 +34,6 @@ class Bound:
         proved: True when the bound closes the gap to the point it was asked for.
         method: how it was obtained ("instant", "ascent", "sdp", "product cuts", "nuclear dual", ...).
         reason: one sentence for people: why it is a proof, or why there is none.
-        seconds: time spent.
         multipliers: the evidence from which the value can be recomputed.
     """
 
@@ -42,7 +41,6 @@ class Bound:
     proved: bool
     method: str
     reason: str = ""
-    seconds: float = 0.0
     multipliers: Any = field(default=None, repr=False, compare=False)
 
     @classmethod

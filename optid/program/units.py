@@ -62,13 +62,12 @@ def in_units(data: Any, units: Transform) -> Any:
 
 
 def inner_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
-    """Return the bases of inputs in other units; those of inputs that keep theirs stay as they are."""
-    return tuple(basis.mapped(1 / scale, -origin / scale)[0]
-                 for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
+    """Return the bases of inputs in the units of the programme; those of inputs that keep theirs stay as they are."""
+    return outer_bases(bases, inverse(units))
 
 
 def outer_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
-    """Return the bases of inputs in the units of the record: the inverse of `inner_bases`."""
+    """Return the bases of inputs in the units of the record."""
     return tuple(basis.mapped(scale, origin)[0] for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
 
 

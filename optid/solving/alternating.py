@@ -24,20 +24,16 @@ STEPS = 1000
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Alternate from the programme's start until the objective stops falling.
+    """Alternate from the start until the objective stops falling; the multipliers are those of the last two half-steps.
 
     Options: ``inner`` (word of the convex back end of the half-steps, default "clarabel"), ``steps`` (largest number of
     pairs of half-steps, default 1000).
-
-    Returns:
-        The last point, with the multipliers of the last two half-steps.
 
     Raises:
         StructureError: a constraint that is not convex even with one factor held.
     """
     form = rank_one_of(program)
-    if form is None:
-        return Answer(Status.FAILED, "the programme carries no rank-one least-squares structure")
+    assert form is not None
     options = dict(settings.options)
     inner, steps = str(options.pop("inner", "clarabel")), int(options.pop("steps", STEPS))
     if options:

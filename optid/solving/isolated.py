@@ -17,8 +17,7 @@ GRACE = 0.5  # seconds a solver has to notice its own time limit before it is ki
 def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
     """Run a back end on a copy of the programme in a forked child, which is killed shortly after the time limit.
 
-    Returns:
-        The child's answer; ``Status.LIMIT`` when it was killed, ``Status.FAILED`` when it died.
+    The answer is then ``Status.LIMIT``, and ``Status.FAILED`` when the child died by itself.
 
     Raises:
         StructureError: the back end refuses the programme.

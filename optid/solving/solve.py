@@ -69,7 +69,10 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
         clock = time.perf_counter()
         answer = _attempt(program, back_end, settings, separate)
         seconds = spent + time.perf_counter() - clock
-        return _verdict(program, back_end, answer, chosen, settings, seconds, prove, separate)
+        base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
+                        iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
+                        claim=answer.status)
+        return _verdict(program, back_end, answer, base, settings, prove, separate).in_units(program.unit)
 
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
@@ -100,7 +103,7 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
     """Run a back end from the programme's start; whatever happens to it is an answer."""
     program.clear_duals()
-    if settings.warm and program.start:
+    if settings.warm and program.start and not back_end.exploits(program):  # methods of a structure read the start
         program.assign(program.start)
     try:
         return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
@@ -110,17 +113,14 @@ def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: 
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
 
 
-def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, settings: Settings, seconds: float,
-             prove: bool, separate: bool) -> Solution:
-    base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
-                    iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
-                    claim=answer.status)
+def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
+             separate: bool) -> Solution:
     values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
     if not values:
         status, reason = _without_point(program, answer, back_end.name)
         if status is Status.FAILED and _contradictory(program):
-            return _conflict(program, base, reason)
-        return replace(base, status=status, reason=reason).in_units(program.unit)
+            return _conflict(base, reason)
+        return replace(base, status=status, reason=reason)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
     if missing := set(program.variables) - set(values) - set(program.derived):
@@ -137,7 +137,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
     assert point.residuals is not None
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
-        return _conflict(program, base, reason)
+        return _conflict(base, reason)
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
         point, bound = _proof(program, back_end, settings, point, separate)
@@ -147,13 +147,12 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, chosen: str, s
             status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
     done = time.perf_counter()
     return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged)
-                   ).in_units(program.unit)
+                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged))
 
 
-def _conflict(program: Program, base: Solution, reason: str) -> Solution:
+def _conflict(base: Solution, reason: str) -> Solution:
     """Say that no point satisfies the constraints; where a solver stopped is then nothing to go on with."""
-    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}").in_units(program.unit)
+    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
 
 
 def _judged(program: Program, answer: Answer, base: Solution) -> Solution:

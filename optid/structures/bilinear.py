@@ -43,7 +43,6 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     estimates = matrices(core.least_squares, core.shapes)
     factors = list(zip(estimates, core.whitening.factors_mu, core.whitening.factors_b))
     white = [np.linalg.svd(left.T @ theta @ right, full_matrices=False) for theta, left, right in factors]
-    plain = [np.linalg.svd(theta, full_matrices=False) for theta in estimates]
     rank = [min(shape) for shape in core.shapes]
     rng = np.random.default_rng(seed)
 
@@ -53,7 +52,8 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     found = []
     for k in range(count):
         if k == 1:
-            mus, bs = core.whitening.forward(*zip(*(pair(svd, 0) for svd in plain)))
+            plain = [pair(np.linalg.svd(theta, full_matrices=False), 0) for theta in estimates]
+            mus, bs = core.whitening.forward(*zip(*plain))
         elif k < 4:
             mus, bs = zip(*(pair(svd, max(k - 1, 0) % r) for svd, r in zip(white, rank)))
         else:
@@ -111,15 +111,9 @@ def descend(core: Core, bs: list[Array], iterations: int = 1000, alternations: i
 
 @dataclass(frozen=True, eq=False)
 class _Projected:
-    """The best mu_i for some b_i of unit length, and the least squares that gave them.
+    """The best mu_i for some b_i of unit length, from pieces (nb, k, P), and the least squares that gave them.
 
-    Attributes:
-        pieces: (nb, k, P) of every block.
-        bs: unit vectors.
-        mus: the best for them.
-        basis: (k, sum P) orthonormal and
-        triangle: with basis @ triangle the regressors of the mu_i.
-        residual: (k,).
+    The regressors of the mu_i are basis @ triangle, (k, sum P), regular where every mu_i has an effect of its own.
     """
 
     pieces: list[Array]
@@ -127,6 +121,7 @@ class _Projected:
     mus: list[Array]
     basis: Array
     triangle: Array
+    regular: bool
     residual: Array
 
     @classmethod
@@ -135,12 +130,10 @@ class _Projected:
         design = np.concatenate([np.tensordot(b, piece, 1) for piece, b in zip(pieces, units)], axis=1)
         basis, triangle = np.linalg.qr(design)
         diagonal = np.abs(np.diag(triangle))
-        if not np.min(diagonal) > 1e-13 * np.max(diagonal):  # an input without effect, or two that are one
-            mus = np.linalg.lstsq(design, target, rcond=1e-13)[0]
-        else:
-            mus = _trtrs(triangle, basis.T @ target)[0]
+        regular = bool(np.min(diagonal) > 1e-13 * np.max(diagonal))  # no input without effect, no two that are one
+        mus = _trtrs(triangle, basis.T @ target)[0] if regular else np.linalg.lstsq(design, target, rcond=1e-13)[0]
         split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
-        return cls(pieces, units, split, basis, triangle, design @ mus - target)
+        return cls(pieces, units, split, basis, triangle, regular, design @ mus - target)
 
     @property
     def value(self) -> float:
@@ -168,10 +161,8 @@ class _Projected:
             forces[row : row + mu.size, column : column + b.size] = scale * gradient
             row, column = row + mu.size, column + b.size
         across = np.concatenate(regressors, axis=1)
-        diagonal = np.abs(np.diag(self.triangle))
-        usable = np.min(diagonal) > 1e-13 * np.max(diagonal)
         mixed = self.basis.T @ across
-        if usable:
+        if self.regular:
             mixed = mixed + _trtrs(self.triangle, forces, trans=1)[0]
         hessian = across.T @ across - mixed.T @ mixed
         weight, column = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny), 0

@@ -50,19 +50,16 @@ class GroupProblem:
             raise StructureError("every group needs a positive weight.")
         if not (np.isfinite(self.design).all() and np.isfinite(self.target).all()):
             raise StructureError("the design or the target has a value that is not finite.")
-        sizes = np.repeat(self.lengths**2, np.diff(self.edges))
-        for d in range(1, int(np.diff(self.edges).max())):
-            first = np.flatnonzero(self._group_of[d:] == self._group_of[:-d])
+        counts = np.diff(self.edges)
+        sizes, group = np.repeat(self.lengths**2, counts), np.repeat(np.arange(counts.size), counts)
+        for d in range(1, int(counts.max())):
+            first = np.flatnonzero(group[d:] == group[:-d])
             inner = np.einsum("ij,ij->j", self.design[:, first], self.design[:, first + d])
             if np.any(np.abs(inner) > SPREAD * sizes[first]):
                 raise StructureError("the columns of a group must be orthogonal.")
         own = np.einsum("ij,ij->j", self.design, self.design)
         if np.any((np.abs(own - sizes) > SPREAD * sizes) & (own > 0)):
             raise StructureError("the columns of a group must be of one length, or zero.")
-
-    @cached_property
-    def _group_of(self) -> np.ndarray:
-        return np.repeat(np.arange(self.edges.size - 1), np.diff(self.edges))
 
     @cached_property
     def lengths(self) -> Array:
@@ -103,20 +100,18 @@ class GroupProblem:
 
 @dataclass(frozen=True, eq=False)
 class GroupSparseStructure(Structure):
-    """``F = 1/2 ‖r - M a‖² + penalty sum_g w_g ‖a_g‖``; the constraint ``residual`` defines r - M a as a variable.
+    """P(a) with lambda as the parameter ``lambda``; the constraint ``residual`` defines r - M a as a variable.
 
     Attributes:
         problem: the numbers.
         blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
-        penalty: name of the parameter that holds lambda.
-        residual: name of the variable of the residual, and of the constraint that defines it.
     """
 
     word: ClassVar[str] = "group-sparse"
+    penalty: ClassVar[str] = "lambda"
+    residual: ClassVar[str] = "residual"
     problem: GroupProblem
     blocks: Mapping[str, tuple[int, ...]]
-    penalty: str = "lambda"
-    residual: str = "residual"
 
     @property
     def about(self) -> str:

@@ -13,7 +13,7 @@ from optid.arrays import Array
 from optid.models.layout import Layout
 from optid.statistics import Statistics
 from optid.structures.rank_one import Core, RankOne
-from optid.structures.whitening import leading_pair
+from optid.structures.whitening import invert_triangular, symmetric_root
 
 
 def positions(layout: Layout) -> NDArray[np.intp]:
@@ -50,7 +50,7 @@ def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: flo
     if ridge or curvature:
         penalties = [ridge / scale**2 * np.eye(basis.size) + curvature * np.asarray(basis.penalty(2))
                      for basis, scale in zip(layout.bases, scales)]
-        roots = [np.kron(np.eye(q), _square_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
+        roots = [np.kron(np.eye(q), symmetric_root(penalty)) for penalty, (_, q) in zip(penalties, blocks)]
         system = np.vstack([system, np.pad(np.asarray(block_diag(*roots)), ((0, 0), (linear, 1)))])
     if prior is not None:
         system = np.vstack([system, np.pad(prior, ((0, 0), (0, 1)))])
@@ -61,11 +61,6 @@ def lifted_problem(statistics: Statistics, columns: NDArray[np.intp], ridge: flo
                    blocks=blocks, scale=float(np.sum(root[:, n:] ** 2)))
 
 
-def _square_root(matrix: Array) -> Array:
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-
-
 def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) -> list[tuple[Array, Array]]:
     """Return the (mu, vec b) nearest to every Theta_c (P_c, nb_c l) (Luo, Algorithm 3.1; Bai, Automatica 34, 1998).
 
@@ -73,9 +68,10 @@ def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) ->
     """
     pairs = []
     for c, theta in enumerate(thetas):
-        left, right = np.eye(theta.shape[0]), np.eye(theta.shape[1])
+        of_mu, of_b = np.eye(theta.shape[0]), np.eye(theta.shape[1])
         if whitened and c in core.kept:
             position = core.kept.index(c)
-            left, right = core.whitening.factors_mu[position], core.whitening.factors_b[position]
-        pairs.append(leading_pair(theta, left, right))
+            of_mu, of_b = core.whitening.factors_mu[position], core.whitening.factors_b[position]
+        left, sizes, right = np.linalg.svd(of_mu.T @ theta @ of_b, full_matrices=False)
+        pairs.append((invert_triangular(of_mu).T @ (sizes[0] * left[:, 0]), invert_triangular(of_b).T @ right[0]))
     return pairs

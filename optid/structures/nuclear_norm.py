@@ -263,23 +263,14 @@ class NuclearProblem:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Outputs solved for together, measured ones in the eigenvectors of their Gram matrix with the free ones removed.
+    """Outputs solved for together, measured ones in eigenvectors of their Gram matrix with the free ones removed."""
 
-    Attributes:
-        measured: positions of the measured outputs in the flattened array.
-        free: positions of the missing ones.
-        values: eigenvalues.
-        vectors: eigenvectors, as columns.
-        cross: (measured, free) part of the Gram matrix.
-        free_inverse: pseudo-inverse of the free part.
-    """
-
-    measured: np.ndarray
-    free: np.ndarray
+    measured: np.ndarray  # positions of the measured outputs in the flattened array
+    free: np.ndarray  # and of the missing ones
     values: Array
-    vectors: Array
-    cross: Array
-    free_inverse: Array
+    vectors: Array  # as columns
+    cross: Array  # (measured, free) part of the Gram matrix
+    free_inverse: Array  # pseudo-inverse of the free part
 
     @classmethod
     def of(cls, where: np.ndarray, gram: Array, known: np.ndarray) -> "Group":
@@ -316,16 +307,12 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
 class NuclearNormStructure(Structure):
     """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
 
-    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them.
-
-    Attributes:
-        problem: the numbers.
-        weight: name of the parameter that holds the weight.
+    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them, the parameter ``weight``
+    holds the weight.
     """
 
     word: ClassVar[str] = "nuclear"
     problem: NuclearProblem
-    weight: str = "weight"
 
     @property
     def about(self) -> str:

@@ -15,14 +15,14 @@ from optid.arrays import Array
 
 _trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 
+TINY = np.finfo(float).tiny
+
 
 def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)``.
+    """Return lower triangular ``(L_mu, L_b)`` with ``gram ~ (L_b L_b^T) kron (L_mu L_mu^T)`` for a shape (P, nb).
 
     Flip-flop iteration, the maximum-likelihood fit of a separable covariance (Dutilleul, J. Stat. Comput. Simul. 64,
     1999): each factor in turn is the average of the other one's whitened blocks.
-
-    The Gram matrix is (P nb, P nb), the shape (P, nb).
     """
     p, nb = shape
     paired = gram.reshape(nb, p, nb, p).transpose(0, 2, 1, 3).reshape(nb * nb, p * p)
@@ -36,9 +36,9 @@ def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array
 
 def _factor(matrix: Array) -> tuple[Array, Array]:
     """Lower Cholesky factor and inverse; a whisper of the identity keeps the coordinates invertible."""
-    size = len(matrix)
-    ridge = 1e-13 * max(float(np.trace(matrix)) / size, np.finfo(float).tiny)
-    factor = np.linalg.cholesky(matrix + ridge * np.eye(size))
+    shifted = matrix.copy()
+    shifted.flat[:: len(matrix) + 1] += 1e-13 * max(float(matrix.trace()) / len(matrix), TINY)
+    factor = np.linalg.cholesky(shifted)
     inverse = invert_triangular(factor)
     return factor, inverse.T @ inverse
 
@@ -51,13 +51,10 @@ def invert_triangular(factor: Array, lower: bool = True) -> Array:
     return inverse
 
 
-def leading_pair(theta: Array, factor_mu: Array, factor_b: Array) -> tuple[Array, Array]:
-    """Return (mu, b) with mu b^T nearest to Theta in the Kronecker metric of two factors; identities for Frobenius.
-
-    Theta is (P, nb); the factors (P, P) and (nb, nb) are lower triangular.
-    """
-    left, size, right = np.linalg.svd(factor_mu.T @ theta @ factor_b, full_matrices=False)
-    return invert_triangular(factor_mu).T @ (size[0] * left[:, 0]), invert_triangular(factor_b).T @ right[0]
+def symmetric_root(matrix: Array) -> Array:
+    """Return the symmetric square root of a matrix without negative eigenvalues, which is unique."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slice]:

@@ -1,0 +1,117 @@
+"""State-space models with static functions of latent signals, or of what a linear or Hammerstein system gives.
+
+* `lfr`, linear fractional representation: ``x(k+1) = A x + B f(u) + Ez h(z) + K e``,
+  ``y(k) = C x + D f(u) + Fz h(z) + d + e``, ``z = Cz x + Dz u + const`` with z scalar for every h. What is affine in z
+  belongs to A, B, C and D; h is orthogonal to it. The latent signals are added one after another to the optimum of the
+  model without them (`optid.identify.prediction_error.latent_search`).
+* `wiener_ss`, `hammerstein_wiener_ss`: ``x(k+1) = A x + B f(u)``, ``y_o(k) = h_o(z_o) + d_o + e_o``,
+  ``z_o = Cz_o x + Dz_o u + const``, from the optimum of the model with h the identity; f is the identity for Wiener
+  models.
+
+The errors are minimised over all parts, z included, by the programmes of `formulations.state_space`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from formulations.state_space import state_space_fit
+from optid.arrays import check_integer
+from optid.bases import Bases, Basis, Polynomial, parse
+from optid.data.record import Data
+from optid.identify.arguments import in_memory, one_of
+from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
+from optid.models import HammersteinSS
+from optid.solving.solve import Procedure
+from optid.statistics.state_unknowns import Latent, beyond_affine
+
+
+def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3",
+        latent: str = "states+inputs", direct: bool = False, basis: Bases = "linear", criterion: str = "simulation",
+        block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
+        feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+        initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
+        constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the error of a model with functions of latent signals.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`.
+
+    Args:
+        channels: number of latent signals.
+        latent_basis: basis of every h, on z in [-1, 1]; beyond, polynomials go on as they are, splines straight.
+        latent: what z is made of, "states+inputs" or "states".
+        direct: whether h acts on the outputs, too.
+        criterion: "simulation" (the free run) or "prediction" (K estimated).
+        initial: models to start from besides, without latent signals.
+        seed: of the directions of z that are tried.
+
+    Raises:
+        StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
+        RankError: too few samples, or no direction of z whose run stays finite.
+    """
+    check_integer(channels, "channels")
+    one_of("latent", latent, ("states+inputs", "states"))
+    inner = _on_latent(latent_basis)
+    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
+    extend = partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations)
+    return state_space_fit(
+        "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
+        weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
+        iterations=iterations, constraints=constraints, extend=extend)
+
+
+def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
+              block_rows: int | Sequence[int] | None = None, weighting: str = "auto", feedthrough: bool = True,
+              stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+              constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation error of a Wiener model.
+
+    Named variables: ``B``, ``Bu``, ``D``, ``Du``, ``Theta``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`, as are the errors raised.
+
+    Args:
+        output_basis: basis of every h, on z in [-1, 1].
+        feedthrough: whether the inputs act on z at once.
+        initial: linear models to start from besides.
+    """
+    return _fit("wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
+                weighting=weighting, stability=stability, initial=initial, constraints=constraints)
+
+
+def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3",
+                          output_basis: Any = "polynomial:3", block_rows: int | Sequence[int] | None = None,
+                          weighting: str = "auto", stability: str = "stable",
+                          initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+                          constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation error of a Hammerstein-Wiener model whose inputs act on the outputs a sample later.
+
+    Named variables: ``Bu``, ``Du``, ``Theta``, ``offset``, ``x0``. Other arguments as in
+    `formulations.state_space.hammerstein_ss`, as are the errors raised.
+
+    Args:
+        output_basis: basis of every h, on z in [-1, 1].
+        initial: Hammerstein models to start from besides.
+    """
+    return _fit("hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
+                block_rows=block_rows, weighting=weighting, stability=stability, initial=initial,
+                constraints=constraints)
+
+
+def _fit(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: bool, iterations: int,
+         **settings: Any) -> Procedure:
+    inner = _on_latent(output_basis)
+    functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=feedthrough)
+                      for o in range(in_memory(data, "simulation errors").l))
+    extend = partial(add_output_functions, functions=functions, iterations=iterations)
+    return state_space_fit(name, data, nx, criterion="simulation", feedthrough=feedthrough, iterations=iterations,
+                           extend=extend, **settings)
+
+
+def _on_latent(given: Basis | str) -> Basis:
+    """Return the basis of a latent function, on [-1, 1]."""
+    basis: Any = parse(given) if isinstance(given, str) else given
+    return replace(basis, interval=(-1.0, 1.0), outside="extrapolate" if isinstance(basis, Polynomial) else "linear")
