@@ -12,7 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
-from optid.models.state_signals import Parts, Places, Signals, Stretch
+from optid.models.state_signals import Direct, Parts, Signals, Stretch
 from optid.models.state_space import StateSpace
 
 STRETCH = 16384
@@ -192,7 +192,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn = np.array(x0, dtype=float), np.eye(n)
-    parts, places = job.model.parts, Places.none(job.model.parts)
+    nothing = Direct.of()  # besides the initial state
     for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
         if not (informs or whole):
             break
@@ -203,7 +203,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
         cost += float(np.sum(error[present] ** 2))
         if informs:
             jacobian = np.empty((last - first, outputs, n))
-            sensitivities(parts, places, signals(job, stretch, states, simulated), turn, jacobian)
+            sensitivities(job.model.parts, nothing, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not np.all(np.isfinite(rows)):
                 raise DataError(
@@ -252,38 +252,23 @@ def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
     return Stretch._make([*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high])
 
 
-def signals(job: Run, stretch: Stretch, states: Array, outputs: Array, **known: Array) -> Signals:
-    """Describe a run over a stretch, so that `sensitivities` can be carried along it.
-
-    Args:
-        job: the run.
-        stretch: what drove it.
-        states: (T, n) its states.
-        outputs: (T, l) its outputs.
-        known: values of functions of the inputs and of measured outputs, where their coefficients are unknown.
-    """
-    model, missing = job.model, np.isnan(stretch.y)
-    count, slopes = len(states), np.zeros((len(states), len(model.latent)))
-    z = stretch.z + states @ model.Cz.T
-    for j, h in enumerate(model.latent):
-        slopes[:, j] = h.slope(z[:, j])
+def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signals:
+    """Describe a run over a stretch with its states (T, n) and outputs (T, l), but for the `values` of unknowns."""
+    model, missing, slopes = job.model, np.isnan(stretch.y), np.zeros((len(states), len(job.model.latent)))
+    for j, (h, z) in enumerate(zip(model.latent, (stretch.z + states @ model.Cz.T).T)):
+        slopes[:, j] = h.slope(z)
     returned = np.zeros((0, model.nx, model.l))
     if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
         own = model.returned(outputs) if missing.any() else 0.0
         returned = np.where(missing[:, None, :], own, -job.gain)
-    parts = {
-        "states": states, "innovation": np.where(missing, 0.0, stretch.y - outputs), "returned": returned,
-        "u": np.zeros((0, 0)), "f": np.zeros((count, len(model.nonlinearities))), "eta": np.zeros((0, 0)),
-        "g": np.zeros((count, len(model.feedback))), "zeta": np.zeros((0, 0)), "w": np.zeros((0, 0)), "slopes": slopes,
-        "phi": np.zeros((0, 0)), **known}
-    return Signals(**{name: np.ascontiguousarray(value) for name, value in parts.items()})
+    return Signals(returned, slopes, np.zeros((len(states), 0)))
 
 
-def sensitivities(parts: Parts, places: Places, run: Signals, turn: Array, jacobian: Array) -> None:
+def sensitivities(parts: Parts, direct: Direct, run: Signals, turn: Array, jacobian: Array) -> None:
     """Carry derivatives along a run; see `optid.models.state_kernels.sensitivities`."""
     from optid.models.state_kernels import sensitivities as carry
 
-    carry(parts, places, run, turn, jacobian)
+    carry(parts, direct, run, turn, jacobian)
 
 
 def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:

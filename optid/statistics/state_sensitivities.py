@@ -4,7 +4,7 @@ A stretch is run by the simulator of the criterion; the derivatives of the state
 (`optid.models.state_kernels`), and what leaves a chunk is a factor of [sensitivities | errors].
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError
 from optid.models import state_simulation as simulation
-from optid.models.state_signals import Signals, Stretch
+from optid.models.state_signals import Stretch
 from optid.models.state_space import StateSpace
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
@@ -141,7 +141,7 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
           ) -> Iterator[tuple[Array, Array]]:
     """Yield outputs (T, l), and sensitivities (T, l, n + shared + 1) with a column to write in, chunk by chunk."""
     n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
-    places, state = unknowns.places(parts), np.array(point.x0[index], dtype=float)
+    direct, state = unknowns.direct(point), np.array(point.x0[index], dtype=float)
     turn = np.zeros((n, n + unknowns.shared))
     turn[:, :n] = np.eye(n)
     for first in range(0, len(job.u), chunk):
@@ -152,24 +152,21 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
         count = len(f)
         states, outputs, jacobian = np.empty((count, n)), np.empty((count, l)), np.empty((count, l, turn.shape[1] + 1))
         simulation.march(job, first, stretch, state, outputs, states)
-        known = {"f": f, "eta": np.hstack(eta), "u": job.u[samples]}
-        run = _signals(unknowns, point, job, stretch, states, outputs, known)
-        simulation.sensitivities(parts, places, run, turn, jacobian)
+        run = simulation.signals(job, stretch, states, outputs)
+        values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
+        simulation.sensitivities(parts, direct, run._replace(values=values), turn, jacobian)
         yield outputs, jacobian
 
 
-def _signals(unknowns: StateUnknowns, point: StatePoint, job: simulation.Run, stretch: Stretch, states: Array,
-             outputs: Array, known: dict[str, Array]) -> Signals:
-    """Describe a run with the values of all functions whose coefficients are unknown."""
-    families = unknowns.expansion.feedback
-    if families:
-        fed = np.where(np.isnan(stretch.y), outputs, stretch.y)
-        zeta = [family.values(fed) for family in families]
-        known["g"] = np.column_stack([part @ nu for part, nu in zip(zeta, point.nus)])
-        known["zeta"] = np.hstack(zeta)
-    if unknowns.latent:
-        z = stretch.z + states @ point.Cz.T
-        phi = [one.basis.values(z[:, i]) @ one.vectors for i, one in enumerate(unknowns.latent)]
-        known["w"] = np.column_stack([part @ c for part, c in zip(phi, point.cs)])
-        known["phi"] = np.hstack(phi)
-    return simulation.signals(job, stretch, states, outputs, **known)
+def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, states: Array, outputs: Array,
+            slopes: Array, u: Array, f: Array, eta: Sequence[Array]) -> Array:
+    """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`."""
+    missing, one = np.isnan(stretch.y), np.ones((len(u), 1))
+    fed, argument = np.where(missing, outputs, stretch.y), np.hstack([states, u, one])
+    zeta = [family.values(fed) for family in unknowns.expansion.feedback]
+    z = (stretch.z + states @ point.Cz.T).T
+    phi = [latent.basis.values(signal) @ latent.vectors for latent, signal in zip(unknowns.latent, z)]
+    g, w = ([part @ one for part, one in zip(parts, of)] for parts, of in ((zeta, point.nus), (phi, point.cs)))
+    innovations = np.where(missing, 0.0, stretch.y - outputs)
+    return np.column_stack([states, innovations, f, *g, *w, one, *eta, *zeta, *phi,
+                            *(slope[:, None] * argument for slope in slopes.T)])
