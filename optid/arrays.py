@@ -92,6 +92,16 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
     return int(value)
 
 
+def finite(values: Any, name: str) -> np.ndarray:
+    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
+    array = np.array(values, dtype=float)
+    if not np.all(np.isfinite(array)):
+        at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
+    array.flags.writeable = False
+    return array
+
+
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
     """Refuse integers (N, channels) beyond 2**53, which float64 cannot hold; see `check_finite`.
 

@@ -12,17 +12,20 @@ from optid.models.nonlinearity import Nonlinearity
 
 
 def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
-    """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
+    """Return the linear part as a `scipy.signal.dlti` with the model's dt.
 
-    The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
-    state-space system. An unknown channel, a name or an index, raises a `StructureError`.
+    The nonlinearity and the constant are not part of it. A state-space model is returned whole, from every f to every
+    output. Of a transfer function it is the part from one f to one output: with one output a transfer function, with
+    several a state-space system. An unknown channel, a name or an index, raises a `StructureError`.
     """
     from scipy.signal import dlti
 
     o, c = _position(output, model.outputs, "output"), _position(input, model.inputs, "input")
-    if model.l == 1:
+    if model.structure != "ss" and model.l == 1:
         return dlti(*_polynomials(model, c), dt=model.dt)
     a, b, c_matrix, d = state_space(model)
+    if model.structure == "ss":
+        return dlti(a, b, c_matrix, d, dt=model.dt)
     return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataError
-from optid.models import export, noise_filter, roots
+from optid.models import noise_filter, roots
 from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
 from optid.models.files import KINDS
 from optid.models.recursions import autoregression
@@ -159,8 +159,6 @@ class HammersteinTF(TransferFunction):
             for lag, row in self.terms(c):
                 state[:lag] += np.outer(f[n - lag :], row)
         return state
-
-    to_dlti = export.to_dlti
 
 
 KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

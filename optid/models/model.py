@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
 from optid.data.channels import Ports, Transform, numbered_names
-from optid.data.record import Data, one_or_all
+from optid.data.record import Data, as_list, one_or_all
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.models import export, files, roots
@@ -19,15 +19,6 @@ from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
-
-
-def finite(values: Any, name: str) -> Array:
-    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
-    array = np.array(values, dtype=float)
-    if not np.all(np.isfinite(array)):
-        raise StructureError(f"{name} contains a value that is not finite.")
-    array.flags.writeable = False
-    return array
 
 
 class Model(Ports):
@@ -223,8 +214,7 @@ class Model(Ports):
     def innovations(self, data: Data, x0: Any = "fit") -> Any:
         """Return the errors (N, l) of `predict` one step ahead, NaN where it has none; a tuple for several records."""
         predicted = self.predict(data, 1, x0)
-        several = predicted if isinstance(predicted, tuple) else (predicted,)
-        return one_or_all([e.y - p for e, p in zip(data.raw().experiments, several)])
+        return one_or_all([e.y - p for e, p in zip(data.raw().experiments, as_list(predicted))])
 
     def initial_state(self, data: Data, simulator: str = "free") -> Any:
         """Estimate the state at the first sample by least squares; a tuple for several experiments.
@@ -309,7 +299,7 @@ class Model(Ports):
 
     # -- other tools and files -----------------------------------------------------------------------------------
 
-    to_control, to_casadi = export.to_control, export.to_casadi
+    to_dlti, to_control, to_casadi = export.to_dlti, export.to_control, export.to_casadi
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""

@@ -79,20 +79,11 @@ def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limit
     return Run(model, u, measured, known, model.K if simulator == "predict" else none, low, high, label)
 
 
-def run(job: Run, x0: Array) -> Array:
+def run(job: Run, x0: Array, horizon: int = 1) -> Array:
     """Compute the outputs (N, l) from the initial state (n,).
 
-    Raises:
-        DataError: an output that leaves the range allowed, named by channel and sample.
-    """
-    return ahead(job, x0, 1)
-
-
-def ahead(job: Run, x0: Array, horizon: int) -> Array:
-    """Run freely for `horizon` - 1 samples from the state before every sample; the outputs (N, l) at the end.
-
-    Returns:
-        NaN in the first `horizon` - 1 samples.
+    With a horizon the model runs freely for `horizon` - 1 samples from the state before every sample; the first
+    `horizon` - 1 outputs are NaN.
 
     Raises:
         DataError: an output that leaves the range allowed, named by channel and sample.
@@ -108,11 +99,12 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
             now, then = (slice(j, j + len(states)) for j in (i - 1, i))
             with np.errstate(all="ignore"):
-                h = _latent(model, states, stretch.z[now])
+                h = model.latent_values(stretch.z[now] + states @ model.Cz.T)
                 states = states @ model.A.T + stretch.drive[now] + y @ model.L.T + h @ model.Ez.T
                 for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
                     states += g(y[:, o])[:, None] * model.E[:, j]
-                y = states @ model.C.T + stretch.direct[then] + _latent(model, states, stretch.z[then]) @ model.Fz.T
+                h = model.latent_values(stretch.z[then] + states @ model.Cz.T)
+                y = states @ model.C.T + stretch.direct[then] + h @ model.Fz.T
             wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
             if wild.any():
                 raise _left(job, first + i + int(np.argmax(wild)))
@@ -127,12 +119,6 @@ def visited(job: Run, x0: Array) -> Array:
         found.append(np.empty((last - first, x.size)))
         march(job, first, stretch, x, np.empty((last - first, job.model.l)), found[-1])
     return np.vstack(found)
-
-
-def _latent(model: StateSpace, states: Array, z: Array) -> Array:
-    """Values (T, k) of the latent functions at states (T, n), z (T, k) being what the inputs add."""
-    values = [h(one) for h, one in zip(model.latent, (z + states @ model.Cz.T).T)]
-    return np.column_stack(values) if values else z
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
@@ -315,7 +301,7 @@ def _march_by_steps(model: StateSpace, parts: Parts, stretch: Stretch, x: Array,
     plain = parts._replace(Ez=np.zeros((x.size, 0)), Fz=np.zeros((model.l, 0)), Cz=np.zeros((0, x.size)))
     for k in range(len(stretch.y)):
         here = slice(k, k + 1)
-        h = _latent(model, x[None], stretch.z[here])[0]
+        h = model.latent_values(stretch.z[here] + model.Cz @ x)[0]
         direct = stretch.direct[k] + parts.Fz @ h
         y, g = direct + parts.C @ x, stretch.feedback[k].copy()
         for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():

@@ -8,13 +8,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, finite
 from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
 from optid.models.gauges import GAUGES, gauge_factor
 from optid.models.layout import Layout
-from optid.models.model import Model, finite, static_solution
+from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression
 from optid.models.text import polynomial, signed_sum, signed_terms
@@ -79,25 +79,19 @@ class TransferFunction(Model):
         self._fix(fields, len(self.b), offset.size)
         self._check_plant()
         self._check_noise()
+        _ = self.layout
 
     def _check_plant(self) -> None:
         l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
-        if not m:
-            raise StructureError("A model needs at least one input.")
         if self.offset.ndim != 1:
             raise StructureError(f"offset has shape {self.offset.shape}; (l,) is needed.")
-        for name in ("nonlinearities", "nk"):
-            if len(getattr(self, name)) != m:
-                raise StructureError(
-                    f"{name} has {len(getattr(self, name))} entries; b has one array for each of {m} inputs."
-                )
+        if len(self.nonlinearities) != m:
+            raise StructureError(f"nonlinearities has {len(self.nonlinearities)} entries for {m} inputs.")
         if self.a.ndim != (1 if l == 1 else 3) or self.a.shape[1:] not in ((), (l, l)):
             raise StructureError(f"a has shape {self.a.shape}; {'(na,)' if l == 1 else f'(na, {l}, {l})'} is needed.")
         for c, b in enumerate(self.b):
             if b.ndim != (1 if l == 1 else 2) or not b.size or b.shape[1:] not in ((), (l,)):
                 raise StructureError(f"b[{c}] has shape {b.shape}; {'(nb,)' if l == 1 else f'(nb, {l})'} is needed.")
-            if self.nk[c] < 0:
-                raise StructureError(f"nk[{c}] = {self.nk[c]}: a delay is not negative.")
         if any(f.offset is not None for f in self.nonlinearities):
             raise StructureError(
                 "A nonlinearity of a model has offset None: put the constant of the equation in offset=."
@@ -139,7 +133,7 @@ class TransferFunction(Model):
     @property
     def largest_lag(self) -> int:
         """Largest lag n: the state of the plant is (n, l)."""
-        return max(self.na, *(delay + nb - 1 for delay, nb in zip(self.nk, self.nb)))
+        return self.layout.first_row
 
     @property
     def memory(self) -> int:
@@ -149,9 +143,9 @@ class TransferFunction(Model):
         """
         return self.largest_lag if self.d is None else 0
 
-    @property
+    @cached_property
     def layout(self) -> Layout:
-        """Columns of the regression this model solves."""
+        """Columns of the regression this model solves; it refuses orders that do not agree."""
         bases = tuple(f.basis for f in self.nonlinearities)
         return Layout(self.na, self.nb, self.nk, bases, self.outputs, self.inputs)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
 from optid.models.functions import has_feedback
 from optid.registry import render
@@ -34,7 +34,7 @@ def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
     Raises:
         StructureError: a horizon that is not a positive integer.
     """
-    return _as_list(model.predict(data, horizon))
+    return as_list(model.predict(data, horizon))
 
 
 def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
@@ -49,7 +49,7 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
     Raises:
         DataError: a missing input, or a simulation that leaves the range of the data.
     """
-    return _as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
+    return as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,3 @@ def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None
             raise DataError(f"no sample can be predicted {h} samples ahead; use shorter horizons")
     fits = common_fits(raw, [*ahead, simulated_or_nan(model, raw)])
     return HorizonCurve(raw.outputs, tuple(chosen), fits[:-1], fits[-1])
-
-
-def _as_list(arrays: Any) -> list[Array]:
-    return list(arrays) if isinstance(arrays, list | tuple) else [arrays]
