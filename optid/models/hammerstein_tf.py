@@ -164,9 +164,14 @@ class HammersteinTF(Model):
         """A_1 .. A_na, (na, l, l) whatever the number of outputs."""
         return self.a.reshape(self.na, self.l, self.l)
 
-    def terms(self, c: int) -> list[tuple[int, Array]]:
-        """Return the numerator of input c as (lag, row (l,))."""
-        return [(self.nk[c] + j, row) for j, row in enumerate(self.b[c].reshape(-1, self.l))]
+    @cached_property
+    def numerators(self) -> Array:
+        """B of every input by lag, the delay included, (largest lag + 1, l, m)."""
+        found = np.zeros((self.largest_lag + 1, self.l, self.m))
+        for c, (delay, b) in enumerate(zip(self.nk, self.b)):
+            found[delay : delay + len(b), :, c] = b.reshape(-1, self.l)
+        found.flags.writeable = False
+        return found
 
     # -- noise ---------------------------------------------------------------------------------------------------
 
@@ -238,12 +243,9 @@ class HammersteinTF(Model):
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""
-        response = np.zeros((n, self.l, self.m))
-        for c in range(self.m):
-            for lag, row in self.terms(c):
-                response[lag : lag + 1, :, c] = row
-            response[:, :, c] = autoregression(self.matrices, response[:, :, c])
-        return response
+        impulses = np.zeros((n, self.l, self.m))
+        impulses[: len(self.numerators)] = self.numerators[:n]
+        return np.stack([autoregression(self.matrices, impulses[:, :, c]) for c in range(self.m)], axis=2)
 
     def inverse_impulse(self, n: int) -> Array:
         """Return the impulse response of A^-1, (n, l, l): [k, o, p] of output o to equation p."""
@@ -254,12 +256,9 @@ class HammersteinTF(Model):
     def frequency_response(self, w: ArrayLike) -> Array:
         """Return A^-1 B_c at the frequencies w (radians per unit of time, up to pi / dt), complex (len(w), l, m)."""
         shift = np.exp(-1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)  # q^-1
-        denominator = np.eye(self.l) + np.tensordot(shift[:, None] ** np.arange(1, self.na + 1), self.matrices, 1)
-        numerator = np.zeros((shift.size, self.l, self.m), dtype=complex)
-        for c in range(self.m):
-            for lag, row in self.terms(c):
-                numerator[:, :, c] += (shift**lag)[:, None] * row
-        return np.asarray(np.linalg.solve(denominator, numerator))
+        powers = shift[:, None] ** np.arange(self.largest_lag + 1)
+        denominator = np.eye(self.l) + np.tensordot(powers[:, 1 : self.na + 1], self.matrices, 1)
+        return np.asarray(np.linalg.solve(denominator, np.tensordot(powers, self.numerators, 1)))
 
     # -- gauge and units -----------------------------------------------------------------------------------------
 
@@ -313,12 +312,9 @@ class HammersteinTF(Model):
 
     def driven(self, u: Array) -> Array:
         """Return the right-hand side sum_c B_c(q) f_c(u_c) + offset, (N, l), with nothing before the record."""
-        right = np.tile(self.offset, (len(u), 1))
-        for c, nonlinearity in enumerate(self.nonlinearities):
-            f = nonlinearity(u[:, c])
-            for lag, row in self.terms(c):
-                if lag < len(u):
-                    right[lag:] += f[: len(u) - lag, None] * row
+        right, f = np.tile(self.offset, (len(u), 1)), [f(samples) for f, samples in zip(self.nonlinearities, u.T)]
+        for lag, c in np.argwhere(self.numerators[: len(u)].any(axis=1)):
+            right[lag:] += f[c][: len(u) - lag, None] * self.numerators[lag, :, c]
         return right
 
     def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
@@ -398,13 +394,11 @@ class HammersteinTF(Model):
     def following(self, u: Array, y: Array) -> Array:
         """Return the state (n, l) after n complete samples u (n, m) and y (n, l), see `state`, without checks."""
         n = self.largest_lag
-        state = np.zeros((n, self.l))
+        state, f = np.zeros((n, self.l)), np.column_stack([f(one) for f, one in zip(self.nonlinearities, u.T)])
         for i, matrix in enumerate(self.matrices, start=1):
             state[:i] -= y[n - i :] @ matrix.T
-        for c, nonlinearity in enumerate(self.nonlinearities):
-            f = nonlinearity(u[:, c])
-            for lag, row in self.terms(c):
-                state[:lag] += np.outer(f[n - lag :], row)
+        for lag, b in enumerate(self.numerators):
+            state[:lag] += f[n - lag :] @ b.T
         return state
 
     # -- text and content of files -------------------------------------------------------------------------------

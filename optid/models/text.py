@@ -79,9 +79,9 @@ def _equation(model: Any, o: int, outputs: tuple[str, ...], digits: int) -> str:
         terms += [(-float(matrix[o, p]), f"{name}(k-{i})") for p, name in enumerate(outputs)]
     for c, (name, f) in enumerate(zip(model.inputs, model.nonlinearities)):
         function = "f" if model.m == 1 else f"f_{name}"
-        for lag, row in model.terms(c):
+        for lag, b in enumerate(model.numerators[:, o, c]):
             sample = f"{name}(k-{lag})" if lag else f"{name}(k)"
-            gain = float(row[o]) * (float(f.mu[0]) if f.is_linear else 1.0)
+            gain = float(b) * (float(f.mu[0]) if f.is_linear else 1.0)
             terms.append((gain, sample if f.is_linear else f"{function}({sample})"))
     if model.c0 is None:
         terms.append((float(model.offset[o]), ""))
