@@ -14,10 +14,9 @@ from typing import Any
 
 from formulations.state_space import StateSpaceFit
 from formulations.state_space_procedure import state_space_fit
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Bases, Basis, Polynomial, parse
 from optid.data.record import Data
-from optid.identify.arguments import one_of
 from optid.identify.prediction_error.latent_search import add_channels
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure

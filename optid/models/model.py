@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.data.channels import Ports, Transform, numbered_names
 from optid.data.record import Data, as_list, one_or_all
 from optid.data.stretches import runs_of
-from optid.errors import DataError, DataWarning, StructureError, nearest
+from optid.errors import DataError, DataWarning, StructureError
 from optid.models import export, files, roots
 from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
@@ -75,8 +75,7 @@ class Model(Ports):
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise StructureError(f"dt = {self.dt!r}: a positive number.")
-        if self.gauge not in self.GAUGES:
-            raise StructureError(f"Unknown gauge {self.gauge!r}: use one of {', '.join(self.GAUGES)}.")
+        one_of("gauge", self.gauge, self.GAUGES)
 
     @property
     def kind(self) -> str:
@@ -233,8 +232,7 @@ class Model(Ports):
         Raises:
             StructureError: an unknown simulator, one that needs the outputs, or an x0 that cannot be read.
         """
-        if simulator not in self.SIMULATORS:
-            raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
+        one_of("simulator", simulator, self.SIMULATORS)
         if simulator != "free" and any(y is None for _, y, _ in records):
             raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
         if isinstance(x0, str):
@@ -273,8 +271,7 @@ class Model(Ports):
         Raises:
             StructureError: unknown gauge, or one that this model cannot take.
         """
-        if gauge not in self.GAUGES:
-            raise StructureError(f"Unknown gauge {gauge!r}. {nearest(gauge, self.GAUGES)}")
+        one_of("gauge", gauge, self.GAUGES)
         if gauge == "gain" and self.l > 1:
             raise StructureError("gauge 'gain' is defined for one output; use 'norm'.")
         return self._regauged(gauge, signs)

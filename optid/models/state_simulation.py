@@ -149,25 +149,20 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
         if affine:
             return x + step
         expected = float(np.sum((root[:, :n] @ step) ** 2))
-        found = _descended(job, y, unit, x, step, cost)
-        if found is None:
+        for halving in range(20):
+            trial = x + step / 2**halving
+            try:
+                near, lower = _linearised(job, y, unit, trial)
+            except DataError:
+                continue
+            if lower <= cost * (1 + ROUNDING):
+                break
+        else:
             return x
-        x, root, cost = found
+        x, root, cost = trial, near, lower
         if expected <= SETTLED * cost:
             return x
     return x
-
-
-def _descended(job: Run, y: Array, unit: Array, x: Array, step: Array, cost: float) -> Any:
-    for halving in range(20):
-        trial = x + step / 2**halving
-        try:
-            root, lower = _linearised(job, y, unit, trial)
-        except DataError:
-            continue
-        if lower <= cost * (1 + ROUNDING):
-            return trial, root, lower
-    return None
 
 
 def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) -> tuple[Array, float]:

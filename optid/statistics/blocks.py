@@ -164,12 +164,17 @@ def rows_present(missing: Sequence[NDArray[np.bool_]], lags: Sequence[range], re
     return present
 
 
+def used_rows(u: Array, y: Array, layout: Layout) -> NDArray[np.bool_]:
+    """Mark the rows (R,) of a layout in which every sample of u (reach + R, m) and y (reach + R, l) is present."""
+    missing = [np.logical_or.reduce(np.isnan(y), axis=1), *np.isnan(u).T]
+    return rows_present(missing, layout.group_lags, layout.first_row)
+
+
 def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Block:
     """Evaluate the bases on one stretch: u (reach + R, m), y (reach + R, l), weights (reach + R,) or None."""
     frame, reach = Frame.of(layout), layout.first_row
     valid = np.zeros(len(u) + reach, dtype=bool)
-    missing = [np.logical_or.reduce(np.isnan(y), axis=1), *np.isnan(u).T]
-    valid[reach : len(u)] = rows_present(missing, layout.group_lags, reach)
+    valid[reach : len(u)] = used_rows(u, y, layout)
     outputs = np.zeros((len(y) + 2 * reach, layout.l))
     outputs[reach : reach + len(y)] = np.where(np.isnan(y), 0.0, y)
     groups = [Signals.dense(outputs)]

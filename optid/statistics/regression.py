@@ -17,7 +17,7 @@ from optid.bases.basis import Basis
 from optid.data.reduction import available_threads, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
-from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches
+from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums, Total
 
@@ -216,12 +216,11 @@ def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array) -> Array:
     for c, (basis, lags) in enumerate(zip(layout.bases, layout.lags)):
         by_lag = theta[layout.block(c)].reshape(len(lags), basis.size, outs)
         first, weights = basis.local(u[:, c])
-        weights[np.isnan(u[:, c])] = np.nan
         for lag, column in zip(lags, basis.contrast @ by_lag):
             at = slice(reach - lag, end - lag)
             for i, weight in enumerate(weights[at].T):
                 error -= weight[:, None] * column[first[at] + i]
-    error[np.isnan(error).any(axis=1)] = np.nan  # a row counts in all outputs or in none
+    error[~used_rows(u, y, layout)] = np.nan
     return error
 
 
