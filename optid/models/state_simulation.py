@@ -170,6 +170,8 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
 
     Where the error of the whole record is of no interest, the run ends when the initial state is forgotten.
     """
+    from optid.models.state_kernels import sensitivities
+
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn = np.array(x0, dtype=float), np.eye(n)
@@ -243,13 +245,6 @@ def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signal
         own = model.returned(outputs) if missing.any() else 0.0
         returned = np.where(missing[:, None, :], own, -job.gain)
     return Signals(returned, slopes, np.zeros((len(states), 0)))
-
-
-def sensitivities(parts: Parts, direct: Direct, run: Signals, turn: Array, jacobian: Array) -> None:
-    """Carry derivatives along a run; see `optid.models.state_kernels.sensitivities`."""
-    from optid.models.state_kernels import sensitivities as carry
-
-    carry(parts, direct, run, turn, jacobian)
 
 
 def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:

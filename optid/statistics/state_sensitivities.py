@@ -135,6 +135,8 @@ def _root(covariance: Array, missing: Any) -> Array:
 
 def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int) -> Iterator[Array]:
     """Yield the sensitivities and the errors in the last column, (T, l, n + shared + 1), chunk by chunk."""
+    from optid.models.state_kernels import sensitivities
+
     n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
     direct, state, turn = unknowns.direct(point), point.x0[index].copy(), np.eye(n, n + unknowns.shared)
     for first in range(0, len(job.u), chunk):
@@ -146,7 +148,7 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
         simulation.march(job, first, stretch, state, outputs, states)
         run = simulation.signals(job, stretch, states, outputs)
         values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
-        simulation.sensitivities(parts, direct, run._replace(values=values), turn, block)
+        sensitivities(parts, direct, run._replace(values=values), turn, block)
         block[:, :, -1] = outputs - job.y[samples]
         yield block
 

@@ -125,9 +125,8 @@ def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
         word: "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
     """
     raw = data.raw()
-    if word == ONE_STEP:
-        return common_fits(raw, [one_step(model, raw)])[0]
-    return common_fits(raw, [simulated_or_nan(model, raw, word)])[0]
+    found = one_step(model, raw) if word == ONE_STEP else simulated_or_nan(model, raw, word)
+    return common_fits(raw, [found])[0]
 
 
 def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
