@@ -247,7 +247,7 @@ def test_predictions_do_not_depend_on_the_gauge(model, scale, gauge):
 
 
 def test_gauge_refusals():
-    with pytest.raises(StructureError, match="Did you mean 'norm'"):
+    with pytest.raises(StructureError, match="gauge=.norn.: use one of norm, gain"):
         siso().regauge("norn")
     with pytest.raises(StructureError, match="static gain"):
         siso(b=([1.0, -1.0],)).regauge("gain")
