@@ -15,12 +15,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from optid.arrays import one_of
 from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.identify.arguments import one_of
 from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.identify.gauges import FIXED, in_gauge, scale_fixed
 from optid.models import HammersteinTF

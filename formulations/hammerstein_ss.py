@@ -17,11 +17,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from formulations.subspace_procedure import identified
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.arguments import one_of
 from optid.identify.subspace.plan import in_record_units, planned
 from optid.solving.solve import Procedure
 

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from formulations.state_space import state_space_fit
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Bases, Basis, Polynomial, parse
 from optid.data.record import Data
-from optid.identify.arguments import in_memory, one_of
+from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure

@@ -24,10 +24,10 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
+from optid.arrays import one_of
 from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.arguments import one_of
 from optid.identify.subspace.low_rank import Structured, choose_weight, structure
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.program.program import Program, Values

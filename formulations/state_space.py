@@ -30,13 +30,13 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
-from optid.identify.arguments import enough_rows, in_memory, one_of, outputs_present
+from optid.identify.arguments import enough_rows, in_memory, outputs_present
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states

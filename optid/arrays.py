@@ -92,6 +92,28 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
     return int(value)
 
 
+def check_probability(value: Any, name: str) -> None:
+    """Refuse an argument that is no probability strictly between 0 and 1 (`StructureError`)."""
+    if not 0 < value < 1:
+        raise StructureError(f"{name}={value!r}; a probability between 0 and 1 is needed.")
+
+
+def one_of(name: str, value: Any, known: Sequence[str]) -> None:
+    """Refuse a word that is not known (`StructureError`)."""
+    if value not in known:
+        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
+
+
+def finite(values: Any, name: str) -> np.ndarray:
+    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
+    array = np.array(values, dtype=float)
+    if not np.all(np.isfinite(array)):
+        at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
+    array.flags.writeable = False
+    return array
+
+
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
     """Refuse integers (N, channels) beyond 2**53, which float64 cannot hold; see `check_finite`.
 

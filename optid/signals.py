@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.errors import StructureError
 
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
@@ -244,10 +244,9 @@ def _amplitudes(spectrum: Spectrum, frequencies: np.ndarray) -> np.ndarray:
 
 
 def _phases(kind: str, amplitudes: np.ndarray, seed: int) -> np.ndarray:
+    one_of("phases", kind, ("schroeder", "random"))
     if kind == "random":
         return np.random.default_rng(seed).uniform(0.0, 2 * np.pi, amplitudes.size)
-    if kind != "schroeder":
-        raise StructureError(f"phases = {kind!r}: 'schroeder' and 'random' exist.")
     power = amplitudes**2 / np.sum(amplitudes**2)
     # phi_k = -2 pi sum_{i<k} (k - i) p_i, by two cumulative sums.
     return -2 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power)[:-1])])

@@ -103,7 +103,7 @@ def test_text_and_table_have_every_term():
             number = float(words.pop(0))
             value += number * (known[words.pop(0)] if words and words[0] in known else 1.0)
         values[left] = value
-    g, h = FED(y[1]), model.latent_values(x[None], u[None])[0]
+    g, h = FED(y[1]), model.latent_values(model.latent_signals(x[None], u[None]))[0]
     later = model.A @ x + model.B @ u + model.E[:, 0] * g + model.L @ y + model.Ez @ h + model.offset_x
     expected = [*later, *y, *z]
     assert list(values.values()) == pytest.approx(expected, rel=1e-12)

@@ -370,8 +370,6 @@ def test_arguments_are_refused():
     for threads in (0, True, 1.5):
         with pytest.raises(StructureError, match="threads"):
             collect(data, layout, threads=threads)
-    with pytest.raises(StructureError, match="theta has shape"):
-        residuals(data, layout, np.zeros(layout.n_columns))
     with pytest.raises(StructureError, match="same layout"):
         _ = collect(data, layout) + collect(data, Layout(**good | {"na": 2}))
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.errors import DataError, StructureError
 
 Outside = Literal["clamp", "linear", "extrapolate", "error"]
@@ -41,8 +41,7 @@ class Basis:
     def __post_init__(self) -> None:
         for name, (smallest, meaning) in self._sizes.items():
             check_integer(getattr(self, name), f"The number of {meaning}", smallest)
-        if self.outside not in OUTSIDE:
-            raise StructureError(f"outside={self.outside!r}: use one of {', '.join(map(repr, OUTSIDE))}.")
+        one_of("outside", self.outside, OUTSIDE)
         if self.interval is None:
             return
         if len(self.interval) != 2 or not np.all(np.isfinite(self.interval)):

@@ -359,3 +359,8 @@ def _take(values: tuple, positions: Sequence[int]) -> tuple:
 def one_or_all(arrays: list[np.ndarray]) -> Any:
     """Return the array of the only experiment, or a tuple with one array for each."""
     return arrays[0] if len(arrays) == 1 else tuple(arrays)
+
+
+def as_list(arrays: Any) -> list[np.ndarray]:
+    """Return one array for each experiment, from what `one_or_all` made of them."""
+    return list(arrays) if isinstance(arrays, tuple) else [arrays]

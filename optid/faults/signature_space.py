@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.errors import DataError, StructureError
 from optid.faults.signatures import Candidate, Dictionary, response
 from optid.models.experiments import samples_of
@@ -126,8 +126,7 @@ class SignatureSpace:
         Raises:
             DataError: too few draws for so rare an alarm: 50 of them must exceed.
         """
-        if not 0 < false_alarm < 1:
-            raise StructureError(f"false_alarm={false_alarm!r}; a probability between 0 and 1 is needed.")
+        check_probability(false_alarm, "false_alarm")
         if false_alarm * draws < 50:
             raise DataError(
                 f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "

@@ -13,12 +13,6 @@ ROWS_PER_UNKNOWN = 1.1
 """Errors that a fit needs for each of its unknowns."""
 
 
-def one_of(name: str, value: str, known: Sequence[str]) -> None:
-    """Refuse a word that is not known (`StructureError`)."""
-    if value not in known:
-        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
-
-
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
     """Expand a scalar to one integer per input and check it."""
     values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
-from optid.identify.uncertainty import Refits, Uncertainty, aligned, check_level
+from optid.identify.uncertainty import Refits, Uncertainty, aligned
 from optid.models import HammersteinTF
 from optid.models.recursions import autoregression
 
@@ -73,7 +73,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     if fit.model.structure != "arx":
         raise StructureError(f"the bootstrap resamples the equation errors of ARX models; this is a {fit.model.title}")
     check_integer(runs, "runs", 40)
-    check_level(level)
+    check_probability(level, "level")
     models, failed = [], 0
     steps = track(_records(fit, runs, seed), description="bootstrap", total=runs, transient=True,
                   console=Console(stderr=True), disable=not sys.stderr.isatty())

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.bases.expansions import Linear
 from optid.errors import StructureError
 from optid.identify.intervals import DRAWS
@@ -229,7 +229,7 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
             constraint without linearisation; the message names it and what to use instead.
         RankError: parameters without effect on the predictions.
     """
-    check_level(level)
+    check_probability(level, "level")
     transforms = [getattr(fit.program.compressed, "outward", None), getattr(fit.data, "transform", None)]
 
     def rebuild(values: dict[str, Array]) -> Any:
@@ -256,9 +256,3 @@ def aligned(model: Any, reference: Any) -> Any:
     if model.structure == "ss":
         return replace(model, B=model.B * signs, D=model.D * signs, nonlinearities=turned)
     return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)), nonlinearities=turned)
-
-
-def check_level(level: float) -> None:
-    """Refuse what is no probability between 0 and 1 (`StructureError`)."""
-    if not 0 < level < 1:
-        raise StructureError(f"level={level!r}: a probability between 0 and 1, such as 0.95")

@@ -12,17 +12,20 @@ from optid.models.nonlinearity import Nonlinearity
 
 
 def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
-    """Return the linear part from one f to one output as a `scipy.signal.dlti` with the model's dt.
+    """Return the linear part as a `scipy.signal.dlti` with the model's dt.
 
-    The nonlinearity and the constant are not part of it. With one output it is a transfer function, with several a
-    state-space system. An unknown channel, a name or an index, raises a `StructureError`.
+    The nonlinearity and the constant are not part of it. A state-space model is returned whole, from every f to every
+    output. Of a transfer function it is the part from one f to one output: with one output a transfer function, with
+    several a state-space system. An unknown channel, a name or an index, raises a `StructureError`.
     """
     from scipy.signal import dlti
 
     o, c = _position(output, model.outputs, "output"), _position(input, model.inputs, "input")
-    if model.l == 1:
+    if model.structure != "ss" and model.l == 1:
         return dlti(*_polynomials(model, c), dt=model.dt)
     a, b, c_matrix, d = state_space(model)
+    if model.structure == "ss":
+        return dlti(a, b, c_matrix, d, dt=model.dt)
     return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
 
 
@@ -87,10 +90,7 @@ def state_space(model: Any) -> tuple[Array, Array, Array, Array]:
     if model.structure == "ss":
         return model.A, model.B, model.C, model.D
     n, outputs = model.largest_lag, model.l
-    rows = np.zeros((n + 1, outputs, model.m))
-    for c in range(model.m):
-        for lag, row in model.terms(c):
-            rows[lag, :, c] = row
+    rows = model.numerators.copy()
     a, b = np.eye(n * outputs, k=outputs), rows[1:].reshape(n * outputs, model.m)
     for i, matrix in enumerate(model.matrices):
         at = slice(i * outputs, (i + 1) * outputs)
@@ -154,10 +154,8 @@ def _piecewise(pieces: Array, x: Any) -> Any:
 
 def _polynomials(model: Any, c: int) -> tuple[Array, Array]:
     """Numerator without leading zeros and denominator in powers of z, for one output."""
-    n = model.largest_lag
-    numerator, denominator = np.zeros(n + 1), np.zeros(n + 1)
-    denominator[: model.na + 1] = np.concatenate([[1.0], model.a])
-    numerator[model.nk[c] : model.nk[c] + model.nb[c]] = model.b[c]
+    numerator, denominator = model.numerators[:, 0, c], np.eye(1, model.largest_lag + 1)[0]
+    denominator[1 : model.na + 1] = model.a
     return np.trim_zeros(numerator, "f") if numerator.any() else np.zeros(1), denominator
 
 

@@ -26,7 +26,7 @@ class HammersteinSS(StateSpace):
         return (self.nx,)
 
     def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
-        return simulation.ahead(simulation.prepared(self, "predict", u, y, None, label), state, horizon)
+        return simulation.run(simulation.prepared(self, "predict", u, y, None, label), state, horizon)
 
     def simulate_measured_feedback(self, data: Data, x0: Any = "zero") -> Any:
         """Simulate with the measured outputs in the feedback (P2), without correcting the state; see `simulate`.
@@ -68,12 +68,6 @@ class HammersteinSS(StateSpace):
         runs = [simulation.prepared(self, "free", u, y, limits, label) for u, y, label in records]
         states = self._states("free", records, "fit")
         return [self.latent_signals(simulation.visited(run, x), run.u) for run, x in zip(runs, states)]
-
-    def to_dlti(self) -> Any:
-        """Return (A, B, C, D), from every f to every output, as a `scipy.signal.dlti`."""
-        from scipy.signal import dlti
-
-        return dlti(self.A, self.B, self.C, self.D, dt=self.dt)
 
 
 KINDS["HammersteinSS"] = HammersteinSS.from_dict

@@ -15,7 +15,7 @@ from optid.errors import StructureError
 from optid.models.feedback_tables import tabulated
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
-from optid.models.state_signals import Parts, Places, Signals, Stretch
+from optid.models.state_signals import Direct, Parts, Signals, Stretch
 
 STEPS = 50
 """Steps at most."""
@@ -227,16 +227,16 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
     """
     from optid.models.state_kernels import sensitivities
 
-    (n, l), x, none = parts.K.shape, x0.copy(), np.zeros((0, 0))  # noqa: E741
-    places, turn = Places.none(parts)._replace(K=n if size else -1), np.eye(n, n + size)
+    (n, l), x, turn = parts.K.shape, x0.copy(), np.eye(parts.K.shape[0], parts.K.shape[0] + size)  # noqa: E741
+    columns = np.arange(n, n + size).reshape(-1, l)  # of the entries of K
+    direct = Direct.of(states=[(np.arange(len(columns))[:, None], columns, np.arange(l), 1.0)])
     total, length = np.zeros((n + size + 1, n + size + 1)), max(64, NUMBERS // ((n + size + 1) * l))
     for first in range(0, len(r), length):
         y = r[first : first + length]
         missing, states, block = np.isnan(y), np.empty((len(y), n)), np.empty((len(y), l, n + size + 1))
         error = np.where(missing, 0.0, _run(parts, y, x, states) - y)
         returned = np.where(missing[:, None], 0.0, -parts.K)
-        signals = Signals(states, -error, returned, none, none, none, none, none, none, none, none)
-        sensitivities(parts, places, signals, turn, block)
+        sensitivities(parts, direct, Signals(returned, np.zeros((len(y), 0)), -error), turn, block)
         block[missing], block[:, :, -1] = 0.0, error
         rows = (root @ block).reshape(-1, n + size + 1)
         total += rows.T @ rows

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, finite
 from optid.errors import StructureError
 
 ROUNDING = -1e-4
@@ -34,11 +34,9 @@ class NoiseCovariances:
 
     def __post_init__(self) -> None:
         for name in ("Q", "R", "S", "innovation"):
-            matrix = np.array(getattr(self, name), dtype=float)
-            if matrix.ndim != 2 or not np.all(np.isfinite(matrix)):
-                raise StructureError(f"{name} has shape {matrix.shape}: a finite matrix is needed.")
-            matrix.flags.writeable = False
-            object.__setattr__(self, name, matrix)
+            object.__setattr__(self, name, finite(getattr(self, name), name))
+        if self.S.ndim != 2:
+            raise StructureError(f"S has shape {self.S.shape}: a matrix is needed.")
         n, outputs = self.S.shape
         for name, size in (("Q", n), ("R", outputs), ("innovation", outputs)):
             matrix = getattr(self, name)

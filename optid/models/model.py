@@ -9,25 +9,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.data.channels import Ports, Transform, numbered_names
-from optid.data.record import Data, one_or_all
+from optid.data.record import Data, as_list, one_or_all
 from optid.data.stretches import runs_of
-from optid.errors import DataError, DataWarning, StructureError, nearest
+from optid.errors import DataError, DataWarning, StructureError
 from optid.models import export, files, roots
 from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
-
-
-def finite(values: Any, name: str) -> Array:
-    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
-    array = np.array(values, dtype=float)
-    if not np.all(np.isfinite(array)):
-        raise StructureError(f"{name} contains a value that is not finite.")
-    array.flags.writeable = False
-    return array
 
 
 class Model(Ports):
@@ -84,8 +75,7 @@ class Model(Ports):
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise StructureError(f"dt = {self.dt!r}: a positive number.")
-        if self.gauge not in self.GAUGES:
-            raise StructureError(f"Unknown gauge {self.gauge!r}: use one of {', '.join(self.GAUGES)}.")
+        one_of("gauge", self.gauge, self.GAUGES)
 
     @property
     def kind(self) -> str:
@@ -223,8 +213,7 @@ class Model(Ports):
     def innovations(self, data: Data, x0: Any = "fit") -> Any:
         """Return the errors (N, l) of `predict` one step ahead, NaN where it has none; a tuple for several records."""
         predicted = self.predict(data, 1, x0)
-        several = predicted if isinstance(predicted, tuple) else (predicted,)
-        return one_or_all([e.y - p for e, p in zip(data.raw().experiments, several)])
+        return one_or_all([e.y - p for e, p in zip(data.raw().experiments, as_list(predicted))])
 
     def initial_state(self, data: Data, simulator: str = "free") -> Any:
         """Estimate the state at the first sample by least squares; a tuple for several experiments.
@@ -243,8 +232,7 @@ class Model(Ports):
         Raises:
             StructureError: an unknown simulator, one that needs the outputs, or an x0 that cannot be read.
         """
-        if simulator not in self.SIMULATORS:
-            raise StructureError(f"simulator={simulator!r}: use one of {', '.join(self.SIMULATORS)}.")
+        one_of("simulator", simulator, self.SIMULATORS)
         if simulator != "free" and any(y is None for _, y, _ in records):
             raise StructureError("This simulator needs the outputs: pass Data, or call simulate.")
         if isinstance(x0, str):
@@ -283,8 +271,7 @@ class Model(Ports):
         Raises:
             StructureError: unknown gauge, or one that this model cannot take.
         """
-        if gauge not in self.GAUGES:
-            raise StructureError(f"Unknown gauge {gauge!r}. {nearest(gauge, self.GAUGES)}")
+        one_of("gauge", gauge, self.GAUGES)
         if gauge == "gain" and self.l > 1:
             raise StructureError("gauge 'gain' is defined for one output; use 'norm'.")
         return self._regauged(gauge, signs)
@@ -309,7 +296,7 @@ class Model(Ports):
 
     # -- other tools and files -----------------------------------------------------------------------------------
 
-    to_control, to_casadi = export.to_control, export.to_casadi
+    to_dlti, to_control, to_casadi = export.to_dlti, export.to_control, export.to_casadi
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""

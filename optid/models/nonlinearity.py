@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, finite
 from optid.bases import Basis, Linear
 from optid.bases import from_dict as basis_from_dict
 from optid.errors import StructureError
@@ -33,14 +33,11 @@ class Nonlinearity:
     offset: float | None = None
 
     def __post_init__(self) -> None:
-        mu = np.array(self.mu, dtype=float)
+        mu = finite(self.mu, "mu")
         if mu.shape != (self.basis.size,):
             raise StructureError(
                 f"mu has shape {mu.shape}; a {type(self.basis).__name__} of this size needs ({self.basis.size},)."
             )
-        if not np.all(np.isfinite(mu)):
-            raise StructureError(f"mu[{int(np.argmin(np.isfinite(mu)))}] is not finite.")
-        mu.flags.writeable = False
         object.__setattr__(self, "mu", mu)
 
     def __call__(self, u: ArrayLike) -> Any:

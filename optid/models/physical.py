@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.optimize import least_squares, root
 
-from optid.arrays import Array
+from optid.arrays import Array, finite
 from optid.errors import DataError, StructureError
 from optid.models.experiments import Record, check_inputs
-from optid.models.model import Model, finite, static_solution
+from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 

@@ -55,6 +55,24 @@ def autoregression(a: Array, right: Array) -> Array:
         return late_njit(_march)(np.ascontiguousarray(a), np.ascontiguousarray(right))
 
 
+def predict_regression(a: Array, right: Array, y: Array, horizon: int, memory: int) -> Array:
+    """Predict y (N, l) of y(k) + sum_i A_i y(k-i) = right(k) from the outputs `horizon` and more samples before.
+
+    a (na, l, l) holds the matrices A_i; the first `memory` + `horizon` - 1 samples are not predicted.
+    """
+    right[:memory] = np.nan
+    shorter: list[Array] = []  # predictions 1, 2, ... samples ahead, as far back as A looks
+    for ahead in range(1, horizon + 1):
+        prediction = right.copy()
+        if len(a):
+            prediction[: memory + ahead - 1] = np.nan
+        for i, matrix in enumerate(a, start=1):
+            known = y if i >= ahead else shorter[-i]
+            prediction[i:] -= known[: len(known) - i] @ matrix.T
+        shorter = [*shorter[-max(len(a), 1) :], prediction]
+    return shorter[-1]
+
+
 def _march(a: Array, right: Array) -> Array:
     y = right.copy()
     for k in range(y.shape[0]):

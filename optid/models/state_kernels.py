@@ -124,46 +124,35 @@ def march(parts, stretch, x, outputs, states):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sensitivities(parts, places, signals, turn, jacobian):
+def sensitivities(parts, direct, signals, turn, jacobian):
     """Carry the derivative S of the state along a run of T samples and leave it behind.
 
-    With H(k) = dh(z)/dtheta = h' (Cz S + (what theta changes in z)) + (what it changes in h), and
+    With H(k) = dh(z)/dtheta = h' Cz S + (what theta changes in h(z) directly), and
     J(k) = dy/dtheta = C S + Fz H + (what theta changes in y directly),
 
         S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
 
     Args:
         parts: the model, a `Parts`.
-        places: first column of every part in theta, a `Places`; the initial state has the first n columns.
+        direct: what theta changes directly, a `Direct`; the initial state has the first n columns.
         signals: the run, a `Signals`.
         turn: (n, q) derivative S of the state, changed in place.
         jacobian: (T, l, q) written.
     """
-    A, B, C, D, E = parts.A, parts.B, parts.C, parts.D, parts.E
-    Ez, Fz, Cz = parts.Ez, parts.Fz, parts.Cz
-    n, l, q = A.shape[0], C.shape[0], turn.shape[1]  # noqa: E741
-    r, s, latent = B.shape[1], E.shape[1], Ez.shape[1]
+    A, C, Ez, Fz, Cz = parts.A, parts.C, parts.Ez, parts.Fz, parts.Cz
+    n, l, q, latent = A.shape[0], C.shape[0], turn.shape[1], Ez.shape[1]  # noqa: E741
     turned, inner = np.empty((n, q)), np.empty((latent, q))
     for k in range(jacobian.shape[0]):
         for c in range(latent):
-            slope = signals.slopes[k, c]
             for p in range(q):
                 inner[c, p] = 0.0
             for j in range(n):
-                a = slope * Cz[c, j]
+                a = signals.slopes[k, c] * Cz[c, j]
                 if a != 0.0:
                     for p in range(q):
                         inner[c, p] += a * turn[j, p]
-                if places.cz[c] >= 0:
-                    inner[c, places.cz[c] + j] += slope * signals.states[k, j]
-            if places.dz[c] >= 0:
-                for j in range(signals.u.shape[1]):
-                    inner[c, places.dz[c] + j] += slope * signals.u[k, j]
-            if places.oz[c] >= 0:
-                inner[c, places.oz[c]] += slope
-            if places.c[c] >= 0:
-                for j in range(places.members[c], places.members[c + 1]):
-                    inner[c, places.c[c] + j - places.members[c]] += signals.phi[k, j]
+        for e in range(direct.ends[0], direct.ends[1]):
+            inner[direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
         for o in range(l):
             row = jacobian[k, o]
             for p in range(q):
@@ -173,22 +162,12 @@ def sensitivities(parts, places, signals, turn, jacobian):
                 if a != 0.0:
                     for p in range(q):
                         row[p] += a * turn[j, p]
-                if places.C >= 0:
-                    row[places.C + o * n + j] += signals.states[k, j]
-            if places.offset >= 0:
-                row[places.offset + o] += 1.0
-            for c in range(r):
-                if places.d[c] >= 0:
-                    row[places.d[c] + o] += signals.f[k, c]
-                if places.mu[c] >= 0 and D[o, c] != 0.0:
-                    for j in range(places.functions[c], places.functions[c + 1]):
-                        row[places.mu[c] + j - places.functions[c]] += D[o, c] * signals.eta[k, j]
             for c in range(latent):
-                if places.fz[c] >= 0:
-                    row[places.fz[c] + o] += signals.w[k, c]
                 if Fz[o, c] != 0.0:
                     for p in range(q):
                         row[p] += Fz[o, c] * inner[c, p]
+        for e in range(direct.ends[1], direct.ends[2]):
+            jacobian[k, direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
         for i in range(n):
             into = turned[i]
             for p in range(q):
@@ -198,33 +177,17 @@ def sensitivities(parts, places, signals, turn, jacobian):
                 if a != 0.0:
                     for p in range(q):
                         into[p] += a * turn[j, p]
-                if places.A >= 0:
-                    into[places.A + i * n + j] += signals.states[k, j]
             for o in range(l):
-                if places.K >= 0:
-                    into[places.K + i * l + o] += signals.innovation[k, o]
                 if signals.returned.shape[0] > 0 and signals.returned[k, i, o] != 0.0:
                     a = signals.returned[k, i, o]
                     for p in range(q):
                         into[p] += a * jacobian[k, o, p]
-            for c in range(r):
-                if places.b[c] >= 0:
-                    into[places.b[c] + i] += signals.f[k, c]
-                if places.mu[c] >= 0:
-                    for j in range(places.functions[c], places.functions[c + 1]):
-                        into[places.mu[c] + j - places.functions[c]] += B[i, c] * signals.eta[k, j]
-            for c in range(s):
-                if places.e[c] >= 0:
-                    into[places.e[c] + i] += signals.g[k, c]
-                if places.nu[c] >= 0:
-                    for j in range(places.coordinates[c], places.coordinates[c + 1]):
-                        into[places.nu[c] + j - places.coordinates[c]] += E[i, c] * signals.zeta[k, j]
             for c in range(latent):
-                if places.ez[c] >= 0:
-                    into[places.ez[c] + i] += signals.w[k, c]
                 if Ez[i, c] != 0.0:
                     for p in range(q):
                         into[p] += Ez[i, c] * inner[c, p]
+        for e in range(direct.ends[2], direct.ends[3]):
+            turned[direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
         for i in range(n):
             for p in range(q):
                 turn[i, p] = turned[i, p]

@@ -1,5 +1,6 @@
-"""What the compiled recursions of a state-space model read: the model, what drives it, and where unknowns stand."""
+"""What the compiled recursions of a state-space model read: the model, what drives it, and what unknowns change."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,83 +67,47 @@ class Stretch(NamedTuple):
         return Stretch._make([*(signal[samples] for signal in self[:5]), *self[5:]])
 
 
-class Places(NamedTuple):
-    """First column of every part of the unknowns among the sensitivities; -1 where a part is not unknown.
+class Direct(NamedTuple):
+    """What every unknown changes directly, entry by entry: ``target[row, column] += gain * values[signal]``.
 
     Attributes:
-        A: of A, row by row, as are the matrices below.
-        C: of C.
-        K: of K.
-        offset: of the constant of the output.
-        mu: (r,) of the coefficients of every function of the inputs.
-        b: (r,) of its column of B.
-        d: (r,) of its column of D.
-        functions: (r + 1,) first column of its functions in `Signals.eta`.
-        nu: (s,) of the coefficients of every feedback function.
-        e: (s,) of its column of E.
-        coordinates: (s + 1,) first column of its functions in `Signals.zeta`.
-        c: (k,) of the coefficients of every latent function.
-        ez: (k,) of its column of Ez.
-        fz: (k,) of its column of Fz.
-        cz: (k,) of its row of Cz.
-        dz: (k,) of its row of Dz.
-        oz: (k,) of the constant in its argument.
-        members: (k + 1,) first column of its functions in `Signals.phi`.
+        row: (e,) latent function, output or state that changes.
+        column: (e,) column of the unknown among the sensitivities.
+        signal: (e,) column of `Signals.values`.
+        gain: (e,).
+        ends: (4,) the entries of latent functions, those of outputs and those of the next state lie between them.
     """
 
-    A: int
-    C: int
-    K: int
-    offset: int
-    mu: Any
-    b: Any
-    d: Any
-    functions: Any
-    nu: Any
-    e: Any
-    coordinates: Any
-    c: Any
-    ez: Any
-    fz: Any
-    cz: Any
-    dz: Any
-    oz: Any
-    members: Any
+    row: np.ndarray
+    column: np.ndarray
+    signal: np.ndarray
+    gain: Array
+    ends: np.ndarray
 
     @classmethod
-    def none(cls, parts: Parts) -> "Places":
-        """Return the places for a model in which the initial state alone is unknown."""
-        r, s, k = (np.full(part.shape[1], -1, dtype=np.int64) for part in (parts.B, parts.E, parts.Ez))
-        ends = [np.zeros(one.size + 1, dtype=np.int64) for one in (r, s, k)]
-        return cls(-1, -1, -1, -1, r, r, r, ends[0], s, s, ends[1], k, k, k, k, k, k, ends[2])
+    def of(cls, latent: Sequence[Any] = (), outputs: Sequence[Any] = (), states: Sequence[Any] = ()) -> "Direct":
+        """Join tables (row, column, signal, gain), whose shapes broadcast; an unknown of column -1 is none."""
+        tables = []
+        for group in (latent, outputs, states):
+            entries = [np.array(np.broadcast_arrays(*one), dtype=float).reshape(4, -1) for one in group]
+            table = np.concatenate([np.zeros((4, 0)), *entries], axis=1)
+            tables.append(table[:, table[1] >= 0])
+        *places, gain = np.concatenate(tables, axis=1)
+        ends = np.cumsum([0, *(table.shape[1] for table in tables)])
+        row, column, signal, ends = (place.astype(np.uintp) for place in (*places, ends))  # quicker than signed ones
+        return cls(row, column, signal, gain, ends)
 
 
 class Signals(NamedTuple):
     """The run of T samples about which it is linearised.
 
     Attributes:
-        states: (T, n).
-        innovation: (T, l) measured less predicted output, zero where there is none or K is not unknown.
         returned: (T, n, l) derivative of the next state with respect to the output that comes back through the
             correction and the feedback; (0, n, l) where nothing does.
-        u: (T, m) inputs in the arguments of the latent functions.
-        f: (T, r) values of the functions of the inputs.
-        eta: (T, P) values of their basis functions.
-        g: (T, s) values of the feedback functions.
-        zeta: (T, Q) values of their basis functions.
-        w: (T, k) values of the latent functions.
-        slopes: (T, k) their derivatives.
-        phi: (T, R) values of their basis functions.
+        slopes: (T, k) derivatives of the latent functions.
+        values: (T, s) what the entries of `Direct` multiply.
     """
 
-    states: Array
-    innovation: Array
     returned: Array
-    u: Array
-    f: Array
-    eta: Array
-    g: Array
-    zeta: Array
-    w: Array
     slopes: Array
-    phi: Array
+    values: Array

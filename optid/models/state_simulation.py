@@ -12,7 +12,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
-from optid.models.state_signals import Parts, Places, Signals, Stretch
+from optid.models.state_signals import Direct, Parts, Signals, Stretch
 from optid.models.state_space import StateSpace
 
 STRETCH = 16384
@@ -79,20 +79,11 @@ def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limit
     return Run(model, u, measured, known, model.K if simulator == "predict" else none, low, high, label)
 
 
-def run(job: Run, x0: Array) -> Array:
+def run(job: Run, x0: Array, horizon: int = 1) -> Array:
     """Compute the outputs (N, l) from the initial state (n,).
 
-    Raises:
-        DataError: an output that leaves the range allowed, named by channel and sample.
-    """
-    return ahead(job, x0, 1)
-
-
-def ahead(job: Run, x0: Array, horizon: int) -> Array:
-    """Run freely for `horizon` - 1 samples from the state before every sample; the outputs (N, l) at the end.
-
-    Returns:
-        NaN in the first `horizon` - 1 samples.
+    With a horizon the model runs freely for `horizon` - 1 samples from the state before every sample; the first
+    `horizon` - 1 outputs are NaN.
 
     Raises:
         DataError: an output that leaves the range allowed, named by channel and sample.
@@ -108,11 +99,12 @@ def ahead(job: Run, x0: Array, horizon: int) -> Array:
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
             now, then = (slice(j, j + len(states)) for j in (i - 1, i))
             with np.errstate(all="ignore"):
-                h = _latent(model, states, stretch.z[now])
+                h = model.latent_values(stretch.z[now] + states @ model.Cz.T)
                 states = states @ model.A.T + stretch.drive[now] + y @ model.L.T + h @ model.Ez.T
                 for j, (g, o) in enumerate(zip(model.feedback, model.output_of)):
                     states += g(y[:, o])[:, None] * model.E[:, j]
-                y = states @ model.C.T + stretch.direct[then] + _latent(model, states, stretch.z[then]) @ model.Fz.T
+                h = model.latent_values(stretch.z[then] + states @ model.Cz.T)
+                y = states @ model.C.T + stretch.direct[then] + h @ model.Fz.T
             wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
             if wild.any():
                 raise _left(job, first + i + int(np.argmax(wild)))
@@ -127,12 +119,6 @@ def visited(job: Run, x0: Array) -> Array:
         found.append(np.empty((last - first, x.size)))
         march(job, first, stretch, x, np.empty((last - first, job.model.l)), found[-1])
     return np.vstack(found)
-
-
-def _latent(model: StateSpace, states: Array, z: Array) -> Array:
-    """Values (T, k) of the latent functions at states (T, n), z (T, k) being what the inputs add."""
-    values = [h(one) for h, one in zip(model.latent, (z + states @ model.Cz.T).T)]
-    return np.column_stack(values) if values else z
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
@@ -163,25 +149,20 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
         if affine:
             return x + step
         expected = float(np.sum((root[:, :n] @ step) ** 2))
-        found = _descended(job, y, unit, x, step, cost)
-        if found is None:
+        for halving in range(20):
+            trial = x + step / 2**halving
+            try:
+                near, lower = _linearised(job, y, unit, trial)
+            except DataError:
+                continue
+            if lower <= cost * (1 + ROUNDING):
+                break
+        else:
             return x
-        x, root, cost = found
+        x, root, cost = trial, near, lower
         if expected <= SETTLED * cost:
             return x
     return x
-
-
-def _descended(job: Run, y: Array, unit: Array, x: Array, step: Array, cost: float) -> Any:
-    for halving in range(20):
-        trial = x + step / 2**halving
-        try:
-            root, lower = _linearised(job, y, unit, trial)
-        except DataError:
-            continue
-        if lower <= cost * (1 + ROUNDING):
-            return trial, root, lower
-    return None
 
 
 def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) -> tuple[Array, float]:
@@ -189,10 +170,12 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
 
     Where the error of the whole record is of no interest, the run ends when the initial state is forgotten.
     """
+    from optid.models.state_kernels import sensitivities
+
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn = np.array(x0, dtype=float), np.eye(n)
-    parts, places = job.model.parts, Places.none(job.model.parts)
+    nothing = Direct.of()  # besides the initial state
     for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
         if not (informs or whole):
             break
@@ -203,7 +186,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
         cost += float(np.sum(error[present] ** 2))
         if informs:
             jacobian = np.empty((last - first, outputs, n))
-            sensitivities(parts, places, signals(job, stretch, states, simulated), turn, jacobian)
+            sensitivities(job.model.parts, nothing, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not np.all(np.isfinite(rows)):
                 raise DataError(
@@ -252,38 +235,16 @@ def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
     return Stretch._make([*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high])
 
 
-def signals(job: Run, stretch: Stretch, states: Array, outputs: Array, **known: Array) -> Signals:
-    """Describe a run over a stretch, so that `sensitivities` can be carried along it.
-
-    Args:
-        job: the run.
-        stretch: what drove it.
-        states: (T, n) its states.
-        outputs: (T, l) its outputs.
-        known: values of functions of the inputs and of measured outputs, where their coefficients are unknown.
-    """
-    model, missing = job.model, np.isnan(stretch.y)
-    count, slopes = len(states), np.zeros((len(states), len(model.latent)))
-    z = stretch.z + states @ model.Cz.T
-    for j, h in enumerate(model.latent):
-        slopes[:, j] = h.slope(z[:, j])
+def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signals:
+    """Describe a run over a stretch with its states (T, n) and outputs (T, l), but for the `values` of unknowns."""
+    model, missing, slopes = job.model, np.isnan(stretch.y), np.zeros((len(states), len(job.model.latent)))
+    for j, (h, z) in enumerate(zip(model.latent, (stretch.z + states @ model.Cz.T).T)):
+        slopes[:, j] = h.slope(z)
     returned = np.zeros((0, model.nx, model.l))
     if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
         own = model.returned(outputs) if missing.any() else 0.0
         returned = np.where(missing[:, None, :], own, -job.gain)
-    parts = {
-        "states": states, "innovation": np.where(missing, 0.0, stretch.y - outputs), "returned": returned,
-        "u": np.zeros((0, 0)), "f": np.zeros((count, len(model.nonlinearities))), "eta": np.zeros((0, 0)),
-        "g": np.zeros((count, len(model.feedback))), "zeta": np.zeros((0, 0)), "w": np.zeros((0, 0)), "slopes": slopes,
-        "phi": np.zeros((0, 0)), **known}
-    return Signals(**{name: np.ascontiguousarray(value) for name, value in parts.items()})
-
-
-def sensitivities(parts: Parts, places: Places, run: Signals, turn: Array, jacobian: Array) -> None:
-    """Carry derivatives along a run; see `optid.models.state_kernels.sensitivities`."""
-    from optid.models.state_kernels import sensitivities as carry
-
-    carry(parts, places, run, turn, jacobian)
+    return Signals(returned, slopes, np.zeros((len(states), 0)))
 
 
 def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:
@@ -330,7 +291,7 @@ def _march_by_steps(model: StateSpace, parts: Parts, stretch: Stretch, x: Array,
     plain = parts._replace(Ez=np.zeros((x.size, 0)), Fz=np.zeros((model.l, 0)), Cz=np.zeros((0, x.size)))
     for k in range(len(stretch.y)):
         here = slice(k, k + 1)
-        h = _latent(model, x[None], stretch.z[here])[0]
+        h = model.latent_values(stretch.z[here] + model.Cz @ x)[0]
         direct = stretch.direct[k] + parts.Fz @ h
         y, g = direct + parts.C @ x, stretch.feedback[k].copy()
         for j in np.flatnonzero(np.isnan(g)) if np.all((stretch.low <= y) & (y <= stretch.high)) else ():

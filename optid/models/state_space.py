@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_lyapunov
 
-from optid.arrays import Array
+from optid.arrays import Array, finite
 from optid.bases import Linear
 from optid.data.channels import Transform
 from optid.errors import StructureError
@@ -17,7 +17,7 @@ from optid.models import roots
 from optid.models.feedback_tables import tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, finite, static_solution
+from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
@@ -211,7 +211,7 @@ class StateSpace(Model):
         points = self._operating_point(u0)
         f, x = self.expanded(points[None])[0], np.zeros(self.nx)
         for _ in range(NEWTON_STEPS):
-            h = self.latent_values(x[None], points[None])[0]
+            h = self.latent_values(self.latent_signals(x[None], points[None]))[0]
             y = self.C @ x + self.D @ f + self.Fz @ h + self.offset_y
             g = np.array([function(y[o]) for function, o in zip(self.feedback, self.output_of)])
             change = self.A @ x + self.B @ f + self.E @ g + self.L @ y + self.Ez @ h + self.offset_x - x
@@ -247,9 +247,8 @@ class StateSpace(Model):
         """Return z (N, k) at states x (N, n) and inputs u (N, m)."""
         return x @ self.Cz.T + u @ self.Dz.T + self.offset_z
 
-    def latent_values(self, x: Array, u: Array) -> Array:
-        """Return h(z) (N, k) at states x (N, n) and inputs u (N, m)."""
-        z = self.latent_signals(x, u)
+    def latent_values(self, z: Array) -> Array:
+        """Return h(z) (N, k) at arguments z (N, k)."""
         return np.column_stack([h(z[:, j]) for j, h in enumerate(self.latent)]) if self.latent else z
 
     def returned(self, y: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Sums, polynomials and state-space models as text: equations for few states, a summary beyond."""
+"""Models as text: sums, polynomials, and equations; of state-space models with many states a summary."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -36,6 +36,56 @@ def signed_sum(terms: Iterable[tuple[float, str]], digits: int = 4) -> str:
 def polynomial(coefficients: Iterable[float], digits: int = 4) -> str:
     """Write 1 + c_1 q^-1 + c_2 q^-2 + ..., without the terms that are zero."""
     return "1" + signed_terms(((float(c), f"q^-{i}") for i, c in enumerate(coefficients, start=1)), digits)
+
+
+def coefficients(model: Any) -> list[tuple[str, float]]:
+    """Return (name, value) of every coefficient of A, B, the offset, C and (Box-Jenkins) D, as tables show them."""
+    several, found = model.l > 1, []
+    for (i, *pair), value in np.ndenumerate(model.a):
+        pair = f"[{','.join(model.outputs[o] for o in pair)}]" if several else ""
+        found.append((f"a{i + 1}{pair}", float(value)))
+    for channel, b in zip(model.inputs, model.b):
+        for (j, *output), value in np.ndenumerate(b):
+            words = ([channel] if model.m > 1 else []) + [model.outputs[o] for o in output]
+            found.append((f"b{j}" + (f"[{','.join(words)}]" if words else ""), float(value)))
+    for name, value in zip(model.outputs, model.offset):
+        found.append((f"offset[{name}]" if several else "offset", float(value)))
+    for name, values in (("c", model.c), ("d", () if model.d is None else model.d)):
+        found += [(f"{name}{i}", float(value)) for i, value in enumerate(values, start=1)]
+    return found
+
+
+def equations(model: Any, digits: int = 4) -> str:
+    """Write the model as difference equations, one per output; of the noise where D is apart.
+
+    f is `f`: where its offset is identifiable the constant is inside f, otherwise it stands at the end.
+    """
+    noise = signed_terms(((v, f"e(k-{i})") for i, v in enumerate(model.c, start=1)), digits)
+    if model.d is None:
+        lines = [_equation(model, o, model.outputs, digits) for o in range(model.l)]
+        return "\n".join(lines) + (" + e(k)" + noise if model.c.size else "")
+    name = model.outputs[0]
+    x = next(word for word in ("x", "x0", "x_plant", f"{name}_x") if word not in (*model.inputs, name))
+    plant = _equation(model, 0, (x,), digits)
+    if model.structure == "oe":
+        return f"{plant}\n{name}(k) = {x}(k) + e(k)"
+    past = signed_terms(((-v, f"v(k-{i})") for i, v in enumerate(model.d, start=1)), digits)
+    return f"{plant}\nv(k) = e(k){noise}{past}\n{name}(k) = {x}(k) + v(k)"
+
+
+def _equation(model: Any, o: int, outputs: tuple[str, ...], digits: int) -> str:
+    terms = []
+    for i, matrix in enumerate(model.matrices, start=1):
+        terms += [(-float(matrix[o, p]), f"{name}(k-{i})") for p, name in enumerate(outputs)]
+    for c, (name, f) in enumerate(zip(model.inputs, model.nonlinearities)):
+        function = "f" if model.m == 1 else f"f_{name}"
+        for lag, b in enumerate(model.numerators[:, o, c]):
+            sample = f"{name}(k-{lag})" if lag else f"{name}(k)"
+            gain = float(b) * (float(f.mu[0]) if f.is_linear else 1.0)
+            terms.append((gain, sample if f.is_linear else f"{function}({sample})"))
+    if model.c0 is None:
+        terms.append((float(model.offset[o]), ""))
+    return f"{outputs[o]}(k) = {signed_sum(terms, digits)}"
 
 
 def state_equations(model: Any, digits: int = 4) -> str:

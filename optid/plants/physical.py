@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid import signals
-from optid.arrays import Array
+from optid.arrays import Array, one_of
 from optid.data.record import Data
 from optid.errors import StructureError, nearest
 from optid.models.equations import Equations
@@ -173,8 +173,7 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
 
     u = as_input(u, 1)
     check_parameters(dt=dt, substeps=substeps)
-    if method not in STAGES:
-        raise StructureError(f"method = {method!r}. {nearest(method, STAGES)}")
+    one_of("method", method, tuple(STAGES))
     rng = np.random.default_rng(seed)
     w = gaussian(rng, len(u), 2, process, 0.0, "process")
     v = gaussian(rng, len(u), 1, measurement, colour, "measurement")[:, 0]

@@ -13,8 +13,7 @@ WILD = 1e8
 def as_input(u: ArrayLike, channels: int) -> Array:
     """Return the input as (N, channels); refuse other shapes, and samples that are not finite (`DataError`)."""
     array = np.asarray(u, dtype=float)
-    if array.ndim == 1:
-        array = array[:, None]
+    array = array[:, None] if array.ndim == 1 else array
     if array.ndim != 2 or array.shape[1] != channels or not len(array):
         wanted = f"(N,) or (N, {channels})" if channels == 1 else f"(N, {channels})"
         raise DataError(f"the input has shape {np.shape(u)}; this plant takes {wanted} with N of at least 1.")

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
 from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
@@ -147,8 +147,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         RankError: an experiment shorter than the block rows, or no complete window at all.
     """
     rows = check_integer(rows, "block rows")
-    if method not in ("auto", "gram", "qr"):
-        raise StructureError(f"method={method!r}: use 'auto', 'gram' or 'qr'.")
+    one_of("method", method, ("auto", "gram", "qr"))
     records = [np.asarray(record, dtype=float) for record in records]
     for i, record in enumerate(records):
         if record.ndim != 2:

@@ -199,34 +199,29 @@ def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) ->
     Returns:
         One array (N, l) per experiment, in output units; NaN where a sample of the row is missing or before the record.
     """
-    theta = np.asarray(theta, dtype=float)
-    if theta.shape != (layout.n_columns, layout.l):
-        raise StructureError(f"theta has shape {theta.shape}; this layout needs ({layout.n_columns}, {layout.l}).")
     check_channels(data, layout)
-    return [_residuals_of(e.u, e.y, layout, theta, chunk) for e in data.experiments]
+    reach, found = layout.first_row, []
+    for e in data.experiments:
+        parts = [_residuals_of(u, y, layout, theta) for u, y in stretches([(e.u, e.y)], reach, max(chunk, reach))]
+        found.append(np.concatenate([np.full(e.y[:reach].shape, np.nan), *parts]))
+    return found
 
 
-def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array, chunk: int) -> Array:
-    reach, outs = layout.first_row, layout.l
-    result = np.full(y.shape, np.nan)
-    tables = [np.tensordot(basis.contrast, theta[layout.block(c)].reshape(b, basis.size, outs), axes=(1, 1))
-              for c, (b, basis) in enumerate(zip(layout.nb, layout.bases))]  # (full size, lags, l)
-    start = reach
-    for part_u, part_y in stretches([(u, y)], reach, max(chunk, reach)):
-        count = len(part_y) - reach
-        error = part_y[reach:] - theta[layout.offset]
-        for i in range(1, layout.na + 1):
-            error += part_y[reach - i : reach - i + count] @ theta[(i - 1) * outs : i * outs]
-        for c, (basis, table) in enumerate(zip(layout.bases, tables)):
-            first, values = basis.local(part_u[:, c])
-            for lag, column in zip(layout.lags[c], table.transpose(1, 0, 2)):
-                at = slice(reach - lag, reach - lag + count)
-                for i, weight in enumerate(values[at].T):
-                    error -= weight[:, None] * column[first[at] + i]
-        error[~used_rows(part_u, part_y, layout)] = np.nan
-        result[start : start + count] = error
-        start += count
-    return result
+def _residuals_of(u: Array, y: Array, layout: Layout, theta: Array) -> Array:
+    """Return the residuals (R, l) of a stretch: u (reach + R, m), y (reach + R, l)."""
+    reach, end, outs = layout.first_row, len(y), layout.l
+    error = y[reach:] - theta[layout.offset]
+    for i in range(1, layout.na + 1):
+        error += y[reach - i : end - i] @ theta[(i - 1) * outs : i * outs]
+    for c, (basis, lags) in enumerate(zip(layout.bases, layout.lags)):
+        by_lag = theta[layout.block(c)].reshape(len(lags), basis.size, outs)
+        first, weights = basis.local(u[:, c])
+        for lag, column in zip(lags, basis.contrast @ by_lag):
+            at = slice(reach - lag, end - lag)
+            for i, weight in enumerate(weights[at].T):
+                error -= weight[:, None] * column[first[at] + i]
+    error[~used_rows(u, y, layout)] = np.nan
+    return error
 
 
 def _total(

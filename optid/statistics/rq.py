@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, one_of
 from optid.errors import RankError, StructureError
 from optid.statistics.hankel import HankelStatistics, dependent_signal
 
@@ -77,8 +77,7 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
         RankError: fewer instruments than regressors, or regressors that the instruments do not reach.
     """
     z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
-    if form not in FORMS:
-        raise StructureError(f"form={form!r}: use one of {', '.join(FORMS)}.")
+    one_of("form", form, FORMS)
     if np.any(statistics.centre) and not (0 in z and 0 in phi):
         raise StructureError("These statistics are centred: the constant (position 0) must be among the instruments "
                              "and the regressors, or take them without a centre.")

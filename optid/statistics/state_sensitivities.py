@@ -4,7 +4,8 @@ A stretch is run by the simulator of the criterion; the derivatives of the state
 (`optid.models.state_kernels`), and what leaves a chunk is a factor of [sensitivities | errors].
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError
 from optid.models import state_simulation as simulation
-from optid.models.state_signals import Signals, Stretch
+from optid.models.state_signals import Stretch
 from optid.models.state_space import StateSpace
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
@@ -24,93 +25,88 @@ NUMBERS = 500_000
 """Entries of the sensitivities formed at a time."""
 
 
-def linearise_states(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any,
-                     gauge: Array | None = None, *, limits: Any = None, chunk: int = 0, method: Method = "auto"
-                     ) -> Linearised:
-    """Run a model over all experiments and compress its errors (model less record) with their sensitivities.
+@dataclass(frozen=True, eq=False)
+class StatePredictor:
+    """The simulator of a criterion on a record, whose errors are model less record.
 
     Where an output is missing its error is left out, nothing is corrected by it, and the model's own output is fed
     back.
 
-    Args:
+    Attributes:
         data: the record; every input present.
         unknowns: their order.
-        x: the unknowns; the matrix that carries the state must be stable.
+        model: (point) -> `StateSpace`; the matrix that carries its state must be stable.
         weight: (l, l) positive definite: the errors count as e^T weight e; where outputs are missing, with the inverse
             of the block of its inverse.
-        model: (point) -> `StateSpace`.
-        gauge: (rows, shared) directions that change no output; they get weight in the factor, not in the errors.
         limits: range that the outputs of every experiment must not leave, from `allowed_range`; None for none.
-        chunk: samples at a time; chosen by their size where 0.
-        method: see `optid.statistics.linearised.Method`.
-
-    Returns:
-        The errors near x; of infinite value where a run leaves the range allowed.
     """
-    try:
-        return linearised(weighted_rows(data, unknowns, x, weight, model, limits, chunk), unknowns.experiments,
-                          unknowns.n, unknowns.shared, gauge, method)
-    except (FloatingPointError, DataError):
-        return _infinite(unknowns)
 
+    data: "Data"
+    unknowns: StateUnknowns
+    model: Callable[[StatePoint], Any]
+    weight: Array
+    limits: Any = None
 
-def weighted_rows(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any, limits: Any = None,
-                  chunk: int = 0) -> Callable[[int], Iterator[tuple[Array, int]]]:
-    """Return what yields the weighted rows [x0 | shared | error] of an experiment, and their number, by its index.
+    def compress(self, x: Array, gauge: Array | None = None, method: Method = "auto") -> Linearised:
+        """Run over all experiments from the unknowns x and compress the errors with their sensitivities.
 
-    Arguments as `linearise_states`. A missing output has a row of zeros.
-    """
-    chunk = chunk or max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
-    point = unknowns.unpack(x)
-    found = model(point)
-    return lambda i: _blocks(_job(data, unknowns, found, i, limits), unknowns, point, i, weight, chunk)
+        Args:
+            x: the unknowns.
+            gauge: (rows, shared) directions that change no output; they get weight in the factor, not in the errors.
+            method: see `optid.statistics.linearised.Method`.
 
+        Returns:
+            The errors near x; of infinite value where a run leaves the range allowed.
+        """
+        n, p, experiments = self.unknowns.n, self.unknowns.shared, self.unknowns.experiments
+        try:
+            return linearised(self.blocks(x), experiments, n, p, gauge, method)
+        except (FloatingPointError, DataError):
+            nothing = (np.eye(n), np.zeros((n, p)), np.zeros(n))
+            return Linearised(np.eye(p), np.zeros(p), (nothing,) * experiments, np.inf, 0, 1.0, "gram")
 
-def residuals(data: "Data", unknowns: StateUnknowns, x: Array, model: Any, limits: Any = None) -> list[Array]:
-    """Return the errors (N, l) (model less record) of every experiment, NaN where the output is missing.
+    def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+        """Return what yields the weighted rows [x0 | shared | error] of an experiment, and their number, by its index.
 
-    Raises:
-        DataError: a run that leaves the range allowed.
-    """
-    point = unknowns.unpack(x)
-    found = model(point)
-    return [simulation.run(_job(data, unknowns, found, i, limits), point.x0[i]) - e.y
-            for i, e in enumerate(data.experiments)]
+        A missing output has a row of zeros.
+        """
+        unknowns, point = self.unknowns, self.unknowns.unpack(x)
+        model, covariance = self.model(point), np.linalg.inv(self.weight)
+        chunk = max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
 
+        def rows(index: int) -> Iterator[tuple[Array, int]]:
+            for block in _runs(self._job(model, index), unknowns, point, index, chunk):
+                count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
+                block = _weighted(block, covariance)
+                if not np.isfinite(block.sum()):
+                    raise FloatingPointError
+                yield block.reshape(-1, block.shape[2]), count
 
-def squares(data: "Data", unknowns: StateUnknowns, x: Array, weight: Array, model: Any, limits: Any = None) -> float:
-    """Return the weighted sum of squared errors; infinite where a run leaves the range allowed."""
-    try:
-        found = residuals(data, unknowns, x, model, limits)
-    except DataError:
-        return np.inf
-    total = sum(float(np.sum(_weighted(e[:, :, None], np.linalg.inv(weight)) ** 2)) for e in found)
-    return total if np.isfinite(total) else np.inf
+        return rows
 
+    def residuals(self, x: Array) -> list[Array]:
+        """Return the errors (N, l) of every experiment, NaN where the output is missing.
 
-def _job(data: "Data", unknowns: StateUnknowns, model: StateSpace, index: int, limits: Any) -> simulation.Run:
-    e = data.experiments[index]
-    return simulation.prepared(model, SIMULATORS[unknowns.criterion], e.u, e.y, limits and limits[index], "")
+        Raises:
+            DataError: a run that leaves the range allowed.
+        """
+        point = self.unknowns.unpack(x)
+        model = self.model(point)
+        return [simulation.run(self._job(model, i), point.x0[i]) - e.y for i, e in enumerate(self.data.experiments)]
 
+    def squares(self, x: Array) -> float:
+        """Return the weighted sum of squared errors; infinite where a run leaves the range allowed."""
+        try:
+            found = self.residuals(x)
+        except DataError:
+            return np.inf
+        total = sum(float(np.sum(_weighted(e[:, :, None], np.linalg.inv(self.weight)) ** 2)) for e in found)
+        return total if np.isfinite(total) else np.inf
 
-def _infinite(unknowns: StateUnknowns) -> Linearised:
-    n, p = unknowns.n, unknowns.shared
-    nothing = (np.eye(n), np.zeros((n, p)), np.zeros(n))
-    return Linearised(np.eye(p), np.zeros(p), (nothing,) * unknowns.experiments, np.inf, 0, 1.0, "gram")
-
-
-def _blocks(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, weight: Array, chunk: int
-            ) -> Iterator[tuple[Array, int]]:
-    """Yield weighted rows [x0 | shared | error], zero where the output is missing, and their number."""
-    covariance, first = np.linalg.inv(weight), 0
-    for outputs, block in _runs(job, unknowns, point, index, chunk):
-        block[:, :, -1] = outputs - job.y[first : first + len(outputs)]
-        first += len(outputs)
-        count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
-        block = _weighted(block, covariance)
-        if not np.isfinite(block.sum()):
-            raise FloatingPointError
-        yield block.reshape(-1, block.shape[2]), count
+    def _job(self, model: StateSpace, index: int) -> simulation.Run:
+        e = self.data.experiments[index]
+        return simulation.prepared(model, SIMULATORS[self.unknowns.criterion], e.u, e.y,
+                                   self.limits and self.limits[index], "")
 
 
 def _weighted(block: Array, covariance: Array) -> Array:
@@ -137,39 +133,35 @@ def _root(covariance: Array, missing: Any) -> Array:
     return root
 
 
-def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int
-          ) -> Iterator[tuple[Array, Array]]:
-    """Yield outputs (T, l), and sensitivities (T, l, n + shared + 1) with a column to write in, chunk by chunk."""
+def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int) -> Iterator[Array]:
+    """Yield the sensitivities and the errors in the last column, (T, l, n + shared + 1), chunk by chunk."""
+    from optid.models.state_kernels import sensitivities
+
     n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
-    places, state = unknowns.places(parts), np.array(point.x0[index], dtype=float)
-    turn = np.zeros((n, n + unknowns.shared))
-    turn[:, :n] = np.eye(n)
+    direct, state, turn = unknowns.direct(point), point.x0[index].copy(), np.eye(n, n + unknowns.shared)
     for first in range(0, len(job.u), chunk):
         samples = slice(first, min(first + chunk, len(job.u)))
         eta = [basis.values(job.u[samples, c]) for c, basis in enumerate(unknowns.expansion.inputs)]
         f = np.column_stack([part @ mu for part, mu in zip(eta, point.mus)])
-        stretch = simulation.stretch_of(job, samples, f)
-        count = len(f)
-        states, outputs, jacobian = np.empty((count, n)), np.empty((count, l)), np.empty((count, l, turn.shape[1] + 1))
+        stretch, count = simulation.stretch_of(job, samples, f), len(f)
+        states, outputs, block = np.empty((count, n)), np.empty((count, l)), np.empty((count, l, turn.shape[1] + 1))
         simulation.march(job, first, stretch, state, outputs, states)
-        known = {"f": f, "eta": np.hstack(eta), "u": job.u[samples]}
-        run = _signals(unknowns, point, job, stretch, states, outputs, known)
-        simulation.sensitivities(parts, places, run, turn, jacobian)
-        yield outputs, jacobian
+        run = simulation.signals(job, stretch, states, outputs)
+        values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
+        sensitivities(parts, direct, run._replace(values=values), turn, block)
+        block[:, :, -1] = outputs - job.y[samples]
+        yield block
 
 
-def _signals(unknowns: StateUnknowns, point: StatePoint, job: simulation.Run, stretch: Stretch, states: Array,
-             outputs: Array, known: dict[str, Array]) -> Signals:
-    """Describe a run with the values of all functions whose coefficients are unknown."""
-    families = unknowns.expansion.feedback
-    if families:
-        fed = np.where(np.isnan(stretch.y), outputs, stretch.y)
-        zeta = [family.values(fed) for family in families]
-        known["g"] = np.column_stack([part @ nu for part, nu in zip(zeta, point.nus)])
-        known["zeta"] = np.hstack(zeta)
-    if unknowns.latent:
-        z = stretch.z + states @ point.Cz.T
-        phi = [one.basis.values(z[:, i]) @ one.vectors for i, one in enumerate(unknowns.latent)]
-        known["w"] = np.column_stack([part @ c for part, c in zip(phi, point.cs)])
-        known["phi"] = np.hstack(phi)
-    return simulation.signals(job, stretch, states, outputs, **known)
+def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, states: Array, outputs: Array,
+            slopes: Array, u: Array, f: Array, eta: Sequence[Array]) -> Array:
+    """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`."""
+    missing, one = np.isnan(stretch.y), np.ones((len(u), 1))
+    fed, argument = np.where(missing, outputs, stretch.y), np.hstack([states, u, one])
+    zeta = [family.values(fed) for family in unknowns.expansion.feedback]
+    z = (stretch.z + states @ point.Cz.T).T
+    phi = [latent.basis.values(signal) @ latent.vectors for latent, signal in zip(unknowns.latent, z)]
+    g, w = ([part @ one for part, one in zip(parts, of)] for parts, of in ((zeta, point.nus), (phi, point.cs)))
+    innovations = np.where(missing, 0.0, stretch.y - outputs)
+    return np.column_stack([states, innovations, f, *g, *w, one, *eta, *zeta, *phi,
+                            *(slope[:, None] * argument for slope in slopes.T)])

@@ -1,14 +1,17 @@
 """The unknowns of a state-space model: matrices, static functions and one initial state per experiment."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
 from optid.errors import StructureError
-from optid.models.state_signals import Parts, Places
+from optid.models.state_signals import Direct
 from optid.statistics.expansion import Expansion
 from optid.statistics.unknowns import Unknowns
 
@@ -62,6 +65,13 @@ def beyond_affine(basis: Basis, points: int = 64) -> Array:
         raise StructureError(f"the basis {type(basis).__name__.lower()} of a latent function has no part that is not "
                              "affine, which the matrices carry: use more functions.")
     return found
+
+
+SHAPES = {
+    "A": "nn", "C": "ln", "K": "nl", "offset": "l", "b": "nm", "d": "lm", "e": "ns", "x0": "En", "Ez": "nk", "Fz": "lk",
+    "Cz": "kn", "Dz": "km", "offset_z": "k",
+}
+"""Shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,126 +161,131 @@ class StateUnknowns(Unknowns):
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Shape of every part in order: "A", "C", "K", "offset", "mu0", "b0", ..., "nu0", "e0", ..., "c0", "g0", "z0".
+        """Shape of every part in order: "A", "C", "K", "offset", "mu0", "b0", ..., "nu0", "e0", ..., "c0", "z0", "g0".
 
         g = [Ez; Fz] and z = [Cz, Dz, constant] of a latent function, as far as they are unknown.
         """
-        n, outputs = self.n, self.l
-        found: dict[str, tuple[int, ...]] = {"A": (n, n)}
+        views = self._views(self._known())
+        return {name: of[0].shape if len(of) == 1 else (sum(one.size for one in of),) for name, of in views.items()}
+
+    def _known(self) -> StatePoint:
+        """Return a point that holds what is known; what is unknown is zero."""
+        size = {"n": self.n, "l": self.l, "m": self.expansion.m, "s": len(self.expansion.feedback),
+                "k": len(self.latent), "E": self.experiments}
+        found = {name: np.zeros([size[letter] for letter in letters]) for name, letters in SHAPES.items()}
+        for i, one in enumerate(self.latent):
+            if one.row is not None:
+                found["Cz"][i], found["Dz"][i] = one.row[: self.n], one.row[self.n : -1]
+                found["offset_z"][i] = one.row[-1]
+            if one.output >= 0 and not one.direct:
+                found["Fz"][one.output, i] = 1.0
+        mus, nus = ([np.full(one.size, float(one.size == 1)) for one in functions]
+                    for functions in (self.expansion.inputs, self.expansion.feedback))
+        cs = [np.full(one.size, float(one.row is not None)) for one in self.latent]
+        return StatePoint(mus=tuple(mus), nus=tuple(nus), cs=tuple(cs), **found)
+
+    def _views(self, point: StatePoint) -> dict[str, list[Array]]:
+        """Return what is unknown of a point, by part and in the order of x, as views of its arrays."""
+        found = {"A": [point.A]}
         if self.linear_output:
-            found["C"] = (outputs, n)
+            found["C"] = [point.C]
         if self.innovations:
-            found["K"] = (n, outputs)
+            found["K"] = [point.K]
         if self.constant:
-            found["offset"] = (outputs,)
-        for c, (size, direct) in enumerate(zip(self.expansion.input_sizes, self.feedthrough)):
+            found["offset"] = [point.offset]
+        for c, direct in enumerate(self.feedthrough):
             if self.free[c]:
-                found[f"mu{c}"] = (size,)
-            found[f"b{c}"] = (n + outputs,) if direct else (n,)
+                found[f"mu{c}"] = [point.mus[c]]
+            found[f"b{c}"] = [point.b[:, c], point.d[:, c]][: 1 + direct]
         for f, family in enumerate(self.expansion.feedback):
             if family.size > 1:
-                found[f"nu{f}"] = (family.size,)
-            found[f"e{f}"] = (n,)
+                found[f"nu{f}"] = [point.nus[f]]
+            found[f"e{f}"] = [point.e[:, f]]
         for i, one in enumerate(self.latent):
             if one.row is None:
-                found |= {f"c{i}": (one.size,), f"z{i}": (n + self.expansion.m * one.moved + 1,)}
+                found[f"c{i}"] = [point.cs[i]]
+                found[f"z{i}"] = [point.Cz[i], *[point.Dz[i]] * one.moved, point.offset_z[i : i + 1]]
             if one.feeds or one.direct:
-                found[f"g{i}"] = (n * one.feeds + outputs * one.direct,)
+                found[f"g{i}"] = [*[point.Ez[:, i]] * one.feeds, *[point.Fz[:, i]] * one.direct]
         return found
 
     def pack(self, point: StatePoint) -> Array:
         """Return the vector of a point."""
-        columns = [np.concatenate([point.b[:, c], point.d[:, c][: self.l * direct]])
-                   for c, direct in enumerate(self.feedthrough)]
-        parts = {"A": point.A, "C": point.C, "K": point.K, "offset": point.offset,
-                 **{f"mu{c}": mu for c, mu in enumerate(point.mus)}, **{f"b{c}": b for c, b in enumerate(columns)},
-                 **{f"nu{f}": nu for f, nu in enumerate(point.nus)},
-                 **{f"e{f}": point.e[:, f] for f in range(point.e.shape[1])}}
-        for i, one in enumerate(self.latent):
-            parts[f"c{i}"] = point.cs[i]
-            parts[f"g{i}"] = np.concatenate([point.Ez[: self.n * one.feeds, i], point.Fz[: self.l * one.direct, i]])
-            inputs = point.Dz[i, : self.expansion.m * one.moved]
-            parts[f"z{i}"] = np.concatenate([point.Cz[i], inputs, point.offset_z[i : i + 1]])
-        return np.concatenate([*(np.ravel(parts[name]) for name in self.slices), np.ravel(point.x0)]).astype(float)
+        parts = [view.ravel() for views in self._views(point).values() for view in views]
+        return np.concatenate([*parts, point.x0.ravel()]).astype(float)
 
     def unpack(self, x: Array) -> StatePoint:
         """Return the point of a vector."""
-        part = self.parts(x)
-        n, outputs, m, s = self.n, self.l, self.expansion.m, len(self.expansion.feedback)
-        b, d, k = np.zeros((n, m)), np.zeros((outputs, m)), len(self.latent)
-        for c, direct in enumerate(self.feedthrough):
-            b[:, c] = part[f"b{c}"][:n]
-            if direct:
-                d[:, c] = part[f"b{c}"][n:]
-        Ez, Fz, Cz, Dz, constants = np.zeros((n, k)), np.zeros((outputs, k)), np.zeros((k, n)), np.zeros((k, m)), []
-        for i, one in enumerate(self.latent):
-            row = part[f"z{i}"] if one.row is None else one.row
-            Cz[i], Dz[i, : row.size - n - 1] = row[:n], row[n:-1]
-            constants.append(row[-1])
-            if one.feeds:
-                Ez[:, i] = part[f"g{i}"][:n]
-            if one.direct:
-                Fz[:, i] = part[f"g{i}"][n * one.feeds :]
-            elif one.output >= 0:
-                Fz[one.output, i] = 1.0
-        return StatePoint(
-            part["A"], part.get("C", np.zeros((outputs, n))), part.get("K", np.zeros((n, outputs))),
-            part.get("offset", np.zeros(outputs)), tuple(part.get(f"mu{c}", np.ones(1)) for c in range(m)), b, d,
-            tuple(part.get(f"nu{f}", np.ones(1)) for f in range(s)),
-            np.column_stack([part[f"e{f}"] for f in range(s)]) if s else np.zeros((n, 0)),
-            x[self.shared :].reshape(self.experiments, n),
-            tuple(part.get(f"c{i}", np.ones(one.size)) for i, one in enumerate(self.latent)), Ez, Fz, Cz, Dz,
-            np.array(constants))
+        return self._filled(self._known(), x)
+
+    def _filled(self, point: StatePoint, x: Array) -> StatePoint:
+        """Write a vector into a point."""
+        at = 0
+        for view in (view for views in self._views(point).values() for view in views):
+            view[...] = x[at : at + view.size].reshape(view.shape)
+            at += view.size
+        point.x0[...] = x[at:].reshape(point.x0.shape)
+        return point
 
     def similarity(self, x: Array) -> Array:
-        """Return orthonormal directions (n^2, shared) of theta that a change of the states moves it along."""
-        point, n = self.unpack(x), self.n
-        at, directions = self.slices, np.zeros((n * n, self.shared))
-        for row, (i, j) in enumerate(np.ndindex(n, n)):
-            one = np.zeros((n, n))
-            one[i, j] = 1.0
-            to = directions[row]
-            to[at["A"]] = (one @ point.A - point.A @ one).ravel()
-            if "C" in at:
-                to[at["C"]] = -(point.C @ one).ravel()
-            if "K" in at:
-                to[at["K"]] = (one @ point.K).ravel()
-            for c in range(point.b.shape[1]):
-                to[at[f"b{c}"]][:n] = one @ point.b[:, c]
-            for f in range(point.e.shape[1]):
-                to[at[f"e{f}"]] = one @ point.e[:, f]
-            for k, latent in enumerate(self.latent):
-                if latent.row is None:
-                    to[at[f"z{k}"]][:n] = -point.Cz[k] @ one
-                if latent.feeds:
-                    to[at[f"g{k}"]][:n] = one @ point.Ez[:, k]
-        return directions
+        """Return directions (n^2, shared) of theta that a change of the states moves it along."""
+        point, nothing, found = self.unpack(x), self._known(), []
+        for place in np.ndindex(self.n, self.n):
+            one = np.zeros((self.n, self.n))
+            one[place] = 1.0
+            moved = replace(nothing, A=one @ point.A - point.A @ one, C=-point.C @ one, K=one @ point.K,
+                            b=one @ point.b, e=one @ point.e, Ez=one @ point.Ez, Cz=-point.Cz @ one)
+            found.append(self.pack(moved)[: self.shared])
+        return np.array(found).reshape(-1, self.shared)
 
-    def places(self, parts: Parts) -> Places:
-        """Return where every part stands behind the n columns of the initial state; ``parts`` are those of a model."""
-        n, m, x = self.n, self.expansion.m, self.expansion
+    @cached_property
+    def signals(self) -> dict[str, NDArray[np.intp]]:
+        """Columns of the signals that multiply unknowns, by name and in order.
 
-        def first(name: str, shift: int = 0, here: bool = True) -> int:
-            return n + self.slices[name].start + shift if here and name in self.slices else -1
+        They are the states "x", the innovations "e", the values "f", "g" and "w" of the functions of inputs, of outputs
+        and of latent signals, the constant "1", their basis functions "eta", "zeta" and "phi", and the arguments
+        [x, u, 1] of every latent function times its slope.
+        """
+        x, k = self.expansion, len(self.latent)
+        sizes = {"x": self.n, "e": self.l, "f": x.m, "g": len(x.feedback), "w": k, "1": 1, "eta": x.p, "zeta": x.q,
+                 "phi": sum(one.size for one in self.latent), "arguments": k * (self.n + x.m + 1)}
+        ends = np.cumsum(list(sizes.values()))
+        return {name: np.arange(end - size, end) for (name, size), end in zip(sizes.items(), ends)}
 
-        def listed(places: list[int]) -> np.ndarray:
-            return np.array(places, dtype=np.int64)
+    @cached_property
+    def _columns(self) -> StatePoint:
+        """The number of every unknown behind the n columns of the initial state, at its place; below zero: known."""
+        numbers = self._known()
+        for value in vars(numbers).values():
+            for array in value if isinstance(value, tuple) else (value,):
+                array[...] = -np.inf
+        return self._filled(numbers, np.arange(self.n, self.n + self.size, dtype=float))
 
-        def ends(sizes: list[int]) -> np.ndarray:
-            return np.cumsum([0, *sizes]).astype(np.int64)
+    def direct(self, point: StatePoint) -> Direct:
+        """Return what every unknown changes directly; the n columns of the initial state come first."""
+        gains = np.concatenate([np.ones(1), point.d.ravel(), point.b.ravel(), point.e.ravel()])
+        return self._direct._replace(gain=gains[self._direct.gain.astype(int)])
 
-        inputs, families = range(m), range(len(x.feedback))
-        latent = list(enumerate(self.latent))
-        return Places.none(parts)._replace(
-            A=first("A"), C=first("C"), K=first("K"), offset=first("offset"),
-            mu=listed([first(f"mu{c}") for c in inputs]), b=listed([first(f"b{c}") for c in inputs]),
-            d=listed([first(f"b{c}", n, direct) for c, direct in enumerate(self.feedthrough)]),
-            functions=ends([*x.input_sizes]), nu=listed([first(f"nu{f}") for f in families]),
-            e=listed([first(f"e{f}") for f in families]), coordinates=ends([family.size for family in x.feedback]),
-            c=listed([first(f"c{i}") for i, _ in latent]),
-            ez=listed([first(f"g{i}", 0, one.feeds) for i, one in latent]),
-            fz=listed([first(f"g{i}", n * one.feeds, one.direct) for i, one in latent]),
-            cz=listed([first(f"z{i}") for i, _ in latent]),
-            dz=listed([first(f"z{i}", n, one.moved) for i, one in latent]),
-            oz=listed([first(f"z{i}", n + m * one.moved) for i, one in latent]),
-            members=ends([one.size for _, one in latent]))
+    @cached_property
+    def _direct(self) -> Direct:
+        """What `direct` returns, with the numbers of the gains [1, d, b, e] of a point in place of them."""
+        at, signals = self._columns, self.signals
+        states, outputs, latent = (np.arange(count)[:, None] for count in (self.n, self.l, len(self.latent)))
+        mu, nu, c = (np.concatenate([np.zeros(0), *of]) for of in (at.mus, at.nus, at.cs))
+        d, b, e = at.d.size, at.b.size, at.e.size
+
+        def named(*names: str) -> Any:
+            return np.concatenate([signals[name] for name in names])
+
+        def repeated(gains: Any, of: Sequence[Array]) -> Any:
+            return np.repeat(gains, [one.size for one in of], axis=1)
+
+        rows = np.hstack([at.Cz, at.Dz, at.offset_z[:, None]])
+        return Direct.of(
+            [(latent, rows, signals["arguments"].reshape(rows.shape), 0),
+             (repeated(latent.T, at.cs), c, signals["phi"], 0)],
+            [(outputs, np.hstack([at.C, at.d, at.Fz, at.offset[:, None]]), named("x", "f", "w", "1"), 0),
+             (outputs, mu, signals["eta"], repeated(1 + np.arange(d).reshape(at.d.shape), at.mus))],
+            [(states, np.hstack([at.A, at.K, at.b, at.e, at.Ez]), named("x", "e", "f", "g", "w"), 0),
+             (states, mu, signals["eta"], repeated(1 + d + np.arange(b).reshape(at.b.shape), at.mus)),
+             (states, nu, signals["zeta"], repeated(1 + d + b + np.arange(e).reshape(at.e.shape), at.nus))])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
@@ -274,8 +274,7 @@ def noise_test(
         DataError: innovations that are not finite, or too few draws for so rare an alarm.
         StructureError: as `noise_search`.
     """
-    if not 0 < false_alarm < 1:
-        raise StructureError(f"false_alarm={false_alarm!r}; a probability between 0 and 1 is needed.")
+    check_probability(false_alarm, "false_alarm")
     if false_alarm * (draws if healthy is None else healthy.size) < 10:
         raise DataError(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "

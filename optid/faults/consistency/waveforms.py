@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.data.record import Data
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.screening import FlatLine, flat_lines
@@ -254,8 +254,7 @@ def _check(found: Dictionary, whitened: Whitened, probability: float, onset: int
     if not isinstance(whitened, Whitened):
         raise StructureError(
             "The waveform test takes the whitened innovations of one experiment: test them one by one.")
-    if not 0 < probability < 1:
-        raise StructureError(f"probability={probability!r}; a number between 0 and 1 is needed.")
+    check_probability(probability, "probability")
     if whitened.r.shape[1] != found.model.l:
         raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
     if found.model.l < 2:

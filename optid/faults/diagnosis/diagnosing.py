@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import check_integer
+from optid.arrays import check_integer, check_probability
 from optid.errors import StructureError, nearest
 from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
 from optid.faults.nuisance import uncertain_start
@@ -47,8 +47,7 @@ class Question:
 
     def __post_init__(self) -> None:
         for word, value in (("false_alarm", self.false_alarm), ("coverage", self.coverage)):
-            if not 0 < value < 1:
-                raise StructureError(f"{word}={value!r}; a probability between 0 and 1 is needed.")
+            check_probability(value, word)
         if self.method not in METHODS:
             raise StructureError(f"method={self.method!r}. {nearest(str(self.method), METHODS)}")
         check_integer(self.max_faults, "max_faults")

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults.rank.order_power import Positions, coefficients, least_order
@@ -251,11 +251,9 @@ def hard_over_test(
         DataError: records with other channels.
         RankError: a record shorter than a window, or a healthy record that does not excite the inputs.
     """
-    if instruments not in INSTRUMENTS:
-        raise StructureError(f"instruments={instruments!r}: use one of {', '.join(INSTRUMENTS)}.")
+    one_of("instruments", instruments, INSTRUMENTS)
     check_integer(block_rows, "block_rows", 2)
-    if not 0 < level < 1:
-        raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
+    check_probability(level, "level")
     data, healthy = data.raw(), healthy.raw()
     if (data.inputs, data.outputs) != (healthy.inputs, healthy.outputs):
         raise DataError(f"the healthy record has channels {', '.join((*healthy.inputs, *healthy.outputs))}, the other "

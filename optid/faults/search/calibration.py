@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.errors import DataError, StructureError
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signature_space import family_thresholds
@@ -86,8 +86,7 @@ def thresholds(
         DataError: too few draws for so rare an alarm, an input that is too short or has a missing sample.
         StructureError: a probability outside (0, 1), a window that is too short, no candidate with a signature.
     """
-    if not 0 < false_alarm < 1:
-        raise StructureError(f"false_alarm={false_alarm!r}; a probability between 0 and 1 is needed.")
+    check_probability(false_alarm, "false_alarm")
     if false_alarm * draws < EXCEEDING:
         raise DataError(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "

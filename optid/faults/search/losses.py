@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.errors import StructureError
 from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
@@ -181,8 +181,7 @@ def severity(
     """
     from scipy.special import chdtri
 
-    if not 0 < coverage < 1:
-        raise StructureError(f"coverage={coverage!r}; a probability between 0 and 1 is needed.")
+    check_probability(coverage, "coverage")
     best, c = bounded(scan, candidate, reach=reach), scan.index(candidate)
     onset, width = best.peak, float(chdtri(1, 1 - coverage))
     low, high = best.sizes[onset, 0], best.sizes[onset, 0]

@@ -12,14 +12,14 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.identify.arguments import one_of, per_channel
+from optid.identify.arguments import per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.compressed import Spread, white_spread

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, check_probability
 from optid.errors import RankError, StructureError
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
@@ -175,8 +175,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
         raise StructureError(f"Instruments, regressors and outputs must lie within the first {rows} block rows.")
     j = statistics.windows
     level = min(LEVEL, SPAN / j) if level is None else level
-    if not 0 < level < 1:
-        raise StructureError(f"level={level!r}: a probability between 0 and 1 is needed.")
+    check_probability(level, "level")
     if j <= 1.1 * z.size + y.size:
         raise RankError(f"{j} complete windows for {z.size} instruments and {y.size} outputs in the block rows: use a "
                         "longer record, fewer block rows or fewer basis functions.")

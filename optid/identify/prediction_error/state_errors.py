@@ -21,7 +21,7 @@ from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
 from optid.models.state_simulation import allowed_range
 from optid.statistics.linearised import Linearised, Method
-from optid.statistics.state_sensitivities import linearise_states, residuals, squares, weighted_rows
+from optid.statistics.state_sensitivities import StatePredictor
 from optid.statistics.state_unknowns import StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
@@ -70,14 +70,17 @@ class StateErrors(Criterion):
             return None
         return tuple(allowed_range([e.y], WILD) for e in self.data.experiments)
 
+    @cached_property
+    def _predictor(self) -> StatePredictor:
+        return StatePredictor(self.data, self.unknowns, self.at, self.weight, self.limits)
+
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
-        return linearise_states(self.data, self.unknowns, x, self.weight, self.at, self.gauge_rows(x),
-                                limits=self.limits, method=method)
+        return self._predictor.compress(x, self.gauge_rows(x), method)
 
     def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
         """Return what yields the weighted rows [sensitivities | errors] of an experiment."""
-        return weighted_rows(self.data, self.unknowns, x, self.weight, self.at, self.limits)
+        return self._predictor.blocks(x)
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""
@@ -102,11 +105,11 @@ class StateErrors(Criterion):
 
     def value(self, x: Array) -> float:
         """Return the weighted sum of squared errors."""
-        return squares(self.data, self.unknowns, x, self.weight, self.at, self.limits)
+        return self._predictor.squares(x)
 
     def residuals(self, x: Array) -> list[Array]:
         """Return the errors (N, l) of every experiment."""
-        return residuals(self.data, self.unknowns, x, self.at, self.limits)
+        return self._predictor.residuals(x)
 
     def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.

@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.bases import Linear, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
-from optid.identify.arguments import enough_rows, one_of, one_output, outputs_present, per_channel
+from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel
 from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import noise_filter, roots

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.bases import fitted_bases, from_dict, parse
 from optid.bases.basis import Basis
 from optid.data.channels import channel_fields, listed, sampling_time
@@ -267,8 +267,7 @@ class RecursiveARX(SavedState):
             RankError: as `theta`.
             StructureError: unknown split or gauge.
         """
-        if split not in SPLITS:
-            raise StructureError(f"split={split!r}: use one of {', '.join(map(repr, SPLITS))}.")
+        one_of("split", split, SPLITS)
         layout, theta = self.layout, self.theta
         core = lifted_problem(self.statistics, positions(layout)).core
         pairs = leading_pairs(core, theta_matrices(theta, layout), split == "whitened")

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.bases import Linear, UserFunctions, feedback_bases, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.identify.arguments import one_of
 from optid.identify.subspace.projection import WEIGHTINGS
 from optid.program.units import in_units, inner_bases, own_units
 from optid.solving.solve import Evidence, Procedure

@@ -116,9 +116,8 @@ def lagged_products(first: Sequence[Array], second: Sequence[Array], lags: Seque
     """
     sums, counts = np.zeros(len(lags)), np.zeros(len(lags))
     for a, b in zip(first, second):
-        here_a, here_b = ~np.isnan(a), ~np.isnan(b)
-        a, b = np.where(here_a, a, 0.0), np.where(here_b, b, 0.0)
-        marks_a, marks_b = here_a.astype(float), here_b.astype(float)
+        marks_a, marks_b = ((~np.isnan(signal)).astype(float) for signal in (a, b))
+        a, b = np.nan_to_num(a), np.nan_to_num(b)
         for i, lag in enumerate(lags):
             now = slice(max(lag, 0), len(a) + min(lag, 0))
             past = slice(max(-lag, 0), len(b) + min(-lag, 0))

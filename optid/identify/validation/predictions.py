@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
 from optid.models.functions import has_feedback
 from optid.registry import render
@@ -34,7 +34,7 @@ def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
     Raises:
         StructureError: a horizon that is not a positive integer.
     """
-    return _as_list(model.predict(data, horizon))
+    return as_list(model.predict(data, horizon))
 
 
 def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
@@ -49,7 +49,7 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
     Raises:
         DataError: a missing input, or a simulation that leaves the range of the data.
     """
-    return _as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
+    return as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,8 @@ def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
         word: "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
     """
     raw = data.raw()
-    if word == ONE_STEP:
-        return common_fits(raw, [one_step(model, raw)])[0]
-    return common_fits(raw, [simulated_or_nan(model, raw, word)])[0]
+    found = one_step(model, raw) if word == ONE_STEP else simulated_or_nan(model, raw, word)
+    return common_fits(raw, [found])[0]
 
 
 def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
@@ -179,7 +178,3 @@ def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None
             raise DataError(f"no sample can be predicted {h} samples ahead; use shorter horizons")
     fits = common_fits(raw, [*ahead, simulated_or_nan(model, raw)])
     return HorizonCurve(raw.outputs, tuple(chosen), fits[:-1], fits[-1])
-
-
-def _as_list(arrays: Any) -> list[Array]:
-    return list(arrays) if isinstance(arrays, list | tuple) else [arrays]
