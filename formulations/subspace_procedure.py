@@ -10,8 +10,6 @@ import warnings
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from formulations.constraints.poles import stable
 from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
@@ -67,5 +65,5 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
         said += "; for this (A, C) the coefficients are proved optimal"
     form = step.form
     bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / unit, block_rows,
-                             said, not np.any(form.gain) and not step.instrumented)
+                             said, not form.injected and not form.extra)
     return replace(bound, value=unit * bound.value)

@@ -164,8 +164,8 @@ def test_instruments_are_two_stage_least_squares():
     rng = np.random.default_rng(3)
     records = [np.hstack([record, rng.uniform(-1, 1, (len(record), 2))]) for record in records_of(rng, [90, 70])]
     expansion = expansion_of(records).with_simulated()
-    form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2))
-    step = observer_problem(records, form, instruments=True)
+    form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2), instrumented=True)
+    step = observer_problem(records, form)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])
@@ -173,7 +173,7 @@ def test_instruments_are_two_stage_least_squares():
     z = np.concatenate([columns(form, record, e)[0].reshape(-1, form.size) for e, record in enumerate(swapped)])
     projected = z @ np.linalg.lstsq(z, phi, rcond=None)[0]
     np.testing.assert_allclose(step.least_squares(), np.linalg.lstsq(projected, y, rcond=None)[0], atol=1e-7)
-    assert step.instrumented
+    assert form.extra
 
 
 def test_what_the_record_does_not_determine_is_named():

@@ -198,17 +198,10 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit
     columns = positions(layout)
-    rows = None if prior == "none" else _prior_rows(prior, statistics, columns)
+    rows = None
+    if prior != "none":
+        from optid.identify.equation_error.priors import likeliest
+
+        rows = likeliest(prior, statistics).rows(columns)
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
-
-
-def _prior_rows(word: str, statistics: Statistics, columns: np.ndarray) -> np.ndarray:
-    """Rows on z, those of every output below one another."""
-    from optid.identify.equation_error.priors import likeliest
-
-    prior = likeliest(word, statistics)
-    found = np.zeros((prior.columns.size * columns.shape[1], columns.size))
-    for o, rows in enumerate(np.split(found, columns.shape[1])):
-        rows[:, columns[prior.columns, o]] = prior.rows(o)
-    return found

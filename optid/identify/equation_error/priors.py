@@ -6,7 +6,7 @@ variance of the noise, maximise the likelihood of the outputs with all coefficie
 flat prior. The triangular factor of the record is all that this needs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -65,10 +65,17 @@ class Prior:
     covariance: Array
     noise: Array
 
-    def rows(self, output: int) -> Array:
-        """Return rows (n, n) W: ``‖W theta‖²`` is what it adds to the squared errors of an output."""
-        root = np.linalg.cholesky(self.covariance)
-        return np.sqrt(self.noise[output]) * solve_triangular(root, np.eye(len(root)), lower=True)
+    def rows(self, places: np.ndarray) -> Array:
+        """Return the rows that the prior adds to the least squares in z, those of every output below one another.
+
+        Args:
+            places: (n_columns, l) position in z of every coefficient of the regressor.
+        """
+        inverse = solve_triangular(np.linalg.cholesky(self.covariance), np.eye(self.columns.size), lower=True)
+        found = np.zeros((self.noise.size, self.columns.size, places.size))
+        for rows, variance, own in zip(found, self.noise, places[self.columns].T):
+            rows[:, own] = np.sqrt(variance) * inverse
+        return found.reshape(-1, places.size)
 
 
 def families(layout: Layout) -> list[list[np.ndarray]]:
@@ -129,13 +136,10 @@ def likeliest(word: str, statistics: Statistics) -> Prior:
                 np.sum(rest[:, o] ** 2)) / noise
         return float(total) / statistics.rows
 
-    words = ["size", "decay", "correlation"][:each] * len(groups) + ["noise"] * layout.l
-    ends = [minimize(unlikelihood, _start(words, *start), method="L-BFGS-B", bounds=[BOUNDS[w] for w in words])
-            for start in product(DECAYS, NOISES)]
+    words, ends = ["size", "decay", "correlation"][:each] * len(groups) + ["noise"] * layout.l, []
+    for decay, noise in product(DECAYS, NOISES):
+        values = {"size": 1.0, "decay": decay, "correlation": 0.7, "noise": noise}
+        ends.append(minimize(unlikelihood, np.array([values[word] for word in words]), method="L-BFGS-B",
+                             bounds=[BOUNDS[word] for word in words]))
     x = min(ends, key=lambda end: end.fun).x
     return Prior(columns, covariance(x), np.exp(x[each * len(groups) :]) * energy)
-
-
-def _start(words: Sequence[str], decay: float, noise: float) -> Array:
-    values = {"size": 1.0, "decay": decay, "correlation": 0.7, "noise": noise}
-    return np.array([values[word] for word in words])

@@ -65,8 +65,6 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
                    **structure: Any) -> Program | Procedure:
     """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
 
-    The other losses leave out the rows that hold a wild reading of an output.
-
     Args:
         loss: see `parse_loss`.
         data: the record.
@@ -138,11 +136,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
 
 
 class _Rows:
-    """The rows of a record without those that hold a wild reading of an output.
-
-    Such a reading spoils the row in which it is the output and, far worse, those in which it is a past output: their
-    leverage grows with it, so that no loss of the residuals alone bounds its influence. It is treated as missing.
-    """
+    """The rows of a record without those that hold a wild reading of an output, now or among its past outputs."""
 
     def __init__(self, data: Data, layout: Layout) -> None:
         self._data, self._layout = data, layout

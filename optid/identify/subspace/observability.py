@@ -207,10 +207,9 @@ class Observability:
         # noise of one size at all outputs, which are in units of their own: what states hardly explain counts as noisy
         level = float(np.mean(np.sum(c**2, axis=1))) * np.eye(len(c))
         gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
-        form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / self.scale)
         coloured = instruments and expansion.simulated and not plan.instruments.endswith("past")
-        return observer_problem(records, form, instruments=coloured,
-                                targets=[record[:, plan.data.m :] for record in plan.records])
+        form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / self.scale, coloured)
+        return observer_problem(records, form, [record[:, plan.data.m :] for record in plan.records])
 
     def model(self) -> HammersteinSS:
         """Return the least-squares model, for comparisons: no constraints, A contracted.

@@ -15,7 +15,7 @@ from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import RankError
-from optid.identify.subspace.regressors import ObserverForm, Regressors
+from optid.identify.subspace.regressors import ObserverForm
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import Expansion
 from optid.statistics.factors import add_to_root
@@ -32,14 +32,12 @@ class Realisation:
         form: the layout.
         problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
         rows: equations used.
-        instrumented: whether the normal equations are those of instruments.
         factored: whether channels are rank one in the programme itself.
     """
 
     form: ObserverForm
     problem: RankOne
     rows: int
-    instrumented: bool = False
     factored: bool = False
 
     def least_squares(self) -> Array:
@@ -120,29 +118,26 @@ class Realisation:
         return replace(found, gauge="norm") if any(basis.size > 1 for basis in x.inputs) else found
 
 
-def observer_problem(records: Sequence[Array], form: ObserverForm, *, instruments: bool = False,
-                     targets: Sequence[Array] | None = None) -> Realisation:
+def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequence[Array] | None = None
+                     ) -> Realisation:
     """Compress the step.
 
     Args:
         records: raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one per experiment; NaN = missing.
         form: what is known.
-        instruments: take the feedback functions of the simulated outputs as instruments for those of the measured ones
-            (two-stage least squares); the expansion must contain both. For noise that is fed back and not white.
         targets: measured outputs (N, l), one per experiment, NaN = missing, where those of the records are partly
             estimated: feedback and observer read the estimates, which are no equations.
 
     Raises:
         RankError: fewer equations than unknowns.
     """
-    regressors = Regressors(form, instruments)
-    extra, own = regressors.extra, slice(form.experiments * form.n, None)
+    x, extra, own = form.expansion, form.extra, slice(form.experiments * form.n, None)
     total = form.size + extra
     root, rows, energy = np.zeros((total + 1, total + 1)), 0, 0.0
     for e, record in enumerate(records):
-        y = record[:, regressors.outputs] if targets is None else targets[e]
-        for i, (start, stop) in enumerate(runs_of(~np.isnan(record[:, regressors.needed]).any(axis=1))):
-            part, used, squares = regressors.compress(record[start:stop], y[start:stop])
+        y = record[:, x.m : x.m + x.l] if targets is None else targets[e]
+        for i, (start, stop) in enumerate(runs_of(~np.isnan(record[:, form.needed]).any(axis=1))):
+            part, used, squares = form.compress(record[start:stop], y[start:stop])
             rows += used
             energy += squares
             if i == 0:
@@ -160,7 +155,7 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, *, instrument
         root = add_to_root(np.zeros((size + 1, size + 1)), root[:size, np.r_[: size - extra, size : total + 1]])
     problem = RankOne(root[:size, :size], root[:size, size], float(root[size, size] ** 2), form.blocks, form.linear,
                       energy)
-    return Realisation(form, problem, rows, bool(extra))
+    return Realisation(form, problem, rows)
 
 
 def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:

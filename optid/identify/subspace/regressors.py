@@ -11,7 +11,7 @@ matrices take the place of a loop over samples; time is the last axis, so that e
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class ObserverForm:
         feedthrough: whether every input acts on the outputs at once.
         offset: whether there is a constant d.
         weights: (l,) by which the residuals are multiplied.
+        instrumented: whether feedback functions of simulated outputs are instruments for those of the measured ones
+            (two-stage least squares), for noise that is fed back and not white; the expansion must contain both.
     """
 
     a: Array
@@ -62,6 +64,7 @@ class ObserverForm:
     feedthrough: tuple[bool, ...]
     offset: bool
     weights: Array
+    instrumented: bool = False
 
     @property
     def n(self) -> int:
@@ -107,6 +110,86 @@ class ObserverForm:
             named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
         return named
 
+    @property
+    def extra(self) -> int:
+        """Number of instruments, as many as entries of all E_o; zero where there are none."""
+        return self.n * self.expansion.q * self.instrumented
+
+    @cached_property
+    def injected(self) -> bool:
+        """Whether the gain feeds measured outputs back."""
+        return bool(np.any(self.gain))
+
+    @property
+    def needed(self) -> np.ndarray:
+        """Which raw channels must be present."""
+        x = self.expansion
+        return np.repeat([True, x.q > 0 or self.injected, self.instrumented], [x.m, x.l, x.l * x.simulated])
+
+    def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
+        """Return the triangular factor of the equations of a run, how many there are, and the outputs' energy.
+
+        The columns are [x0 | d | Theta of the inputs | E simulated | E], then the target.
+        Many equations enter by their Gram matrix, unless its condition would cost digits.
+        """
+        given = (self.weights * target)[~np.isnan(target)]
+        count = self.size - (self.experiments - 1) * self.n + self.extra
+        root = np.zeros((count + 1, count + 1))
+        if given.size > MANY * len(root):
+            root = root_of_gram(sum((part @ part.T for part in self._weighted(run, target)), root), count)
+        if not conditioning(root) <= CONDITION_LIMIT:
+            parts = (part.T for part in self._weighted(run, target))
+            root = reduce(add_to_root, parts, np.zeros((count + 1, count + 1)))
+        return root, given.size, float(given @ given)
+
+    def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
+        """Yield the weighted equations (size + 1, K), some samples of one output at a time."""
+        x = self.expansion
+        chunk = min(CHUNK, max(64, HELD // (self.l * self.n * (x.p + 2 * x.q + self.l + 1))))
+        starts = range(0, len(run), chunk)
+        state = np.zeros((self.l, len(self._signals(run[:1])), self.n))
+        state[:, 0] = self.c  # C_o F^k, the effect of x0
+        responses = adjoint_responses(self.a - self.gain @ self.c, self.c, state,
+                                      (self._signals(run[start : start + chunk]) for start in starts))
+        for start, (signals, out) in zip(starts, responses):
+            y = target[start : start + chunk].T
+            for o in range(self.l):
+                rows = self._rows(o, signals, out[o], y[o])
+                rows *= self.weights[o]
+                present = ~np.isnan(y[o])
+                yield rows if present.all() else rows[:, present]
+
+    def _signals(self, raw: Array) -> Array:
+        """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
+        x = self.expansion
+        found, one = x(raw).T, np.ones((1, len(raw)))
+        parts = [0 * one, found[: x.p]]
+        if self.extra:
+            parts.append(found[x.zeta_simulated.start :])
+        parts.append(found[x.p : x.p + x.q])
+        if self.injected:
+            parts += [one, raw[:, x.m : x.m + x.l].T]
+        return np.concatenate(parts)
+
+    def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
+        """Return the equations of output o with their target, from the responses (d, n, T) to the signals."""
+        x, count = self.expansion, len(y)
+        p, target = x.p, y
+        offset, direct = np.zeros((x.l, count)), np.zeros((x.l, p, count))
+        offset[o], direct[o] = 1.0, signals[1 : 1 + p]
+        if self.injected:
+            past = len(signals) - 1 - x.l
+            offset -= self.gain.T @ out[past]
+            direct -= np.tensordot(self.gain.T, out[1 : 1 + p], (1, 1))
+            target = y - np.einsum("jit,ij->t", out[past + 1 :], self.gain)
+        parts, start = [out[0], offset] if self.offset else [out[0]], 0
+        feedback = [family.size for family in x.feedback] * (2 if self.extra else 1)
+        for size, feedthrough in zip([*x.input_sizes, *feedback], [*self.feedthrough, *[False] * len(feedback)]):
+            own = slice(start, start + size)
+            parts += [out[1:][own].transpose(1, 0, 2)] + [direct[:, own]] * feedthrough
+            start += size
+        return np.concatenate([part.reshape(-1, count) for part in [*parts, target]])
+
 
 def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterable[Array]
                       ) -> Iterator[tuple[Array, Array]]:
@@ -151,87 +234,3 @@ def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterabl
         found = found.reshape(l, d, n, -1)
         state = found[..., count]
         yield part, found[..., :count]
-
-
-class Regressors:
-    """Equations of one run: [x0 | d | Theta of the inputs | E simulated | E], as in the unknowns z, and the target.
-
-    Attributes:
-        extra: number of instruments, as many as entries of all E_o; zero where there are none.
-        size: number of unknowns and instruments.
-        needed: channels that must be present.
-    """
-
-    def __init__(self, form: ObserverForm, instruments: bool) -> None:
-        """Lay out the equations."""
-        self.form, x = form, form.expansion
-        self.injected = bool(np.any(form.gain))
-        self.extra = form.n * x.q if instruments else 0
-        self.size = form.size - (form.experiments - 1) * form.n + self.extra
-        self.outputs = slice(x.m, x.m + x.l)
-        self.needed = np.repeat([True, x.q > 0 or self.injected, instruments], [x.m, x.l, x.l * x.simulated])
-
-    def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
-        """Return the triangular factor of the equations of a run, how many there are, and the outputs' energy.
-
-        Many equations enter by their Gram matrix, unless its condition would cost digits.
-        """
-        given = (self.form.weights * target)[~np.isnan(target)]
-        root = np.zeros((self.size + 1, self.size + 1))
-        if given.size > MANY * len(root):
-            root = root_of_gram(sum((part @ part.T for part in self._weighted(run, target)), root), self.size)
-        if not conditioning(root) <= CONDITION_LIMIT:
-            parts = (part.T for part in self._weighted(run, target))
-            root = reduce(add_to_root, parts, np.zeros((self.size + 1, self.size + 1)))
-        return root, given.size, float(given @ given)
-
-    def _weighted(self, run: Array, target: Array) -> Iterator[Array]:
-        """Yield the weighted equations (size + 1, K), some samples of one output at a time."""
-        form = self.form
-        chunk = min(CHUNK, max(64, HELD // (form.l * form.n * (form.expansion.p + 2 * form.expansion.q + form.l + 1))))
-        starts = range(0, len(run), chunk)
-        state = np.zeros((form.l, len(self._signals(run[:1])), form.n))
-        state[:, 0] = form.c  # C_o F^k, the effect of x0
-        responses = adjoint_responses(form.a - form.gain @ form.c, form.c, state,
-                                      (self._signals(run[start : start + chunk]) for start in starts))
-        for start, (signals, out) in zip(starts, responses):
-            y = target[start : start + chunk].T
-            for o in range(form.l):
-                rows = self._rows(o, signals, out[o], y[o])
-                rows *= form.weights[o]
-                present = ~np.isnan(y[o])
-                yield rows if present.all() else rows[:, present]
-
-    def _signals(self, raw: Array) -> Array:
-        """Return [0 | eta | (zeta simulated |) zeta (| 1 | y)], the first without any effect but that of its state."""
-        x = self.form.expansion
-        found, one = x(raw).T, np.ones((1, len(raw)))
-        parts = [0 * one, found[: x.p]]
-        if self.extra:
-            parts.append(found[x.zeta_simulated.start :])
-        parts.append(found[x.p : x.p + x.q])
-        if self.injected:
-            parts += [one, raw[:, self.outputs].T]
-        return np.concatenate(parts)
-
-    def _rows(self, o: int, signals: Array, out: Array, y: Array) -> Array:
-        """Return the equations of output o with their target, from the responses (d, n, T) to the signals."""
-        form, x, count = self.form, self.form.expansion, len(y)
-        p, target = x.p, y
-        offset, direct = np.zeros((x.l, count)), np.zeros((x.l, p, count))
-        offset[o], direct[o] = 1.0, signals[1 : 1 + p]
-        if self.injected:
-            past = len(signals) - 1 - x.l
-            offset -= form.gain.T @ out[past]
-            direct -= np.tensordot(form.gain.T, out[1 : 1 + p], (1, 1))
-            target = y - np.einsum("jit,ij->t", out[past + 1 :], form.gain)
-        parts, start = [out[0], offset] if form.offset else [out[0]], 0
-        for size, feedthrough in zip(x.input_sizes, form.feedthrough):
-            own = slice(start, start + size)
-            parts += [out[1 + start : 1 + start + size].transpose(1, 0, 2), *([direct[:, own]] if feedthrough else [])]
-            start += size
-        sizes = [family.size for family in x.feedback]
-        for size in sizes * (2 if self.extra else 1):
-            parts.append(out[1 + start : 1 + start + size].transpose(1, 0, 2))
-            start += size
-        return np.concatenate([part.reshape(-1, count) for part in [*parts, target]])
