@@ -194,6 +194,7 @@ class _Collocation:
         shared[np.abs(shared) < LEAST] = LEAST
         start = errors.places.values(x)
         for label, course in zip(self.labels, courses):
-            for j, name in enumerate(self.equations.states):
-                start[f"states of {name}{label}"] = course[:, j]
+            for j, name in enumerate(self.equations.states):  # a run may pass a bound, where equations stay as they are
+                start[f"states of {name}{label}"] = np.clip(
+                    course[:, j], *(end / errors.usual[j] for end in self.equations.interval(name)))
         return start

@@ -12,6 +12,7 @@ import optid
 from optid import Data, Equations
 from optid.errors import DataWarning, LookupFailed, OptidError, RankError, StructureError
 from optid.examples import example
+from optid.identify.physical import PhysicalErrors
 
 pytestmark = pytest.mark.numerical
 
@@ -205,6 +206,14 @@ def test_models_are_saved_exported_and_run(tanks, tmp_path):
     assert other.static_gain(1.0) == pytest.approx(loaded.static_gain(1.0) * (loaded.parameters["lower"] / 0.2) ** 2)
     rest = (loaded.parameters["pump"] / loaded.parameters["lower"]) ** 2
     assert loaded.static_gain(1.0) == pytest.approx(2 * rest, rel=1e-6)
+
+
+def test_equations_are_written_as_by_hand():
+    def right(v):
+        return {"x": -v["a"] * (v["x"] - v["u"]) + 2 * cp.sqrt(v["x"] + 3) - (v["b"] * v["x"]) ** 2, "y": v["x"]}
+
+    errors = PhysicalErrors.of(record(50), Equations(right, {"x": 0.5}, {"a": 0.5, "b": 0.1}))
+    assert errors.in_words() == ("dx/dt = (-a) (x - u) + 2.0 sqrt(x + 3.0) - (b x)^2", "y = x")
 
 
 @pytest.mark.parametrize(

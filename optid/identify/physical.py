@@ -157,7 +157,7 @@ class PhysicalErrors(Criterion):
     def in_words(self) -> tuple[str, ...]:
         """Return the equations in words."""
         following = "d{}/dt" if self.steps else "{}(k+1)"
-        return tuple(f"{following.format(name) if name in self.equations.states else name} = {expression}"
+        return tuple(f"{following.format(name) if name in self.equations.states else name} = {_in_words(expression)}"
                      for name, expression in self._evaluated.items())
 
     def split(self, x: Array) -> tuple[Array, Array]:
@@ -311,6 +311,24 @@ class PhysicalErrors(Criterion):
                     f"the equation of {names[o]!r} has no value at the start, sample {k}: {at}. Roots and logarithms "
                     "need other starts, or bounds of the states that keep their arguments positive")
         return found
+
+
+def _in_words(expression: Any) -> str:
+    """Write an expression of scalars as one writes it by hand."""
+    name, args = type(expression).__name__, getattr(expression, "args", ())
+    if not args or name not in ("AddExpression", "NegExpression", "multiply", "MulExpression", "Power", "PowerApprox"):
+        return str(expression)
+    words = [_in_words(arg) for arg in args]
+    if name == "AddExpression":
+        return " + ".join(words).replace("+ -", "- ")
+    closed = [f"({text})" if type(arg).__name__ in ("AddExpression", "NegExpression") else text
+              for text, arg in zip(words, args)]
+    if name == "NegExpression":
+        return f"-{closed[0]}"
+    if name in ("multiply", "MulExpression"):
+        return " ".join(closed)
+    exponent = float(expression.p.value)
+    return f"sqrt({words[0]})" if exponent == 0.5 else f"{f'({words[0]})' if args[0].args else words[0]}^{exponent:g}"
 
 
 class CompressedPhysical(CompressedStates):

@@ -110,5 +110,5 @@ def response_pairs(model: Model) -> list[tuple[str, str]]:
     Where an input has several static functions there is one column for each of them, by its word.
     """
     words = [function.word for function in static_functions(model) if function.family == "nonlinearities"]
-    sources = model.inputs if len(words) == model.m else words
+    sources = words if len(words) > model.m else model.inputs
     return [(source, output) for output in model.outputs for source in sources]
