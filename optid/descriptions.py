@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
-_SHARED = re.compile(r"[Aa]rguments as in `(?:([\w.]+)\.)?(\w+)`")
+_SHARED = re.compile(r"[Aa]rguments as in\s+`(?:([\w.]+)\.)?(\w+)`")
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
