@@ -18,6 +18,7 @@ _HOME = {
     "program.solution": ["Status", "Solution", "Bound"],
     "solving.solve": ["solve"],
     "identify.fitting": ["fit", "resolve", "Fit"],
+    "identify.search": ["identify", "Identification"],
     "identify.selection": ["path", "fit_by_holdout"],
     "identify.validation": ["validate", "compare_models", "fit_by_horizon"],
     "identify.order": ["order", "OrderStudy"],

@@ -10,6 +10,7 @@ from optid.cli.comparing import ComparingCommand, compare
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.designing import design
 from optid.cli.diagnosing import diagnose
+from optid.cli.identifying import identify, search
 from optid.cli.isolability import isolability
 from optid.cli.monitoring import monitor
 from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Files, Report, Seed, reads_a_record
@@ -169,12 +170,16 @@ def fit(
         typer.Option("--model", "-m", metavar="FILE", rich_help_panel=RESULT, help="Write the model (JSON)."),
     ] = None,
 ) -> None:
-    """Fit a model to a record, prove it optimal, and report it.
+    """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
 
     Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
     --constraint monotone:increasing --report report.html
     """
     check_names(formulation, constraint, solver)
+    asked = (na, nb, nk, basis, loss, ridge, curvature, holdout, gauge, settings, option, time_limit, scheduler)
+    if data and formulation == DEFAULT and not stream and all(word is None for word in asked):
+        search(data, example, how, seed, split, test, constraint, solver, model, report, accuracy=accuracy)
+        return
     from optid.cli import arguments as words
 
     words.check_folders(model, report)
@@ -317,6 +322,7 @@ def examples() -> None:
     table()()
 
 
+app.command(cls=Command)(identify)
 app.command(cls=ComparingCommand)(compare)
 app.command(cls=Command)(design)
 app.command(cls=Command)(diagnose)

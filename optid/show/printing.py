@@ -31,7 +31,7 @@ def describe(fit: "Fit") -> str:
                 _rule("="),
                 f"No model: {word}",
                 _rule("="),
-                *_wrapped(sentence),
+                *wrapped(sentence),
                 "",
                 *_facts(summary.certificate_facts(fit)),
                 _rule("="),
@@ -61,11 +61,11 @@ def describe(fit: "Fit") -> str:
         lines += [_rule("-"), *set_table(noise)]
     if fit.prices:
         lines += [_rule("-"), *set_table(summary.constraint_table(fit))]
-    lines += [_rule("-"), *_wrapped(sentence)]
-    lines += _wrapped(
+    lines += [_rule("-"), *wrapped(sentence)]
+    lines += wrapped(
         "Solver: " + "; ".join(f"{name.lower()} {value}" for name, value in summary.solver_facts(fit)[1:])
     )
-    lines += [line for finding in fit.findings for line in _wrapped(f"Note: {finding}")]
+    lines += [line for finding in fit.findings for line in wrapped(f"Note: {finding}")]
     return "\n".join([*lines, _rule("=")])
 
 
@@ -74,7 +74,7 @@ def describe_checks(checked: "Validation") -> str:
     lines = [f"Validation on {checked.data}" if checked.data else "Validation"]
     for table in checks.validation_tables(checked):
         lines += [*set_table(table), ""]
-    return "\n".join([*lines[:-1], *(line for note in checked.notes for line in _wrapped(f"Note: {note}"))])
+    return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrapped(f"Note: {note}"))])
 
 
 def describe_horizons(curve: "HorizonCurve") -> str:
@@ -94,7 +94,8 @@ def _rule(sign: str) -> str:
     return sign * WIDTH
 
 
-def _wrapped(text: str, indent: str = "  ") -> list[str]:
+def wrapped(text: str, indent: str = "  ") -> list[str]:
+    """Break a sentence into lines of the page, those after the first indented."""
     return wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
 
 
@@ -117,7 +118,7 @@ def _equation(text: str) -> list[str]:
 def _facts(facts: Facts) -> list[str]:
     lines = []
     for name, value in facts:
-        lines += _wrapped(f"{name}: {value}")
+        lines += wrapped(f"{name}: {value}")
     return lines
 
 
@@ -139,11 +140,11 @@ def set_table(table: Table) -> list[str]:
     room = WIDTH - sum(widths) - len(widths)
     names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))
     gap = 2 if names + sum(widths) + 2 * len(widths) <= WIDTH else 1
-    lines = _wrapped(table.title)
+    lines = wrapped(table.title)
     for row in (table.head, *table.rows):
         cells = "".join(" " * gap + f"{cell:>{width}}" for cell, width in zip(row[1:], widths))
         if len(row[0]) > names:
             lines += [row[0], " " * names + cells]
         else:
             lines.append(f"{row[0]:<{names}}{cells}".rstrip())
-    return lines + (_wrapped(table.note) if table.note else [])
+    return lines + (wrapped(table.note) if table.note else [])

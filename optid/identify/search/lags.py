@@ -1,0 +1,152 @@
+"""Lags of autoregressions by the errors of blocks left out, exactly and at the cost of one pass over the record.
+
+The sums of products of a record without a block are those of the whole less those of the rows that touch the block:
+its own samples and as many after it as there are lags. All structures are columns of the largest one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.bases import Linear
+from optid.bases.basis import Basis
+from optid.data.record import Data
+from optid.errors import RankError
+from optid.identify.search.blocks import Blocks, Part
+from optid.statistics import Layout, Statistics, accumulate
+
+Places = NDArray[np.intp]
+
+ROWS_PER_COLUMN = 4
+RIDGE = 1e-12
+
+SHARP = 0.2
+"""Share of the errors' energy that the first lag with an effect must save for a delay to be taken for real."""
+
+SLIGHT = 0.05
+"""What all the lags before it may save together, as a share of that."""
+
+
+@dataclass(frozen=True)
+class Autoregression:
+    """Orders of an autoregression, with the mean squared error of one-step predictions of the blocks left out.
+
+    The error is in units of the variance of the outputs, a mean over them.
+    """
+
+    na: int
+    nb: int
+    nk: tuple[int, ...]
+    error: float
+
+
+class LagSums:
+    """Sums of products of lagged samples, of the whole record and of every block with what its rows reach.
+
+    Attributes:
+        layout: the largest structure.
+        whole: sums of the whole record.
+        blocks: by block, sums of the rows that touch it.
+    """
+
+    def __init__(self, blocks: Blocks, bases: tuple[Basis, ...], na: int = 8, lags: int = 16) -> None:
+        data = blocks.data
+        width, rows = sum(basis.size for basis in bases), data.n_samples
+        while na * data.l + lags * width + 1 > rows / ROWS_PER_COLUMN and na + lags > 3:
+            na, lags = max(na - 1, 1), max(lags - 2, 2)
+        self.data, self.layout = data, Layout(na, (lags,) * data.m, (0,) * data.m, bases, data.outputs, data.inputs)
+        self.whole = self._of([Part(i, 0, e.n_samples) for i, e in enumerate(data.experiments)])
+        reach = self.layout.first_row
+        self.blocks = [self._of([Part(p.experiment, max(p.first - reach, 0),
+                                      min(p.last + reach, data.experiments[p.experiment].n_samples)) for p in parts])
+                       for parts in blocks.parts]
+
+    def _of(self, parts: list[Part]) -> Statistics:
+        long = [p for p in parts if p.last - p.first > self.layout.first_row]
+        if not long:
+            raise RankError(f"no block is longer than {self.layout.first_row} lags")
+        return accumulate(Data.join(*(self.data.select(experiments=p.experiment).window(p.first, p.last)
+                                      for p in long)), self.layout)
+
+    def columns(self, na: int, nb: int, nk: tuple[int, ...]) -> Places:
+        """Return the columns of a smaller structure."""
+        past, lags = self.layout.na * self.data.l, self.layout.nb[0]
+        found, start = list(range(na * self.data.l)), past
+        for basis, delay in zip(self.layout.bases, nk):
+            first = start + min(delay, lags) * basis.size
+            found += range(first, min(first + nb * basis.size, start + lags * basis.size))
+            start += lags * basis.size
+        return np.array([*found, start], dtype=np.intp)
+
+    def error(self, na: int, nb: int, nk: tuple[int, ...]) -> float:
+        """Return the mean squared one-step error of the blocks that were left out of the fit, over the variances."""
+        columns, y = self.columns(na, nb, nk), self._targets
+        energy, rows = np.zeros(self.data.l), 0
+        for block in self.blocks:
+            theta = _solved(self.whole.gram - block.gram, columns, y)
+            both = np.concatenate([columns, y])
+            weights = np.vstack([-theta, np.eye(y.size)])
+            energy += np.einsum("ij,ik,kj->j", weights, block.gram[np.ix_(both, both)], weights)
+            rows += block.rows
+        return float(np.mean(energy / np.maximum(rows, 1) / self._variance))
+
+    @property
+    def _targets(self) -> Places:
+        return self.layout.n_columns + np.arange(self.data.l, dtype=np.intp)
+
+    @property
+    def _variance(self) -> Array:
+        gram, rows, y = self.whole.gram, max(self.whole.rows, 1), self._targets
+        variance = gram[y, y] / rows - (gram[self.layout.offset, y] / rows) ** 2
+        return np.maximum(variance, 1e-300)
+
+    def remainder(self, columns: Places) -> float:
+        """Return what least squares on some columns leaves of the outputs of the whole record, over the variances."""
+        gram, y = self.whole.gram, self._targets
+        theta = _solved(gram, columns, y)
+        rest = gram[y, y] - np.einsum("ij,ij->j", theta, gram[np.ix_(columns, y)])
+        return float(np.mean(np.maximum(rest, 0.0) / max(self.whole.rows, 1) / self._variance))
+
+
+def scan(sums: LagSums, delays: list[tuple[int, ...]]) -> list[Autoregression]:
+    """Compare autoregressions of all orders with some delays; the best of each delay first."""
+    layout = sums.layout
+    found = [Autoregression(na, nb, nk, sums.error(na, nb, nk)) for nk in delays for na in range(1, layout.na + 1)
+             for nb in range(1, min(layout.nb[0] - max(nk), 8) + 1)]
+    return sorted(found, key=lambda one: one.error)
+
+
+def sharp_delays(sums: LagSums) -> tuple[int, ...]:
+    """Return the delay of every input where one shows without doubt, 0 elsewhere.
+
+    Lags are taken away from the first on. A delay is sharp where the last of them saves much of the errors and all
+    before it next to nothing: on a slow input neighbouring lags stand in for one another, and no lag is missed.
+    """
+    layout, found = sums.layout, []
+    lags = layout.nb[0]
+    for c in range(layout.m):
+        others = tuple(0 for _ in range(layout.m))
+        rest = [sums.remainder(sums.columns(layout.na, lags, (*others[:c], k, *others[c + 1 :])))
+                for k in range(lags)]
+        saved = np.diff(np.log(np.maximum(rest, RIDGE)))
+        delay = int(np.argmax(saved)) if saved.size else 0
+        sharp = delay and saved[delay] >= SHARP and saved[:delay].sum() <= SLIGHT * saved[delay]
+        found.append(delay if sharp else 0)
+    return tuple(found)
+
+
+def linear(data: Data) -> tuple[Basis, ...]:
+    """Return the basis of a linear model for every input."""
+    return (Linear(),) * data.m
+
+
+def _solved(gram: Array, columns: Places, y: Places) -> Array:
+    """Solve the normal equations of some columns, scaled; directions without energy are left out."""
+    inner = gram[np.ix_(columns, columns)]
+    sizes = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+    values, vectors = np.linalg.eigh(inner / np.outer(sizes, sizes))
+    kept = values > RIDGE * values[-1]
+    right = vectors[:, kept].T @ (gram[np.ix_(columns, y)] / sizes[:, None])
+    return (vectors[:, kept] @ (right / values[kept, None])) / sizes[:, None]

@@ -1,0 +1,199 @@
+"""From a record to a model: structures of every class on trial, the choice among them, and its reasons."""
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import check_integer, one_of
+from optid.data.record import Data
+from optid.errors import DataError, RankError, SolverFailed, StructureError
+from optid.identify.fitting import Fit, fit
+from optid.identify.search.blocks import Blocks
+from optid.identify.search.ladder import CLEAR, KINDS, RUNGS, Ladder, gain
+from optid.identify.search.pool import Pool
+from optid.identify.search.trial import Candidate, Trial, tried
+from optid.registry import named_constraint, render
+
+SHARES: dict[str, float] = dict(zip(KINDS, (0.35, 0.6, 0.8, 1.0)))
+"""Share of the budget that has passed when a class of models has had its time."""
+
+RESERVED = 0.1
+"""Share of the budget that is kept for the fit of the choice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What `identify` found; `print` it.
+
+    Attributes:
+        fit: the chosen structure, fitted to the whole record.
+        chosen: its trial.
+        best: the best trial of every class that had one, by class.
+        trials: all of them, in the order in which they were made.
+        reasons: why this one, a sentence each.
+        horizon: samples ahead that were compared; None for the free run.
+        blocks: number of blocks.
+        stopped: what ended the search early, or "".
+        seconds: wall time.
+    """
+
+    fit: Fit
+    chosen: Trial
+    best: Mapping[str, Trial] = field(repr=False)
+    trials: tuple[Trial, ...] = field(repr=False)
+    reasons: tuple[str, ...] = field(repr=False)
+    horizon: int | None
+    blocks: int
+    stopped: str
+    seconds: float
+
+    @property
+    def model(self) -> Any:
+        """The model, in raw units."""
+        return self.fit.model
+
+    def __str__(self) -> str:
+        return render(self)
+
+
+def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
+             classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
+             accuracy: float = 1e-8, workers: int | None = None,
+             progress: Callable[[str], None] | None = None) -> Identification:
+    """Find a structure for a record by blocked cross-validation, and fit it.
+
+    Every structure is fitted to the record without one block after another, and simulates the block that was left out
+    from an initial state fitted to it. Classes of models follow each other from the simple to the rich; a richer one is
+    chosen only where the pooled fit improves and the median over the blocks of the log ratio of error energies exceeds
+    0.2. A model whose run leaves the range of the record in a block is never chosen. An interrupt (Ctrl-C) ends the
+    search with the best so far.
+
+    Args:
+        data: the record.
+        budget: seconds of the search.
+        horizon: compare predictions so many samples ahead; None compares free runs.
+        blocks: number of contiguous blocks.
+        classes: of "linear", "input functions", "feedback", "latent signals", those to be tried.
+        constraints: as of `optid.fit`; what cannot obey them is not chosen.
+        solver: the back end's word, for every programme.
+        accuracy: as of `optid.fit`.
+        workers: processes; None for one per processor that is free to use.
+        progress: is told a sentence after every trial.
+
+    Returns:
+        The model fitted to the whole record, with the table of what was tried and the reasons of the choice.
+
+    Raises:
+        DataError: not a record in memory.
+        RankError: a record too short for the blocks.
+        StructureError: arguments that cannot be.
+        SolverFailed: nothing could be fitted; with the most frequent reason.
+    """
+    clock = time.monotonic()
+    if not isinstance(data, Data):
+        raise DataError(f"identify takes optid.Data, not {type(data).__name__}: a search fits a record many times, in "
+                        "memory")
+    if not budget > 0:
+        raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
+    for word in classes:
+        one_of("classes", word, KINDS)
+    if horizon is not None:
+        check_integer(horizon, "horizon")
+    rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
+    cut = Blocks.of(data, blocks)
+    ladder, stopped = Ladder.of(cut), ""
+    end = clock + (1 - RESERVED) * budget
+    count = _processors() if workers is None else check_integer(workers, "workers")
+
+    def attempt(task: tuple[Candidate, Trial | None, float]) -> Trial:
+        candidate, rival, deadline = task
+        return tried(candidate, cut, rival, {"solver": solver, "accuracy": accuracy}, rules, horizon, deadline)
+
+    pool = Pool(attempt, count)
+    try:
+        for kind in (kind for kind in KINDS if kind in classes):
+            limit = clock + SHARES[kind] * (end - clock)
+            if not _climb(ladder, kind, pool, limit, end, partial(_told, ladder, progress, clock)):
+                stopped = f"the budget of {budget:g} s"
+    except KeyboardInterrupt:
+        stopped = "an interrupt"
+    finally:
+        pool.close()
+    best = {kind: trial for kind in KINDS if (trial := ladder.best(kind)) is not None}
+    chosen = ladder.choice()
+    if chosen is None:
+        raise _nothing(ladder)
+    found = fit(data, chosen.candidate.formulation, solver=solver, accuracy=accuracy, constraints=rules,
+                **chosen.candidate.arguments)
+    return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(reasons(ladder, best, chosen)),
+                          horizon, blocks, stopped, time.monotonic() - clock)
+
+
+def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told: Callable[[Trial], None]) -> bool:
+    """Try the candidates of a class until there are no more, or its time is over, which returns False."""
+    rung = RUNGS[kind](ladder)
+    batch = next(rung, None)
+    while batch is not None:
+        if time.monotonic() > limit:
+            return False
+        fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
+        rival = ladder.rival(kind)
+        for candidate, trial in zip(fresh, pool.run([(c, rival, limit) for c in fresh], end, told)):
+            ladder.trials[candidate.key] = Trial(candidate, reason="out of time") if trial is None else trial
+        try:
+            batch = rung.send([ladder.trials[c.key] for c in batch])
+        except StopIteration:
+            batch = None
+    return True
+
+
+def reasons(ladder: Ladder, best: Mapping[str, Trial], chosen: Trial) -> list[str]:
+    """Say of every class why it was taken or left."""
+    found: list[str] = []
+    current: Trial | None = None
+    for kind, trial in best.items():
+        if current is None:
+            found.append(f"{kind}: {trial.score:.1f} % by cross-validation")
+            current = trial
+            continue
+        saved = gain(current, trial)
+        amount = f"{trial.score:.1f} % against {current.score:.1f} %"
+        median = f"{100 * (1 - np.exp(-saved)):.0f} % of the error energy in the median block"
+        if trial.score > current.score and saved > CLEAR:
+            found.append(f"{kind}: {amount}, and saves {median}: taken")
+            current = trial
+        elif trial.score > current.score:
+            found.append(f"{kind}: {amount}, but saves {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: left")
+        else:
+            found.append(f"{kind}: {amount}: left")
+    for kind in KINDS:
+        if kind not in best and any(t.candidate.kind == kind for t in ladder.trials.values()):
+            several = [t for t in ladder.trials.values() if t.candidate.kind == kind]
+            found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
+                         f"(first: {several[0].reason})")
+    return found
+
+
+def _told(ladder: Ladder, progress: Callable[[str], None] | None, clock: float, trial: Trial) -> None:
+    if progress is not None:
+        outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
+        progress(f"{time.monotonic() - clock:.0f} s, {trial.candidate.kind}: {trial.candidate.formulation} "
+                 f"{trial.candidate.words}: {outcome}")
+
+
+def _nothing(ladder: Ladder) -> Exception:
+    trials = list(ladder.trials.values())
+    if not trials:
+        return RankError("no structure could be tried: the budget was over before the first")
+    words = [t.reason for t in trials]
+    common = max(set(words), key=words.count)
+    return SolverFailed(f"none of {len(trials)} structures could be fitted and cross-validated; most often: {common}")
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
