@@ -113,6 +113,9 @@ def coloured(text: str) -> Text:
     result.highlight_regex(r"(?m)^\S.*(?=\n[-=─═]{3})", "bold")
     result.highlight_regex(r"(?m)^[-=─═]{3,}$", "dim")
     result.highlight_regex(r"\boptimal \(proved\)", "bold green")
+    result.highlight_regex(r"(?m)^The model on this record: (good|fair)$", "bold green")
+    result.highlight_regex(r"(?m)^The model on this record: poor$", "bold yellow")
+    result.highlight_regex(r"(?m)^The model on this record: useless$|\bFAIL$", "bold red")
     result.highlight_regex(r"\b(locally optimal|inaccurate|limit) \(not proved\)", "bold yellow")
     return result
 

@@ -121,6 +121,34 @@ class Fit:
 
         return uncertainty(self)
 
+    @cached_property
+    def verdict(self) -> Any:
+        """What the model is worth on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
+        from optid.identify.verdict import verdict
+
+        return verdict(self.model, self.data) if isinstance(self.data, Data) and self.model is not None else None
+
+    @cached_property
+    def advice(self) -> tuple[Any, ...]:
+        """At most five steps that would make the model better (`optid.identify.advice.Advice`); some are tried."""
+        from optid.identify.advice import advise
+
+        return advise(self)
+
+    def refit(self, *, data: Data | Stream | None = None, formulation: str | None = None,
+              replaced: Mapping[str, Any] | None = None, **changes: Any) -> "Fit":
+        """Fit again with changes, without a proof.
+
+        Args:
+            data: another record.
+            formulation: another formulation.
+            replaced: its arguments, in place of those of this fit.
+            changes: arguments that are to differ.
+        """
+        arguments = dict(self.arguments if replaced is None else replaced)
+        return fit(self.data if data is None else data, formulation or self.formulation, prove=False,
+                   **{**arguments, **changes})
+
     def __str__(self) -> str:
         return render(self)
 

@@ -11,6 +11,7 @@ from optid.show.wording import Table
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
     from optid.identify.validation import Comparison, HorizonCurve, Validation
+    from optid.identify.verdict import Verdict
 
 WIDTH, LEFT = 80, 36
 
@@ -18,11 +19,12 @@ MOST_NAME = 44
 """First cells of a table wider than this stand on lines of their own."""
 
 
-def describe(fit: "Fit") -> str:
+def describe(fit: "Fit", judged: "Verdict | None" = None) -> str:
     """Return the result of a fit as text, at most 80 columns wide.
 
     Args:
         fit: the fit; one without a model (``raises=False``) gives the facts about the solve.
+        judged: the verdict on the model; that of the fit when not given.
     """
     tone, word, sentence = summary.verdict(fit)
     if fit.model is None:
@@ -43,6 +45,7 @@ def describe(fit: "Fit") -> str:
         *[(name, value) for name, value in summary.certificate_facts(fit) if name in _SHORT],
         *[(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "In all")],
     ]
+    judged = fit.verdict if judged is None else judged
     lines = [
         _rule("="),
         summary.title(fit).center(WIDTH).rstrip(),
@@ -50,6 +53,7 @@ def describe(fit: "Fit") -> str:
         _rule("="),
         *_columns(left, right),
         _rule("-"),
+        *([*set_table(summary.verdict_table(judged)), _rule("-")] if judged is not None else []),
         *_equation(fit.model.equation()),
         *_facts(summary.model_facts(fit)),
     ]
@@ -141,7 +145,7 @@ def set_table(table: Table) -> list[str]:
     names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))
     gap = 2 if names + sum(widths) + 2 * len(widths) <= WIDTH else 1
     lines = wrapped(table.title)
-    for row in (table.head, *table.rows):
+    for row in (*[table.head] * any(table.head), *table.rows):
         cells = "".join(" " * gap + f"{cell:>{width}}" for cell, width in zip(row[1:], widths))
         if len(row[0]) > names:
             lines += [row[0], " " * names + cells]

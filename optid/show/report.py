@@ -112,6 +112,8 @@ def _content(fit: "Fit", test: Data | None, command: str) -> dict[str, Any]:
         "tone": tone,
         "word": word[:1].upper() + word[1:],
         "sentence": sentence,
+        "judged": summary.verdict_table(fit.verdict) if fit.verdict is not None else None,
+        "judged_tone": summary.TONES[fit.verdict.word] if fit.verdict is not None else "",
         "findings": fit.findings,
         "cards": _cards(fit, checked.get("test")),
         "equation": [_breakable(line) for line in fit.model.equation().splitlines()],

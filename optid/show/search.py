@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def describe_search(found: "Identification") -> str:
     """Return the search and the fit it ended with as text, at most 80 columns wide."""
-    return "\n".join([*search_lines(found), "", describe(found.fit)])
+    return "\n".join([*search_lines(found), "", describe(found.fit, found.verdict)])
 
 
 def search_lines(found: "Identification") -> list[str]:

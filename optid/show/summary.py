@@ -14,11 +14,15 @@ from optid.show.wording import Table, gap_text, number, percent, seconds
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
+    from optid.identify.verdict import Verdict
 
 Facts = list[tuple[str, str]]
 
 MOST = 12
 """Entries of an array among the figures that are printed."""
+
+TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
+"""How a verdict on a model is coloured."""
 
 PRICE_NOTE = (
     "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit (%) gained when the "
@@ -52,6 +56,12 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
         most = f"{100 * gap:.2g} %"
         return "fair", word, f"A local optimum; no model of this structure can lower the objective by more than {most}."
     return "fair", word, f"A local optimum; whether a better one exists is not known{because}."
+
+
+def verdict_table(found: "Verdict") -> Table:
+    """What the verdict on a model rests on, part by part."""
+    rows = [(part.name, part.value, "PASS" if part.passed else "FAIL") for part in found.parts]
+    return Table(f"The model on this record: {found.word}", ("", "", ""), rows)
 
 
 def fit_table(fit: "Fit") -> Table:

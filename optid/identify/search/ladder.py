@@ -13,8 +13,8 @@ import numpy as np
 from optid.bases import fitted_bases
 from optid.data.record import Data
 from optid.errors import OptidError
-from optid.identify.search.blocks import Blocks
-from optid.identify.search.lags import LagSums, linear, scan, sharp_delays
+from optid.identify.blocks import Blocks
+from optid.identify.delays import LagSums, linear, scan, sharp_delays
 from optid.identify.search.trial import Candidate, Trial
 
 Rung = Generator[list[Candidate], list[Trial], None]
@@ -28,8 +28,8 @@ PATIENCE = 2
 LARGEST = 10
 """Largest number of states."""
 
-FEW_LEVELS = 2
-"""Levels of an input up to which no function of it can be told from a straight line."""
+FEW_LEVELS = 5
+"""Levels of an input up to which nothing shows between them how a function would go on."""
 
 CLEAR = 0.2
 """Median over the blocks of the log ratio of error energies that a richer class must save."""
@@ -69,7 +69,7 @@ class Ladder:
         data, m = blocks.data, blocks.data.m
         sums = LagSums(blocks, linear(data))
         delays, found = [(0,) * m, sharp_delays(sums)], []
-        if not binary(data):
+        if not few_levels(data):
             try:  # what acts through an even function shows in no linear model
                 found.append(sharp_delays(LagSums(blocks, fitted_bases(data, "polynomial:3"), na=4, lags=12)))
             except OptidError:
@@ -140,13 +140,13 @@ def gain(simple: Trial, rich: Trial) -> float:
     return float(np.median(np.log(np.maximum(simple.losses, 1e-300) / np.maximum(rich.losses, 1e-300))))
 
 
-def binary(data: Data) -> bool:
-    """Whether no input has more than two levels."""
+def few_levels(data: Data) -> bool:
+    """Whether no input has more than a few levels: only linear models are tried then."""
     return all(_levels(data, c) <= FEW_LEVELS for c in range(data.m))
 
 
 def bases(data: Data, word: str) -> Any:
-    """Return a basis for all inputs; straight lines for those of two levels."""
+    """Return a basis for all inputs; straight lines for those of few levels."""
     found = [word if _levels(data, c) > FEW_LEVELS else "linear" for c in range(data.m)]
     return word if len(set(found)) == 1 else found
 
@@ -183,8 +183,6 @@ def linear_models(ladder: Ladder) -> Rung:
 
 def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
-    if binary(ladder.data):
-        return
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
         n = ladder.order()
@@ -233,6 +231,11 @@ def latent_signals(ladder: Ladder) -> Rung:
     a = ladder.arguments(LATENT)
     yield [_latent(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
            *(_latent(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4"))]
+
+
+def classes_for(data: Data, asked: Sequence[str]) -> list[str]:
+    """Return the classes that a record allows among those asked for."""
+    return [kind for kind in KINDS if kind in asked and (kind == LINEAR or not few_levels(data))]
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+import numpy as np
+
 GRACE = 1.0  # seconds after a deadline, which work looks at itself
 
 
@@ -59,7 +61,8 @@ class Pool:
                 connection.send(tasks[busy[connection]])
             if not busy:
                 break
-            ready: list[Any] = wait(list(busy), max(deadline + GRACE - time.monotonic(), 0.0))
+            left = max(deadline + GRACE - time.monotonic(), 0.0)
+            ready: list[Any] = wait(list(busy), None if left == np.inf else left)
             if not ready:
                 self.close()
                 break

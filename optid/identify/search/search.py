@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,13 @@ import numpy as np
 from optid.arrays import check_integer, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, SolverFailed, StructureError
+from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.blocks import Blocks
-from optid.identify.search.ladder import CLEAR, KINDS, RUNGS, Ladder, gain
+from optid.identify.search.ladder import CLEAR, KINDS, RUNGS, Ladder, classes_for, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, tried
+from optid.identify.verdict import Verdict, verdict
 from optid.registry import named_constraint, render
-
-SHARES: dict[str, float] = dict(zip(KINDS, (0.35, 0.6, 0.8, 1.0)))
-"""Share of the budget that has passed when a class of models has had its time."""
 
 RESERVED = 0.1
 """Share of the budget that is kept for the fit of the choice."""
@@ -56,6 +54,12 @@ class Identification:
     def model(self) -> Any:
         """The model, in raw units."""
         return self.fit.model
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """What the model is worth on the record, from the blocks left out."""
+        assert isinstance(self.fit.data, Data)
+        return verdict(self.model, self.fit.data, self.chosen.by_block.tolist(), self.chosen.score)
 
     def __str__(self) -> str:
         return render(self)
@@ -102,6 +106,10 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
     for word in classes:
         one_of("classes", word, KINDS)
+    possible = classes_for(data, classes)
+    if not possible:
+        raise StructureError("no input has more than five levels: only linear models can be told apart, add 'linear' "
+                             "to the classes")
     if horizon is not None:
         check_integer(horizon, "horizon")
     rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
@@ -116,8 +124,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
 
     pool = Pool(attempt, count)
     try:
-        for kind in (kind for kind in KINDS if kind in classes):
-            limit = clock + SHARES[kind] * (end - clock)
+        for i, kind in enumerate(possible, start=1):
+            limit = clock + i / len(possible) * (end - clock)  # what a class does not use is left to those after it
             if not _climb(ladder, kind, pool, limit, end, partial(_told, ladder, progress, clock)):
                 stopped = f"the budget of {budget:g} s"
     except KeyboardInterrupt:
@@ -130,8 +138,12 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise _nothing(ladder)
     found = fit(data, chosen.candidate.formulation, solver=solver, accuracy=accuracy, constraints=rules,
                 **chosen.candidate.arguments)
-    return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(reasons(ladder, best, chosen)),
-                          horizon, blocks, stopped, time.monotonic() - clock)
+    why = reasons(ladder, best)
+    if len(possible) < len(classes):
+        why.append("no input has more than five levels: functions cannot be told from straight lines between them, and "
+                   "only linear models were tried")
+    return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(why), horizon, blocks,
+                          stopped, time.monotonic() - clock)
 
 
 def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told: Callable[[Trial], None]) -> bool:
@@ -139,11 +151,12 @@ def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told
     rung = RUNGS[kind](ladder)
     batch = next(rung, None)
     while batch is not None:
-        if time.monotonic() > limit:
+        if ladder.rival(kind) is not None and time.monotonic() > limit:
             return False
         fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
         rival = ladder.rival(kind)
-        for candidate, trial in zip(fresh, pool.run([(c, rival, limit) for c in fresh], end, told)):
+        last = end if rival else np.inf  # the first are waited for
+        for candidate, trial in zip(fresh, pool.run([(c, rival, limit) for c in fresh], last, told)):
             ladder.trials[candidate.key] = Trial(candidate, reason="out of time") if trial is None else trial
         try:
             batch = rung.send([ladder.trials[c.key] for c in batch])
@@ -152,7 +165,7 @@ def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told
     return True
 
 
-def reasons(ladder: Ladder, best: Mapping[str, Trial], chosen: Trial) -> list[str]:
+def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
     """Say of every class why it was taken or left."""
     found: list[str] = []
     current: Trial | None = None

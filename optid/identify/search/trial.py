@@ -2,16 +2,16 @@
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import OptidError
+from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.fitting import fit
-from optid.identify.search.blocks import Blocks, pooled_fit
 
 WORSE = 1.3
 """A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
@@ -109,43 +109,48 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
         settings: solver and accuracy.
         constraints: of the user.
         horizon: samples ahead of the predictions that are compared; None for the free run.
-        deadline: by `time.monotonic`.
+        deadline: by `time.monotonic`; where there is no rival, it takes the time it needs.
     """
-    clock = time.process_time()
-    arguments = {**candidate.arguments, **({"constraints": tuple(constraints)} if constraints else {})}
-    common: dict[str, Any] = {"candidate": candidate}
+    clock, known = time.process_time(), Trial(candidate)
+    arguments = {**candidate.arguments, **spared(candidate),
+                 **({"constraints": tuple(constraints)} if constraints else {})}
 
     def fitted(data: Any) -> Any:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            return fit(data, candidate.formulation, prove=False, **settings, **spared(candidate), **arguments)
-
-    def ended(reason: str = "", **found: Any) -> Trial:
-        return Trial(**{**common, **found}, seconds=time.process_time() - clock, reason=reason)
+        return fit(data, candidate.formulation, prove=False, **settings, **arguments)
 
     try:
-        whole = fitted(blocks.data)
-        model = whole.model
-        energies, measures = zip(*(blocks.errors(model, b, horizon) for b in range(len(blocks))))
-        common |= {"status": whole.solution.status.value, "parameters": free_parameters(model),
-                   "estimation": pooled_fit(np.array(energies), np.array(measures))}
-        if rival is not None and common["estimation"] < rival.score:
-            return ended("fits the record itself less than its rival fits blocks left out")
-        order, energy, measure = halves(len(blocks)), [], []
-        for done, b in enumerate(order, start=1):
-            if time.monotonic() > deadline:
-                return ended("out of time")
-            found = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
-            energy.append(found[0])
-            measure.append(found[1])
-            so_far = {"energy": np.array(energy), "measure": np.array(measure), "order": tuple(order[:done])}
-            if not np.isfinite(found[0]).all():
-                return ended(f"its run diverges in block {b + 1}", **so_far)
-            if rival is not None and 2 * done == len(order) and _behind(so_far, rival):
-                return ended("falls behind its rival on the first half of the blocks", **so_far)
-        return ended(**so_far)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):  # the fit that is chosen tells them
+            warnings.simplefilter("ignore")
+            for known in _steps(known, fitted, blocks, rival, horizon, deadline):
+                if known.reason:
+                    break
     except (OptidError, np.linalg.LinAlgError, ValueError) as error:
-        return ended(f"{type(error).__name__}: {error}")
+        known = replace(known, reason=f"{type(error).__name__}: {error}")
+    return replace(known, seconds=time.process_time() - clock)
+
+
+def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Trial | None, horizon: int | None,
+           deadline: float) -> Iterator[Trial]:
+    """Yield what is known after the fit to the whole record, and after every block."""
+    whole = fitted(blocks.data)
+    energies, measures = zip(*(blocks.errors(whole.model, b, horizon) for b in range(len(blocks))))
+    known = replace(known, status=whole.solution.status.value, parameters=free_parameters(whole.model),
+                    estimation=pooled_fit(np.array(energies), np.array(measures)))
+    if rival is not None and known.estimation < rival.score:
+        yield replace(known, reason="fits the record itself less than its rival fits blocks left out")
+    order, energy, measure = halves(len(blocks)), [], []
+    for done, b in enumerate(order, start=1):
+        if rival is not None and time.monotonic() > deadline:  # without a rival there is nothing to fall back to
+            yield replace(known, reason="out of time")
+        found = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
+        energy.append(found[0])
+        measure.append(found[1])
+        known = replace(known, energy=np.array(energy), measure=np.array(measure), order=tuple(order[:done]))
+        if not np.isfinite(found[0]).all():
+            yield replace(known, reason=f"its run diverges in block {b + 1}")
+        if rival is not None and 2 * done == len(order) and _behind(known, rival):
+            yield replace(known, reason="falls behind its rival on the first half of the blocks")
+    yield known
 
 
 def spared(candidate: Candidate) -> dict[str, Any]:
@@ -174,11 +179,10 @@ def free_parameters(model: Any) -> int:
     return int(n * (model.l + signals) + direct + model.l + shapes + rows)
 
 
-def _behind(so_far: Mapping[str, Any], rival: Trial) -> bool:
-    energy, measure = so_far["energy"], so_far["measure"]
-    places = [rival.order.index(b) for b in so_far["order"]]
-    ours, theirs = (float(np.sum(e.sum(axis=0) / np.maximum(m.sum(axis=0), 1e-300)))
-                    for e, m in ((energy, measure), (rival.energy[places], rival.measure[places])))
+def _behind(known: Trial, rival: Trial) -> bool:
+    places = [rival.order.index(b) for b in known.order]
+    ours, theirs = (float(np.sum(e.sum(axis=0) / np.maximum(m.sum(axis=0), 1e-300))) for e, m in (
+        (known.energy, known.measure), (rival.energy[places], rival.measure[places])))
     return ours > WORSE * theirs
 
 

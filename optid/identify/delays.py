@@ -14,7 +14,7 @@ from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.search.blocks import Blocks, Part
+from optid.identify.blocks import Blocks, Part
 from optid.statistics import Layout, Statistics, accumulate
 
 Places = NDArray[np.intp]

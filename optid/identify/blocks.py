@@ -120,7 +120,7 @@ class Blocks:
             horizon: samples ahead of the prediction; None for the free run.
         """
         part, (variance, span) = self.block(block).raw(), self.outputs
-        try:
+        try:  # what runs away is told by its energy
             found = self._free_run(model, part) if horizon is None else as_list(model.predict(part, horizon))
         except OptidError:
             return np.full(self.data.l, np.inf), np.zeros(self.data.l)

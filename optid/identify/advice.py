@@ -1,0 +1,296 @@
+"""What would make a model better: sentences that each name the step to take and, where that is cheap to try, its gain.
+
+The record is looked at first, since no structure mends a wrong one; then neighbouring structures are fitted.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import OptidError
+from optid.identify.blocks import Blocks
+from optid.identify.delays import LagSums, linear, sharp_delays
+from optid.identify.validation.predictions import fit_percent, simulated_or_nan
+from optid.models.functions import has_feedback, static_functions
+
+MOST = 5
+
+WORTH = 0.1
+"""Share of the error of the free run that a step has to save to be advised."""
+
+SPARED = 0.5
+"""Points of fit that may be lost for a simpler structure."""
+
+JUMP = 4.0
+"""Factor between the sizes of a channel's movements before and after a sample that is taken for a change."""
+
+APART = 15.0
+"""Points by which both halves of a record fit better alone than together, where the plant changes between them."""
+
+DRIVEN = 0.5
+"""Log ratio of one-step errors that the past of the output saves of the input, where columns look swapped."""
+
+TOO_FEW = 10
+"""Samples per parameter at least."""
+
+LONG = 20_000
+"""Samples beyond which no neighbouring structure is tried."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """One step.
+
+    Attributes:
+        sentence: what was seen, and what the step brings.
+        step: an option of the command line, or a call.
+        gain: points of simulation fit it brings where that was tried; NaN where not.
+    """
+
+    sentence: str
+    step: str
+    gain: float = np.nan
+
+    def __str__(self) -> str:
+        return f"{self.sentence}: {self.step}"
+
+
+def advise(fit: Any) -> tuple[Advice, ...]:
+    """Return at most five steps, the most useful first.
+
+    Args:
+        fit: `optid.identify.fitting.Fit` of a record in memory.
+    """
+    if not isinstance(fit.data, Data) or fit.model is None:
+        return ()
+    before = _score(fit.model, fit.data)
+    on_record = list(_on_record(fit))
+    tried = sorted(_tried(fit, before), key=lambda one: -one.gain) if fit.data.n_samples <= LONG else []
+    found: dict[str, Advice] = {}
+    for one in (*on_record, *tried, *_on_model(fit)):
+        found.setdefault(one.step, one)
+    return tuple(found.values())[:MOST]
+
+
+# -- the record ----------------------------------------------------------------------------------------------------
+
+
+def _on_record(fit: Any) -> Iterator[Advice]:
+    data: Data = fit.data.raw()
+    yield from _swapped(data)
+    for role, names in (("input", data.inputs), ("output", data.outputs)):
+        for c, name in enumerate(names):
+            yield from _jump(role, name, [(e.u if role == "input" else e.y)[:, c] for e in data.experiments])
+    wild = [sentence for sentence in fit.findings if " wild" in sentence]
+    if wild:
+        yield Advice(wild[0].partition(":")[0], "--loss huber, or mark them as missing")
+    yield from _halves(fit)
+
+
+def _swapped(data: Data) -> Iterator[Advice]:
+    """Look for an input that the past of the outputs explains, while its own past explains nothing of them."""
+    if data.m != 1 or data.l != 1:
+        return
+    try:
+        forward, backward = (_drive(record) for record in (data, _reversed(data)))
+    except OptidError:
+        return
+    if backward > DRIVEN and forward < 0.1 * backward:
+        yield Advice(f"the past of {data.outputs[0]!r} explains {data.inputs[0]!r}, and not the other way round: input "
+                     "and output look swapped", f"--inputs {data.outputs[0]} --outputs {data.inputs[0]}")
+
+
+def _drive(data: Data) -> float:
+    """Return what the past of the input, without its present, saves of the log one-step error of the output."""
+    sums = LagSums(Blocks.of(data), linear(data), na=6, lags=8)
+    with_input = sums.columns(sums.layout.na, sums.layout.nb[0] - 1, (1,))
+    alone = np.concatenate([with_input[: sums.layout.na], with_input[-1:]])
+    return float(np.log(max(sums.remainder(alone), 1e-12) / max(sums.remainder(with_input), 1e-12)))
+
+
+def _reversed(data: Data) -> Data:
+    return Data([e.y for e in data.experiments], [e.u for e in data.experiments], dt=data.dt, inputs=data.outputs,
+                outputs=data.inputs)
+
+
+def _jump(role: str, name: str, records: list[Array]) -> Iterator[Advice]:
+    """Look for a sample from which on a channel moves many times as much, or as little, as before."""
+    for i, x in enumerate(records):
+        steps = np.abs(np.diff(x[np.isfinite(x)]))
+        size = steps.size // 16
+        if size < 8:
+            continue
+        sizes = np.array([np.sqrt(np.mean(part**2)) for part in np.array_split(steps, 16)])
+        if not sizes.min() > 0:
+            continue
+        ratio, at = max((max(sizes[k:].min() / sizes[:k].max(), sizes[:k].min() / sizes[k:].max()), k)
+                        for k in range(3, 14))
+        if ratio > JUMP:
+            factor, sample = np.median(sizes[at:]) / np.median(sizes[:at]), at * len(x) // 16
+            where = f" of experiment {i + 1}" if len(records) > 1 else ""
+            yield Advice(f"{role} {name!r} moves {factor:.3g} times as much from about sample {sample}{where} on: its "
+                         "unit or its gain may have changed there", f"data.window(0, {sample}) fits the part before")
+            return
+
+
+def _halves(fit: Any) -> Iterator[Advice]:
+    """Fit both halves alone: where both are much better then, the plant is not the same in both."""
+    data: Data = fit.data
+    if data.n_experiments > 1 or data.n_samples > LONG or data.n_samples < 200:
+        return
+    middle = data.n_samples // 2
+    parts = data.split(middle)
+    whole = simulated_or_nan(fit.model, data.raw())[0]
+    before = [float(np.mean(fit_percent(p.raw().experiments[0].y, w))) for p, w in
+              zip(parts, (whole[:middle], whole[middle:]))]
+    alone = [_try(fit, data=part) for part in parts]
+    if all(one is not None for one in alone):
+        after = [_score(one.model, part) for one, part in zip(alone, parts)]
+        if min(a - b for a, b in zip(after, before)) > APART:
+            yield Advice(f"fitted alone, the halves of the record reach {after[0]:.0f} and {after[1]:.0f} % instead of "
+                         f"{before[0]:.0f} and {before[1]:.0f} %: the plant changes within the record",
+                         f"data.split({middle}) gives both")
+
+
+# -- neighbouring structures -----------------------------------------------------------------------------------------
+
+
+def _tried(fit: Any, before: float) -> Iterator[Advice]:
+    """Fit neighbouring structures; those that save much of the error of the free run are advised."""
+    for sentence, step, again in _neighbours(fit):
+        found = again()
+        if found is None:
+            continue
+        after = _score(found.model, fit.data)
+        if after - before > WORTH * (100 - before):
+            yield Advice(f"{sentence} raises the simulation fit from {before:.0f} to {after:.0f} %", step,
+                         after - before)
+
+
+def _neighbours(fit: Any) -> Iterator[tuple[str, str, Callable[[], Any]]]:
+    name, arguments, data = fit.formulation, fit.arguments, fit.data
+    if "nk" in _known(fit):
+        for delay in _delays(fit):
+            words = " ".join(map(str, delay))
+            yield (f"a delay of {words} samples", f"--nk {words}", partial(_try, fit, nk=list(delay)))
+    if "na" in arguments and "nb" in arguments:
+        for more in (1, 2):
+            na, nb = arguments["na"] + more, _more(arguments["nb"], more)
+            yield (f"na {na} and nb {_words(nb)}", f"--na {na} --nb {_words(nb)}", partial(_try, fit, na=na, nb=nb))
+    if isinstance(arguments.get("nx"), int):
+        for more in (1, 2):
+            nx = arguments["nx"] + more
+            yield f"nx {nx}", f"--nx {nx}", partial(_try, fit, nx=nx)
+    if arguments.get("offset") is False:
+        yield "an estimated constant", "--set offset=true", partial(_try, fit, offset=True)
+    single, static = data.l == 1, "hammerstein" in name
+    lags = {key: arguments[key] for key in ("na", "nb", "nk", "constraints") if key in arguments}
+    if single and "arx" in name and "armax" not in name and "na" in arguments:
+        other = "hammerstein_oe.exact" if static else "oe.exact"
+        more = {"basis": arguments["basis"]} if "basis" in arguments else {}
+        yield ("fitting the free run instead of the one-step prediction", f"--formulation {other}",
+               partial(_try, fit, formulation=other, replaced={**lags, **more}))
+    if not static and all(np.unique(e.u[:, c]).size > 2 for e in data.experiments for c in range(data.m)):
+        other = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact",
+                 "ss.exact": "hammerstein_ss.exact"}.get(name)
+        if other is not None:
+            yield ("a static function of the input", f"--formulation {other} --basis triangular:6",
+                   partial(_try, fit, formulation=other, basis="triangular:6"))
+    if not has_feedback(fit.model) and not getattr(fit.model, "latent", ()):
+        basis = arguments.get("basis", "linear") if static else "linear"
+        yield ("a static function of the output that is fed back",
+               "--formulation hammerstein_ss.exact --nx 2 --feedback-basis polynomial:3",
+               partial(_try, fit, formulation="hammerstein_ss.exact",
+                       replaced={"nx": 2, "basis": basis, "feedback_basis": "polynomial:3", "iterations": 30}))
+
+
+def _delays(fit: Any) -> list[tuple[int, ...]]:
+    """Return delays that the record suggests, other than the model's."""
+    now, m = tuple(fit.model.nk), fit.data.m
+    found = [(0,) * m]
+    for bases in (linear(fit.data), tuple(f.basis for f in fit.model.nonlinearities)):
+        try:
+            sharp = sharp_delays(LagSums(Blocks.of(fit.data), bases))
+        except OptidError:
+            continue
+        found += [sharp, tuple(max(k - 1, 0) for k in sharp)]
+    return [delay for delay in dict.fromkeys(found) if delay != now]
+
+
+# -- the model -------------------------------------------------------------------------------------------------------
+
+
+def _on_model(fit: Any) -> Iterator[Advice]:
+    model, data = fit.model, fit.data.raw()
+    if not model.is_stable and not has_feedback(model):
+        yield Advice("the model has a pole outside the unit circle", "--constraint max_pole_radius:0.99")
+    for function in static_functions(model):
+        if function.is_linear:
+            continue
+        x = function.samples(data)
+        x = x[np.isfinite(x)]
+        share = float(np.mean(function.nonlinearity.basis.is_outside(x)))
+        if share > 0.01:
+            low, high = np.min(x), np.max(x)
+            yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
+                         f"--basis ...:interval={low:.4g},{high:.4g}")
+    verdict = fit.verdict
+    count = fit.data.n_samples * fit.data.l
+    parameters = sum(np.size(value) for _, value in model.coefficients())
+    if count < TOO_FEW * parameters:
+        yield Advice(f"{count} samples are few for {parameters} coefficients", "fewer lags or basis functions, or a "
+                     "longer record")
+    if float(fit.figures.get("condition", 1.0)) > 1e7:
+        yield Advice("the inputs move too little to tell the lags apart", "optid design proposes an input")
+    if verdict is not None:
+        yield from _straight(fit)
+
+
+def _straight(fit: Any) -> Iterator[Advice]:
+    """Look whether a straight line does as well as the functions of the inputs."""
+    plain = {"hammerstein_arx.exact": "arx", "hammerstein_oe.exact": "oe.exact", "hammerstein_ss.exact": "ss.exact"}
+    other = plain.get(fit.formulation)
+    if other is None or has_feedback(fit.model):
+        return
+    kept = {key: value for key, value in fit.arguments.items() if key in ("na", "nb", "nk", "nx", "offset")}
+    found = _try(fit, formulation=other, replaced=kept)
+    if found is not None and _score(found.model, fit.data) > _score(fit.model, fit.data) - SPARED:
+        yield Advice("a straight line does as well as the function of the input", f"--formulation {other}")
+
+
+def _try(fit: Any, *, data: Data | None = None, formulation: str | None = None,
+         replaced: Mapping[str, Any] | None = None, **changes: Any) -> Any:
+    """Fit again with changes; None where that is not possible."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            return fit.refit(data=data, formulation=formulation, replaced=replaced, **changes)
+        except (OptidError, np.linalg.LinAlgError, ValueError):
+            return None
+
+
+def _score(model: Any, data: Data) -> float:
+    """Return the fit of the free run in %, a mean over the outputs; minus infinity where there is none."""
+    raw = data.raw()
+    found = fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(simulated_or_nan(model, raw)))
+    value = float(np.mean(found))
+    return value if np.isfinite(value) else -np.inf
+
+
+def _known(fit: Any) -> set[str]:
+    return {"nk"} if hasattr(fit.model, "nk") and "nb" in fit.arguments else set()
+
+
+def _more(values: Any, more: int) -> Any:
+    return [int(v) + more for v in values] if isinstance(values, list | tuple) else int(values) + more
+
+
+def _words(values: Any) -> str:
+    return " ".join(map(str, values)) if isinstance(values, list | tuple) else str(values)
+

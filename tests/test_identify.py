@@ -1,0 +1,356 @@
+"""The search for a structure: blocks, exact sums, the ladder, the choice, and what stops it."""
+
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+import optid
+from optid.bases import Linear
+from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
+from optid.identify.blocks import Blocks, pooled_fit
+from optid.identify.delays import LagSums, linear, scan, sharp_delays
+from optid.identify.search import identify
+from optid.identify.search import search as searching
+from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, Ladder, gain
+from optid.identify.search.pool import Pool
+from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
+from optid.models.layout import Layout
+from optid.statistics import collect
+
+FOREVER = 1e12
+
+
+def plant(samples=400, *, delay=0, cubic=0.0, noise=0.02, seed=0, start=0.0):
+    """y = x + e with x(k) = 0.8 x(k-1) + f(u(k - 1 - delay)), f(u) = u + cubic u^3."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-2, 2, samples)
+    f, x, y = u + cubic * u**3, start, np.zeros(samples)
+    for k in range(samples):
+        y[k] = x
+        x = 0.8 * x + (f[k - delay] if k >= delay else 0.0)
+    y += noise * y.std() * rng.standard_normal(samples)
+    return optid.Data(u, y)
+
+
+# -- blocks ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lengths", [(103,), (60, 43, 80), (50, 50, 50, 50), (20,) * 9])
+def test_every_sample_is_left_out_once(lengths):
+    rng = np.random.default_rng(1)
+    data = optid.Data([rng.normal(size=n) for n in lengths], [rng.normal(size=n) for n in lengths])
+    blocks = Blocks.of(data, 4)
+    seen = [np.zeros(n, dtype=int) for n in lengths]
+    for b in range(4):
+        for part in blocks.parts[b]:
+            seen[part.experiment][part.first : part.last] += 1
+        inside = sum(e.n_samples for e in blocks.block(b).experiments)
+        outside = blocks.without(b)
+        assert inside + outside.n_samples <= data.n_samples
+        left = np.concatenate([e.y.ravel() for e in outside.experiments])
+        assert not np.isin(left, np.concatenate([e.y.ravel() for e in blocks.block(b).experiments])).any()
+    assert all(np.max(counts) == 1 for counts in seen)
+    assert sum(counts.sum() for counts in seen) >= 0.9 * data.n_samples
+
+
+def test_borders_of_experiments_are_borders_of_blocks_where_they_are_near():
+    lengths = (52, 48, 51, 49)
+    data = optid.Data([np.arange(n) % 7 * 1.0 for n in lengths], [np.arange(n) % 5 * 1.0 for n in lengths])
+    assert all(len(parts) == 1 for parts in Blocks.of(data, 4).parts)
+
+
+def test_a_record_too_short_for_the_blocks_is_refused():
+    with pytest.raises(RankError, match="30 samples are too few for cross-validation in 4 blocks"):
+        Blocks.of(plant(30), 4)
+
+
+def test_the_errors_of_a_block_are_those_of_the_free_run_from_a_state_fitted_to_its_beginning():
+    data = plant(400, start=5.0)
+    blocks = Blocks.of(data, 4)
+    model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
+    energy, measure = blocks.errors(model, 1)
+    part = data.window(100, 200)
+    x0 = model.initial_state(part.window(0, 33))
+    expected = np.sum((np.ravel(model.simulate(part, x0=x0)) - part.y.ravel()) ** 2)
+    assert energy[0] == pytest.approx(expected, rel=1e-9)
+    assert measure[0] == pytest.approx(100 * np.var(data.y))
+    assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(expected / measure[0])))
+
+
+def test_errors_do_not_depend_on_units():
+    data = plant(300)
+    other = optid.Data(1e-4 * data.u, 1e5 * data.y)
+    found = []
+    for one in (data, other):
+        model = optid.fit(one, "oe.exact", na=1, nb=1, nk=1).model
+        found.append(pooled_fit(*(np.array([v]) for v in Blocks.of(one, 4).errors(model, 2))))
+    assert found[1] == pytest.approx(found[0], abs=1e-5)
+
+
+def test_a_run_that_leaves_the_range_counts_as_infinite():
+    data = plant(200)
+    model = optid.fit(data, "arx", na=1, nb=1, nk=1).model
+    wild = type(model)(np.array([-1.2]), model.b, model.nonlinearities, model.nk, model.offset)
+    with pytest.warns(DataWarning, match="unstable"):
+        energy, _ = Blocks.of(data, 4).errors(wild, 0)
+    assert np.isinf(energy).all()
+
+
+# -- exact sums ------------------------------------------------------------------------------------------------------
+
+
+def test_the_sums_without_a_block_are_those_of_the_record_without_it():
+    data = plant(300, noise=0.1)
+    blocks = Blocks.of(data, 3)
+    sums = LagSums(blocks, linear(data), na=3, lags=4)
+    for b, block in enumerate(sums.blocks):
+        direct = collect(blocks.without(b), sums.layout)
+        np.testing.assert_allclose(sums.whole.gram - block.gram, direct.gram, rtol=1e-9, atol=1e-8)
+        assert sums.whole.rows - block.rows == direct.rows
+
+
+def test_errors_of_smaller_structures_are_those_of_fits_without_the_blocks():
+    data = plant(400, delay=1, noise=0.1)
+    blocks = Blocks.of(data, 4)
+    sums = LagSums(blocks, linear(data), na=4, lags=6)
+    na, nb, nk = 2, 3, (1,)
+    total, rows = 0.0, 0
+    reach = sums.layout.first_row
+    for b in range(4):
+        model = optid.fit(blocks.without(b), "arx", na=na, nb=nb, nk=1).model
+        part = blocks.parts[b][0]
+        window = data.window(max(part.first - reach, 0), min(part.last + reach, 400))
+        predicted = np.ravel(model.predict(window))[reach:]
+        total += np.sum((predicted - window.y.ravel()[reach:]) ** 2)
+        rows += predicted.size
+    used = data.y.ravel()[reach:]
+    assert sums.error(na, nb, nk) == pytest.approx(total / rows / used.var(), rel=0.02)
+    best = scan(sums, [(0,), (1,)])[0]
+    assert best.error <= sums.error(na, nb, nk)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4, 7])
+def test_a_delay_is_sharp_where_the_input_is_rich(delay):
+    data = plant(600, delay=delay, noise=0.05)
+    assert sharp_delays(LagSums(Blocks.of(data), linear(data))) == (delay + 1,)
+
+
+def test_a_slow_input_shows_no_sharp_delay():
+    rng = np.random.default_rng(2)
+    u = np.convolve(rng.normal(size=700), np.ones(60) / 60, "valid")
+    u = np.convolve(u, np.hanning(40) / np.hanning(40).sum(), "same")
+    y = np.convolve(u, 0.9 ** np.arange(40))[: u.size]
+    data = optid.Data(u, y + 0.05 * y.std() * rng.standard_normal(u.size))
+    assert sharp_delays(LagSums(Blocks.of(data), linear(data))) == (0,)
+
+
+# -- trials ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_trial_is_given_up_early_and_says_why():
+    data = plant(400, cubic=0.5)
+    blocks = Blocks.of(data)
+    good = tried(Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
+                 blocks, None, {}, (), None, FOREVER)
+    assert good.complete and good.score > 95 and len(good.by_block) == 4 and good.parameters == 5
+    poor = tried(Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None, FOREVER)
+    assert not poor.complete and "its rival fits blocks left out" in poor.reason and poor.score == -np.inf
+    late = tried(good.candidate, blocks, good, {}, (), None, time.monotonic() - 1)
+    assert late.reason == "out of time"
+    refused = tried(Candidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None, FOREVER)
+    assert refused.reason.startswith("RankError") and refused.status == "refused"
+
+
+@pytest.mark.parametrize("formulation, arguments, count", [
+    ("arx", {"na": 2, "nb": 3}, 6), ("hammerstein_arx.exact", {"na": 2, "nb": 2, "basis": "polynomial:3"}, 7),
+    ("ss.exact", {"nx": 2, "feedthrough": False}, 5),
+])
+def test_free_parameters_are_counted_without_those_that_repeat_others(formulation, arguments, count):
+    assert free_parameters(optid.fit(plant(300), formulation, **arguments).model) == count
+
+
+# -- the choice ------------------------------------------------------------------------------------------------------
+
+
+def trial(kind, energies, parameters=3):
+    energy = np.array(energies, dtype=float)[:, None]
+    candidate = Candidate(kind, f"of {kind}", {"n": parameters})
+    return Trial(candidate, 99.0, energy, np.ones_like(energy), tuple(range(len(energy))), parameters, 0.1, "optimal")
+
+
+def ladder_of(*trials):
+    return Ladder(plant(100), [(0,)], [], {t.candidate.key: t for t in trials})
+
+
+def test_a_richer_class_has_to_win_clearly_in_the_median_block():
+    simple = trial(LINEAR, [0.1, 0.1, 0.1, 0.5])
+    lucky = trial(INPUTS, [0.1, 0.1, 0.1, 0.1])  # better in one block only
+    clear = trial(INPUTS, [0.05, 0.05, 0.07, 0.4], 5)
+    assert gain(simple, lucky) < CLEAR < gain(simple, clear)
+    assert ladder_of(simple, lucky).choice() is simple
+    assert ladder_of(simple, clear).choice() is clear
+    worse = trial(INPUTS, [0.01, 0.01, 0.01, 3.0])  # clearly better in the median, worse in all
+    assert ladder_of(simple, worse).choice() is simple
+
+
+def test_of_structures_that_are_as_good_the_smaller_is_best():
+    large, small = trial(LINEAR, [0.1] * 4, 9), trial(LINEAR, [0.101] * 4, 3)
+    assert ladder_of(large, small).best(LINEAR) is small
+    assert ladder_of(large, trial(LINEAR, [0.12] * 4, 3)).best(LINEAR) is large
+
+
+def test_a_model_whose_run_diverges_in_a_block_is_never_chosen():
+    simple, wild = trial(LINEAR, [0.5] * 4), trial(INPUTS, [0.001, 0.001, 0.001, np.inf])
+    assert ladder_of(simple, wild).choice() is simple and ladder_of(wild).choice() is None
+
+
+# -- the whole -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cubic, expected", [(0.0, LINEAR), (0.5, INPUTS)])
+def test_the_class_of_a_simulated_plant_is_found(cubic, expected):
+    told = []
+    found = identify(plant(500, delay=3, cubic=cubic, noise=0.05), classes=KINDS[:2], workers=1, progress=told.append)
+    assert found.chosen.candidate.kind == expected and found.chosen.score > 93
+    assert found.fit.simulation_fit[0] > 93 and found.verdict.word in ("good", "fair")
+    assert 0 < len(told) <= len(found.trials)
+    delays = np.asarray(found.model.nk) if hasattr(found.model, "nk") else np.array([4])
+    assert delays[0] in (0, 3, 4)
+    text = str(found)
+    assert "Search over" in text and f"* {expected}" in text and "The model on this record" in text
+    assert found.reasons[0].startswith("linear: ") and any("input functions" in reason for reason in found.reasons)
+
+
+def test_processes_find_the_same():
+    data = plant(300, cubic=0.5, noise=0.05)
+    alone, together = (identify(data, classes=KINDS[:2], workers=count) for count in (1, 2))
+    assert alone.chosen.candidate.kind == together.chosen.candidate.kind == INPUTS
+    assert together.chosen.score == pytest.approx(alone.chosen.score, abs=2.0)
+
+
+def test_an_interrupt_gives_the_best_so_far():
+    def stop(sentence):
+        if "oe.exact" in sentence:
+            raise KeyboardInterrupt
+
+    found = identify(plant(300), workers=1, progress=stop)
+    assert found.stopped == "an interrupt" and found.chosen.complete
+    assert "ended by an interrupt" in str(found)
+
+
+def test_a_budget_ends_the_search():
+    found = identify(plant(400, cubic=0.4), budget=1.0, workers=1)
+    assert found.stopped == "the budget of 1 s" and found.model is not None
+
+
+def test_constraints_hold_for_what_is_chosen():
+    data = plant(400, cubic=0.5, noise=0.05)
+    found = identify(data, classes=[INPUTS], constraints=["monotone:increasing", "gain:20"], workers=1)
+    assert {price.name.partition(":")[0].partition(" ")[0] for price in found.fit.prices} == {"monotone", "gain"}
+    assert found.model.nonlinearities[0].basis.size > 1
+
+
+def test_inputs_of_few_levels_allow_linear_models_only():
+    rng = np.random.default_rng(3)
+    u = np.sign(rng.normal(size=300))
+    y = np.convolve(u, 0.8 ** np.arange(40))[:300] + 0.1 * rng.normal(size=300)
+    found = identify(optid.Data(u, y), workers=1)
+    assert {t.candidate.kind for t in found.trials} == {LINEAR} and "five levels" in found.reasons[-1]
+    with pytest.raises(StructureError, match="add 'linear'"):
+        identify(optid.Data(u, y), classes=[INPUTS])
+
+
+@pytest.mark.parametrize("changes, error, words", [
+    ({"budget": 0}, StructureError, "budget is a number of seconds"), ({"blocks": 1}, StructureError, "blocks"),
+    ({"classes": ["wiener"]}, StructureError, "wiener"), ({"horizon": 0}, StructureError, "horizon"),
+    ({"workers": 0}, StructureError, "workers"), ({"solver": "nothing"}, OptidError, "nothing"),
+    ({"constraints": ["monotonous"]}, OptidError, "monotonous"),
+])
+def test_arguments_that_cannot_be_are_refused(changes, error, words):
+    with pytest.raises(error, match=words):
+        identify(plant(200), **{"workers": 1, **changes})
+
+
+def test_bad_records_are_refused():
+    with pytest.raises(DataError, match="identify takes optid.Data"):
+        identify(np.zeros(10))
+    with pytest.raises(RankError, match="too few for cross-validation"):
+        identify(plant(25))
+    u = np.random.default_rng(0).normal(size=200)
+    with pytest.raises((DataError, SolverFailed), match="constant"):
+        identify(optid.Data(u, np.ones(200)), workers=1)
+    with pytest.raises((DataError, SolverFailed), match="constant"):
+        identify(optid.Data(np.ones(200), u), workers=1)
+
+
+def test_missing_samples_are_left_out():
+    data = plant(500, noise=0.05)
+    u, y = np.array(data.u).ravel(), np.array(data.y).ravel()
+    y[100:140] = np.nan
+    u[300:303] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        found = identify(optid.Data(u, y), classes=[LINEAR], workers=1)
+    assert found.chosen.score > 90
+
+
+def test_a_horizon_compares_predictions():
+    found = identify(plant(300), classes=[LINEAR], horizon=3, workers=1)
+    assert found.horizon == 3 and "3 samples ahead" in str(found)
+
+
+def test_two_outputs():
+    one, two = plant(300, seed=4), plant(300, seed=4, cubic=0.2)
+    found = identify(optid.Data(one.u, np.column_stack([one.y, two.y])), classes=[LINEAR], workers=1)
+    assert found.model.l == 2 and found.chosen.score > 50
+
+
+# -- the pool --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
+    told = []
+    pool = Pool(lambda x: (time.sleep(0.01), x * x)[1], count)
+    try:
+        assert pool.run(range(7), time.monotonic() + 60, told.append) == [x * x for x in range(7)]
+        assert sorted(told) == [x * x for x in range(7)]
+        assert pool.run(range(3), time.monotonic() - 1, told.append) == [None] * 3
+    finally:
+        pool.close()
+
+
+def test_a_pool_survives_the_death_of_a_process():
+    import os
+
+    pool = Pool(lambda x: os._exit(1) if x == 1 else x, 2)
+    try:
+        found = pool.run([0, 1, 2, 3], time.monotonic() + 60, lambda result: None)
+        assert found[1] is None and [x for x in found if x is not None] == [0, 2, 3]
+    finally:
+        pool.close()
+
+
+def test_what_hangs_ends_with_the_time(monkeypatch):
+    monkeypatch.setattr("optid.identify.search.pool.GRACE", 0.1)
+    pool = Pool(lambda x: time.sleep(600) if x else x, 2)
+    assert pool.run([0, 1], time.monotonic() + 0.5, lambda result: None) == [0, None]
+    pool.close()
+
+
+def test_nothing_that_can_be_fitted_is_an_error_with_the_most_frequent_reason(monkeypatch):
+    def refuse(candidate, *_):
+        return Trial(candidate, reason="RankError: too short")
+
+    monkeypatch.setattr(searching, "tried", refuse)
+    with pytest.raises(SolverFailed, match="most often: RankError: too short"):
+        identify(plant(200), workers=1)
+
+
+def test_layouts_of_the_sums_hold_every_lag():
+    data = plant(200)
+    sums = LagSums(Blocks.of(data), (Linear(),), na=2, lags=3)
+    assert isinstance(sums.layout, Layout)
+    assert sums.columns(1, 2, (1,)).tolist() == [0, 3, 4, 5]
