@@ -111,7 +111,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
         horizon: samples ahead of the predictions that are compared; None for the free run.
         deadline: by `time.monotonic`; where there is no rival, it takes the time it needs.
     """
-    clock, known = time.process_time(), Trial(candidate)
+    clock, found = time.process_time(), Trial(candidate)
     arguments = {**candidate.arguments, **spared(candidate),
                  **({"constraints": tuple(constraints)} if constraints else {})}
 
@@ -121,12 +121,13 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):  # the fit that is chosen tells them
             warnings.simplefilter("ignore")
-            for known in _steps(known, fitted, blocks, rival, horizon, deadline):
+            for known in _steps(found, fitted, blocks, rival, horizon, deadline):
+                found = known
                 if known.reason:
                     break
     except (OptidError, np.linalg.LinAlgError, ValueError) as error:
-        known = replace(known, reason=f"{type(error).__name__}: {error}")
-    return replace(known, seconds=time.process_time() - clock)
+        found = replace(found, reason=f"{type(error).__name__}: {error}")
+    return replace(found, seconds=time.process_time() - clock)
 
 
 def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Trial | None, horizon: int | None,
