@@ -100,7 +100,7 @@ def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
     """Return a CasADi matrix of a number, array or sparse matrix, column by column, without its zeros."""
     if sp.issparse(value):
-        return ca.DM(sp.csc_matrix(sp.csc_array(value).reshape(shape, order="F")))  # CasADi before 3.7 knows no csc_array
+        return ca.DM(sp.csc_matrix(sp.csc_array(value).reshape(shape, order="F")))  # CasADi 3.8.0 knows no csc_array
     return ca.sparsify(ca.DM(np.reshape(np.asarray(value, dtype=float), shape, order="F")))
 
 
