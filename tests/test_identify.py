@@ -13,7 +13,7 @@ from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.delays import LagSums, linear, scan, sharp_delays
 from optid.identify.search import identify
 from optid.identify.search import search as searching
-from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, Ladder, gain
+from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
 from optid.models.layout import Layout
@@ -32,6 +32,22 @@ def plant(samples=400, *, delay=0, cubic=0.0, noise=0.02, seed=0, start=0.0):
         x = 0.8 * x + (f[k - delay] if k >= delay else 0.0)
     y += noise * y.std() * rng.standard_normal(samples)
     return optid.Data(u, y)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """A ladder of a few structures."""
+
+    def lines(ladder):
+        yield [Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}),
+               Candidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]})]
+
+    def functions(ladder):
+        yield [Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": basis})
+               for basis in ("polynomial:3", "triangular:4")]
+
+    monkeypatch.setitem(RUNGS, LINEAR, lines)
+    monkeypatch.setitem(RUNGS, INPUTS, functions)
 
 
 # -- blocks ----------------------------------------------------------------------------------------------------------
@@ -209,6 +225,7 @@ def test_a_model_whose_run_diverges_in_a_block_is_never_chosen():
 # -- the whole -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cubic, expected", [(0.0, LINEAR), (0.5, INPUTS)])
 def test_the_class_of_a_simulated_plant_is_found(cubic, expected):
     told = []
@@ -223,36 +240,36 @@ def test_the_class_of_a_simulated_plant_is_found(cubic, expected):
     assert found.reasons[0].startswith("linear: ") and any("input functions" in reason for reason in found.reasons)
 
 
-def test_processes_find_the_same():
+def test_processes_find_the_same(short):
     data = plant(300, cubic=0.5, noise=0.05)
     alone, together = (identify(data, classes=KINDS[:2], workers=count) for count in (1, 2))
     assert alone.chosen.candidate.kind == together.chosen.candidate.kind == INPUTS
     assert together.chosen.score == pytest.approx(alone.chosen.score, abs=2.0)
 
 
-def test_an_interrupt_gives_the_best_so_far():
+def test_an_interrupt_gives_the_best_so_far(short):
     def stop(sentence):
         if "oe.exact" in sentence:
             raise KeyboardInterrupt
 
-    found = identify(plant(300), workers=1, progress=stop)
+    found = identify(plant(300), classes=KINDS[:2], workers=1, progress=stop)
     assert found.stopped == "an interrupt" and found.chosen.complete
     assert "ended by an interrupt" in str(found)
 
 
-def test_a_budget_ends_the_search():
-    found = identify(plant(400, cubic=0.4), budget=1.0, workers=1)
-    assert found.stopped == "the budget of 1 s" and found.model is not None
+def test_a_budget_ends_the_search(short):
+    found = identify(plant(400, cubic=0.4), classes=KINDS[:2], budget=1e-3, workers=1)
+    assert found.stopped == "the budget of 0.001 s" and found.chosen.candidate.kind == LINEAR
 
 
-def test_constraints_hold_for_what_is_chosen():
+def test_constraints_hold_for_what_is_chosen(short):
     data = plant(400, cubic=0.5, noise=0.05)
     found = identify(data, classes=[INPUTS], constraints=["monotone:increasing", "gain:20"], workers=1)
     assert {price.name.partition(":")[0].partition(" ")[0] for price in found.fit.prices} == {"monotone", "gain"}
     assert found.model.nonlinearities[0].basis.size > 1
 
 
-def test_inputs_of_few_levels_allow_linear_models_only():
+def test_inputs_of_few_levels_allow_linear_models_only(short):
     rng = np.random.default_rng(3)
     u = np.sign(rng.normal(size=300))
     y = np.convolve(u, 0.8 ** np.arange(40))[:300] + 0.1 * rng.normal(size=300)
@@ -262,6 +279,7 @@ def test_inputs_of_few_levels_allow_linear_models_only():
         identify(optid.Data(u, y), classes=[INPUTS])
 
 
+@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("changes, error, words", [
     ({"budget": 0}, StructureError, "budget is a number of seconds"), ({"blocks": 1}, StructureError, "blocks"),
     ({"classes": ["wiener"]}, StructureError, "wiener"), ({"horizon": 0}, StructureError, "horizon"),
@@ -273,7 +291,7 @@ def test_arguments_that_cannot_be_are_refused(changes, error, words):
         identify(plant(200), **{"workers": 1, **changes})
 
 
-def test_bad_records_are_refused():
+def test_bad_records_are_refused(short):
     with pytest.raises(DataError, match="identify takes optid.Data"):
         identify(np.zeros(10))
     with pytest.raises(RankError, match="too few for cross-validation"):
@@ -285,7 +303,7 @@ def test_bad_records_are_refused():
         identify(optid.Data(np.ones(200), u), workers=1)
 
 
-def test_missing_samples_are_left_out():
+def test_missing_samples_are_left_out(short):
     data = plant(500, noise=0.05)
     u, y = np.array(data.u).ravel(), np.array(data.y).ravel()
     y[100:140] = np.nan
@@ -296,11 +314,12 @@ def test_missing_samples_are_left_out():
     assert found.chosen.score > 90
 
 
-def test_a_horizon_compares_predictions():
+def test_a_horizon_compares_predictions(short):
     found = identify(plant(300), classes=[LINEAR], horizon=3, workers=1)
     assert found.horizon == 3 and "3 samples ahead" in str(found)
 
 
+@pytest.mark.slow
 def test_two_outputs():
     one, two = plant(300, seed=4), plant(300, seed=4, cubic=0.2)
     found = identify(optid.Data(one.u, np.column_stack([one.y, two.y])), classes=[LINEAR], workers=1)

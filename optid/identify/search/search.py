@@ -157,7 +157,8 @@ def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told
         rival = ladder.rival(kind)
         last = end if rival else np.inf  # the first are waited for
         for candidate, trial in zip(fresh, pool.run([(c, rival, limit) for c in fresh], last, told)):
-            ladder.trials[candidate.key] = Trial(candidate, reason="out of time") if trial is None else trial
+            if trial is None:
+                ladder.trials[candidate.key] = Trial(candidate, reason="out of time")
         try:
             batch = rung.send([ladder.trials[c.key] for c in batch])
         except StopIteration:
@@ -193,6 +194,7 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None] | None, clock: float, trial: Trial) -> None:
+    ladder.trials[trial.candidate.key] = trial  # also what an interrupt leaves
     if progress is not None:
         outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
         progress(f"{time.monotonic() - clock:.0f} s, {trial.candidate.kind}: {trial.candidate.formulation} "
