@@ -90,6 +90,7 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
     sections = {value for tag, name, value in page.attributes if tag == "section" and name == "id"}
     assert sections == {
         "verdict",
+        "trust",
         "model",
         "figures",
         "constraints",
