@@ -5,7 +5,7 @@ import pytest
 from state_systems import linear
 
 import optid
-from formulations import state_shooting
+from formulations.constraints.poles import stable
 from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
@@ -58,3 +58,94 @@ def same(data, case, solver="ipopt", **changes):
 @pytest.mark.parametrize("case", CASES)
 def test_ipopt_finds_the_optimum_of_the_descents(case):
     same(record(case), case)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_subspace_starts_without_a_descent(case):
+    data = record(case, noise=0.5, seed=1)
+    name, options = CASES[case]
+    weights = {"weighting": "scale"}
+    ours = optid.fit(data, f"{name}.shooting", solver="ipopt", iterations=0, **options, **weights)
+    theirs = optid.fit(data, f"{name}.exact", **options, **weights)
+    assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
+    ours.program.assign(ours.program.start)
+    assert ours.program.objective.value > (1 + 1e-5) * ours.solution.objective
+
+
+@pytest.mark.parametrize("weighting", ["auto", "determinant"])
+def test_gaps_and_several_experiments(weighting):
+    data = record("two by two", (200, 150), noise=0.2, gaps=0.1)
+    options = {"nx": 2, "weighting": weighting}
+    ours = optid.fit(data, "ss.shooting", solver="ipopt", **options)
+    theirs = optid.fit(data, "ss.exact", **options)
+    assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
+    assert ours.values["states[2]"].shape == (150, 2)
+    for i, (one, other) in enumerate(zip(ours.model.simulate(data, x0="fit"), theirs.model.simulate(data, x0="fit"))):
+        assert one == pytest.approx(other, abs=1e-5 * np.abs(other).max())
+        course = ours.program.view[f"output[{i + 1}]"].value
+        assert course.shape == one.shape
+
+
+@pytest.mark.parametrize("solver", ["uno", "fatrop"])
+def test_other_back_ends(solver):
+    if not optid.backends.back_ends()[solver].installed:
+        pytest.skip(f"{solver} is not installed")
+    same(record("hammerstein", (80,)), "hammerstein", solver)
+
+
+def test_standard_errors_are_those_of_the_reduced_fit():
+    ours, theirs = same(record("hammerstein"), "hammerstein")
+    for quantity in (lambda model: np.abs(model.poles), lambda model: model.simulate(np.full((5, 1), 0.5))):
+        one, other = (optid.uncertainty(fit).interval(quantity) for fit in (ours, theirs))
+        assert one.standard_error == pytest.approx(other.standard_error, rel=1e-3)
+
+
+def test_constraints_on_courses_in_units_of_the_record():
+    data = record("hammerstein")
+    data = Data(data.u, 100.0 + 40.0 * data.y)
+    free = optid.fit(data, "hammerstein_ss.shooting", solver="ipopt", nx=2)
+    ceiling = 100.0 + 0.9 * (float(np.max(free.model.simulate(data, x0="fit"))) - 100.0)
+    fit = optid.fit(data, "hammerstein_ss.shooting", solver="ipopt", nx=2,
+                    constraints=[lambda v: {"ceiling": v["output"] <= ceiling}])
+    assert fit.solution.status is Status.LOCAL
+    assert np.max(fit.model.simulate(data, x0="fit")) == pytest.approx(ceiling, rel=1e-4)
+    assert fit.solution.objective > free.solution.objective and fit.prices[0].active
+    reach = 0.8 * np.max(np.abs(free.program.view["states"].value[:, 0]))
+    fit = optid.fit(data, "hammerstein_ss.shooting", solver="ipopt", nx=2, constraints=[
+        lambda v: {"state": v["states"][:, 0] ** 2 <= reach**2}])
+    assert np.max(np.abs(fit.program.view["states"].value[:, 0])) <= reach * (1 + 1e-6)
+
+
+def test_a_start_that_grows_and_an_integrator_are_named():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 120), np.zeros(120)
+    for k in range(1, 120):
+        y[k] = 1.03 * y[k - 1] + u[k - 1]
+    fit = optid.fit(Data(u, y), "ss.shooting", nx=1, solver="ipopt", raises=False)
+    assert fit.solution.status is not Status.LOCAL or fit.model.is_stable
+    fit = optid.fit(Data(u, y), "ss.shooting", nx=1, stability="free", solver="ipopt", raises=False)
+    assert fit.solution.status is Status.LOCAL and abs(fit.model.poles[0]) == pytest.approx(1.03, abs=1e-6)
+
+
+def test_refusals():
+    data = record("hammerstein", (150,))
+    lost = data.u.copy()
+    lost[::2] = np.nan
+
+    def refused(error, match, data=data, name="hammerstein_ss.shooting", **changes):
+        with pytest.raises(error, match=match):
+            optid.fit(data, name, solver="ipopt", **({"nx": 2} | changes))
+
+    long = np.random.default_rng(0).uniform(-1, 1, (6000, 1))
+    refused(StructureError, "6000 samples.*up to 5000.*'hammerstein_ss.exact'", Data(long, long))
+    refused(DataError, "stretch|missing", Data(lost, data.y))
+    refused(RankError, "samples for|needed", Data(data.u[:12], data.y[:12]))
+    refused(OptidError, "samples|states|rows", nx=60)
+    refused(DataError, "constant", Data(np.ones((150, 1)), data.y))
+    refused(StructureError, "weighting", weighting="heavy")
+    refused(StructureError, "stability", stability="maybe")
+    refused(StructureError, "asks for 'state'.*states", constraints=[lambda v: v["state"] <= 1])
+    refused(StructureError, "about poles.*hammerstein_ss.exact", constraints=[stable(0.9)])
+    refused(StructureError, "triangular basis.*no formula", feedback_basis="triangular:4")
+    refused(OptidError, "", constraints=[lambda v: {"up": v["A"][0, 0] >= 1, "down": v["A"][0, 0] <= -1}])
+    refused(StructureError, "nonnegative integer", iterations=-1)
