@@ -10,8 +10,9 @@ constraints on states. A start is found as there; the programme is posed at the 
 found on the way, or at the best start itself with ``iterations=0``.
 
 The matrices are full; what changes no output (changes of the states, the scales of products such as mu b, affine
-changes of z) is fixed by linear rows: the step from the start is orthogonal to it. Nothing keeps the poles inside the
-unit circle on the way; a result whose run is unstable, or is not the run of its model, says so in its status. The
+changes of z) is fixed by linear rows: the step from the start is orthogonal to it. Courses stay within ten times their
+size at the start; nothing else keeps the poles inside the unit circle. Constraints that the start violates by much may
+lead to states that satisfy the equations backwards in time. A result whose run is unstable, or is not the run of its model, says so in its status. The
 functions g and h need a formula: polynomials and trigonometric ones, which the programme continues beyond their
 interval. The states are those of the start up to the small change that the gauge allows: constraints on single states
 suit models given as ``initial``, constraints on ``output`` every model.
@@ -22,7 +23,6 @@ Named variables: those of `formulations.state_space` (``A``, ``C``, ``mu``, ``b`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import cvxpy as cp
@@ -38,7 +38,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.refinement import NO_BOUND
-from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_errors import WILD, StateErrors
 from optid.identify.prediction_error.state_uncertainty import CompressedStates
 from optid.identify.subspace.plan import Plan
 from optid.models import HammersteinSS
@@ -127,21 +127,21 @@ def _fit(name: str, data: Data, nx: int | str, constraints: Sequence[Any], stabi
             raise StructureError(f"constraint {rule.name!r} is about poles, which this programme does not have: use it "
                                  f"with '{name}.exact'")
     return state_space_fit(f"{name}.shooting", data, nx, criterion="simulation", stability=stability,
-                           constraints=constraints, finish=partial(_shoot, stability == "stable"), **settings)
+                           constraints=constraints, finish=_shoot, **settings)
 
 
-def _shoot(stable: bool, plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
+def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
            figures: Mapping[str, Any]) -> Procedure:
     """Solve the programme from where the descents arrived, and judge the model by its own run."""
     fit = StateShooting(plan.name, errors, constraints, plan.units)
     x = fit.signed(best.x)
-    program = replace(fit.pose(x, errors.linearise(x), 0.0), settled=best.converged and not constraints)
+    program = replace(fit.pose(x, errors.linearise(x), 0.0), settled=best.converged)
     solution = yield program
     if not solution.has_point:
         return None
     program.assign(solution.values)
     x = fit.places.pack(solution.values)
-    status, reason = _judged(errors, x, solution, stable)
+    status, reason = _judged(errors, x, solution)
     if status is Status.LOCAL and isinstance(program.compressed, CompressedStates):
         program.compressed.settle(program)
     model = fit.recover(solution.values)
@@ -149,12 +149,12 @@ def _shoot(stable: bool, plan: Plan, errors: StateErrors, constraints: tuple[Any
     return Evidence(model, solution.objective, bound, status, reason, {**figures, "Gauss-Newton steps": best.steps})
 
 
-def _judged(errors: StateErrors, x: Array, solution: Solution, stable: bool) -> tuple[Status, str]:
+def _judged(errors: StateErrors, x: Array, solution: Solution) -> tuple[Status, str]:
     """Take the solver's status only where the model is stable and its run has the errors of the programme."""
     if solution.status not in (Status.LOCAL, Status.OPTIMAL):
         return solution.status, solution.reason
     radius = spectral_radius(errors.unknowns.unpack(x).A)
-    if stable and radius >= errors.limit:
+    if radius >= errors.limit:
         return Status.INACCURATE, (f"the model is unstable (spectral radius of A {radius:.6g}): its states satisfy the "
                                    "equations, but no run from x0 will; use the .exact formulation, or stability='free'")
     value = errors.value(x)
@@ -207,12 +207,13 @@ class StateShooting(StateSpaceFit):
         e, unknowns, key = self.criterion.data.experiments[i], self.criterion.unknowns, self.criterion.key
         expansion, n, found = unknowns.expansion, unknowns.n, {}
 
-        def course(name: str, shape: Any, value: Any) -> cp.Variable:
-            one = variables[f"{name}{label}"] = cp.Variable(shape, name=f"{name}{label}")
+        def course(name: str, value: Array) -> cp.Variable:
+            limit = np.broadcast_to(WILD * np.max(np.abs(value), axis=0), value.shape)
+            one = variables[f"{name}{label}"] = cp.Variable(value.shape, name=f"{name}{label}", bounds=[-limit, limit])
             one.value = value
             return one
 
-        x = course("states", run.shape, run)
+        x = course("states", run)
         following, shown = x @ variables["A"].T, x @ variables["C"].T
         for c, basis in enumerate(expansion.inputs):
             b, eta = variables[key("b", c)], basis.values(e.u[:, c])
@@ -222,14 +223,14 @@ class StateShooting(StateSpaceFit):
         for j, one in enumerate(unknowns.latent):
             row, matrix = variables[key("z", j)], variables[key("g", j)]
             argument = x @ row[:n] + row[-1] + (e.u @ row[n:-1] if one.moved else 0.0)
-            z = course(f"signal of {key('z', j)}", len(run), argument.value)
+            z = course(f"signal of {key('z', j)}", argument.value)
             found[f"{z.name()}"] = (z == argument,)
             h = _values(one.basis, z, one.vectors @ variables[key("c", j)])
             following = following + _outer(h, matrix[:n])
             shown = shown + _outer(h, matrix[n:]) if one.direct else shown
         if unknowns.constant:
             shown = shown + _outer(cp.Constant(np.ones(len(run))), variables["offset"])
-        output = course("output", e.y.shape, shown.value)
+        output = course("output", shown.value)
         for j, family in enumerate(expansion.feedback):
             nu = variables[key("nu", j)] if family.size > 1 else np.ones(1)
             g = (_values(family.basis, output[:, family.output], family.vectors @ nu)
