@@ -10,12 +10,12 @@ constraints on states. A start is found as there; the programme is posed at the 
 found on the way, or at the best start itself with ``iterations=0``.
 
 The matrices are full; what changes no output (changes of the states, the scales of products such as mu b, affine
-changes of z) is fixed by linear rows: the step from the start is orthogonal to it. Courses stay within ten times their
-size at the start; nothing else keeps the poles inside the unit circle. Constraints that the start violates by much may
-lead to states that satisfy the equations backwards in time. A result whose run is unstable, or is not the run of its model, says so in its status. The
-functions g and h need a formula: polynomials and trigonometric ones, which the programme continues beyond their
-interval. The states are those of the start up to the small change that the gauge allows: constraints on single states
-suit models given as ``initial``, constraints on ``output`` every model.
+changes of z) is fixed by linear rows: the step from the start is orthogonal to it. Courses stay within ten times
+their size at the start; nothing else keeps the poles inside the unit circle. Constraints that the start violates by
+much may lead to states that satisfy the equations backwards in time. A result whose run is unstable, or is not the
+run of its model, says so in its status. The functions g and h need a formula: polynomials and trigonometric ones,
+which the programme continues beyond their interval. The states are those of the start up to the small change that the
+gauge allows: constraints on single states suit models given as ``initial``, constraints on ``output`` every model.
 
 Named variables: those of `formulations.state_space` (``A``, ``C``, ``mu``, ``b``, ``z``, ...), with the exact products
 ``Theta``, and the courses ``states`` (N, nx) and ``output`` (N, l), with several experiments ``states[1]``, ...
@@ -156,12 +156,12 @@ def _judged(errors: StateErrors, x: Array, solution: Solution) -> tuple[Status, 
     radius = spectral_radius(errors.unknowns.unpack(x).A)
     if radius >= errors.limit:
         return Status.INACCURATE, (f"the model is unstable (spectral radius of A {radius:.6g}): its states satisfy the "
-                                   "equations, but no run from x0 will; use the .exact formulation, or stability='free'")
+                                   "equations, but no run from x0 will; use the .exact formulation or stability='free'")
     value = errors.value(x)
     if not abs(value - solution.objective) <= SAME_RUN * abs(value) + 1e-9 * errors.energy:
         return Status.INACCURATE, (f"a run of the model has the squared errors {value:.6g}, the programme "
-                                   f"{solution.objective:.6g}: it is unstable, or leaves the interval of a function, where "
-                                   "this programme continues it; give that basis outside='extrapolate'")
+                                   f"{solution.objective:.6g}: it is unstable, or leaves the interval of a function, "
+                                   "where this programme continues it; give that basis outside='extrapolate'")
     return Status.LOCAL, NO_BOUND.format(errors.errors)
 
 
@@ -197,8 +197,9 @@ class StateShooting(StateSpaceFit):
                     outputs=expansion.output_names, reference=start, units=units,
                     bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
         objective = cp.Minimize(sum(cp.sum_squares(variables[name]) for name in derived))
-        program = Program(self.name, objective, structural, variables, start, self.recover, view, frozenset(structural),
-                          derived=derived, compressed=compressed, scale=errors.energy, courses=courses,
+        program = Program(self.name, objective, structural, variables, start, self.recover, view,
+                          frozenset(structural), derived=derived, compressed=compressed, scale=errors.energy,
+                          courses=courses,
                           note=NO_BOUND.format(errors.errors))
         return program.subject_to(*self.constraints)
 

@@ -190,8 +190,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     """Fit a model in the units of the samples, and return it in those of the record.
 
     ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none.
-    ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None solves the
-    programmes in the tangent.
+    ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
+    solves the programmes in the tangent.
     The other arguments are those of `hammerstein_ss`, as are the errors raised.
     """
     for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
