@@ -17,6 +17,8 @@ run of its model, says so in its status. The functions g and h need a formula: p
 which the programme continues beyond their interval. The states are those of the start up to the small change that the
 gauge allows: constraints on single states suit models given as ``initial``, constraints on ``output`` every model.
 
+IPOPT takes records up to the limit in seconds; Uno and fatrop factorise densely and are for some hundred samples.
+
 Named variables: those of `formulations.state_space` (``A``, ``C``, ``mu``, ``b``, ``z``, ...), with the exact products
 ``Theta``, and the courses ``states`` (N, nx) and ``output`` (N, l), with several experiments ``states[1]``, ...
 """
