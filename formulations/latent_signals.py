@@ -11,7 +11,7 @@
 The errors are minimised over all parts, z included, by the programmes of `formulations.state_space`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -53,15 +53,21 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
         RankError: too few samples, or no direction of z whose run stays finite.
     """
-    check_integer(channels, "channels")
-    one_of("latent", latent, ("states+inputs", "states"))
-    inner = _on_latent(latent_basis)
-    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
-    extend = partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations)
+    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations)
     return state_space_fit(
         "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
         weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
         iterations=iterations, constraints=constraints, extend=extend)
+
+
+def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool, seed: int, iterations: int
+                    ) -> Callable[..., Any]:
+    """Return what adds the latent signals of `lfr` to an optimum without them; arguments and errors as there."""
+    check_integer(channels, "channels")
+    one_of("latent", latent, ("states+inputs", "states"))
+    inner = _on_latent(latent_basis)
+    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
+    return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations)
 
 
 def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",

@@ -97,8 +97,7 @@ class _Collocation:
 
     def __init__(self, errors: PhysicalErrors) -> None:
         self.errors, self.data, self.equations = errors, errors.data, errors.equations
-        several = self.data.n_experiments > 1
-        self.labels = [f"[{i}]" if several else "" for i in range(1, self.data.n_experiments + 1)]
+        self.labels = errors.labels
         self.variables = errors.places.variables()
         sizes = errors.usual[errors.unknowns.n :]
         self.view = {name: size * self.variables[name] for name, size in zip(self.equations.parameters, sizes)}

@@ -73,8 +73,7 @@ class _Shooting:
 
     def __init__(self, criterion: TransferErrors) -> None:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
-        several = criterion.unknowns.experiments > 1
-        self.labels = [f"[{i}]" if several else "" for i in range(1, criterion.unknowns.experiments + 1)]
+        self.labels = criterion.labels
         self.key, self.places = criterion.key, Places.of(criterion.unknowns, criterion.key)
         self.variables = self.places.variables()
         self.variables.pop("x0", None)  # the first outputs are the initial state

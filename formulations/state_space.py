@@ -37,6 +37,7 @@ from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import enough_rows, in_memory, outputs_present
+from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -184,15 +185,18 @@ class StateSpaceFit(TangentFit):
 def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, stability: str,
                     weighting: str, iterations: int, constraints: Sequence[Any], initial: Any, block_rows: Any,
                     basis: Any = "linear", feedback_basis: Any = None, offset: bool = True, feedthrough: Any = True,
-                    extend: Callable[..., Any] | None = None) -> Procedure:
+                    extend: Callable[..., Any] | None = None, finish: Callable[..., Procedure] | None = None
+                    ) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record.
 
     ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none.
+    ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
+    solves the programmes in the tangent.
     The other arguments are those of `hammerstein_ss`, as are the errors raised.
     """
     for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
         one_of(what, word, WORDS[what])
-    check_integer(iterations, "iterations")
+    check_integer(iterations, "iterations", 1 if finish is None else 0)
     in_memory(data, f"{criterion} errors")
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and criterion == "prediction":
@@ -217,11 +221,16 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
             errors, best, more = extend(errors, best)
             figures = {**figures, **more}
         others = tuple(rule for rule in constraints if rule not in poles)
-        programmes = StateSpaceFit(plan.name, errors, others, plan.units)
-        evidence = yield from refine(programmes, best, {"order": nx, **figures}, programmes.signed(best.x))
+        evidence = yield from (finish or _refined)(plan, errors, others, best, {"order": nx, **figures})
         return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
 
     return in_record_units(run(), plan)
+
+
+def _refined(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent, figures: Mapping[str, Any]
+             ) -> Procedure:
+    programmes = StateSpaceFit(plan.name, errors, constraints, plan.units)
+    return (yield from refine(programmes, best, figures, programmes.signed(best.x)))
 
 
 def _block_rows(plan: Plan) -> list[int | None]:

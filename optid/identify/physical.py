@@ -349,9 +349,7 @@ class CompressedPhysical(CompressedStates):
         Raises:
             RankError: parameters that the record, with the constraints that bind, does not determine.
         """
-        x = self.places.pack(program.values())
-        for name, value in {"reference": x, "at": self.criterion.linearise(x)}.items():
-            object.__setattr__(self, name, value)
+        super().settle(program)
         equal, above, slack = constraint_rows(program, tuple(self.places.names))
         self._refuse_undetermined(np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]]))
 

@@ -17,8 +17,8 @@ from optid.data.channels import Transform
 SIGNALS = ("x", "output")
 """Named courses of the output, one row per sample."""
 
-HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", "mu feedback", "Theta feedback",
-           "static")
+HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "states", "B", "Bu", "D", "Du", "Ez", "mu feedback",
+           "Theta feedback", "static")
 """Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""
 
 

@@ -63,6 +63,12 @@ class Criterion(ABC):
         return "prediction errors" if self.unknowns.innovations else "simulation errors"
 
     @cached_property
+    def labels(self) -> list[str]:
+        """What the names of the courses of every experiment end in: "[1]", ..., nothing where there is only one."""
+        count = self.data.n_experiments
+        return [f"[{i}]" if count > 1 else "" for i in range(1, count + 1)]
+
+    @cached_property
     def energy(self) -> float:
         """Weighted sum of squares of the outputs about their means."""
         y = np.vstack([e.y for e in self.data.experiments])

@@ -14,8 +14,7 @@ from optid.arrays import Array
 from optid.errors import DataError, RankError
 from optid.identify.prediction_error.descent import Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.models import state_simulation as simulation
-from optid.statistics.state_unknowns import SIMULATORS, Latent, StatePoint
+from optid.statistics.state_unknowns import Latent, StatePoint
 
 RANKED = 8_000
 """Samples on which directions are ranked and short descents made."""
@@ -81,7 +80,7 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
     Arguments and errors as `add_channels`; ``functions`` has one for every output, of basis functions as they are.
     """
     point, n = errors.unknowns.unpack(best.x), errors.unknowns.n
-    signals = np.hstack([np.vstack(_visited(errors, point)), np.vstack([e.u for e in errors.data.experiments])])
+    signals = np.hstack([np.vstack(errors.visited(point)), np.vstack([e.u for e in errors.data.experiments])])
     measured, offsets, cs, rows = np.vstack([e.y for e in errors.data.experiments]), [], [], []
     for o, one in enumerate(functions):
         v = np.concatenate([point.C[o], point.d[o]])
@@ -103,7 +102,7 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
 def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
     """Return the same model in states of unit covariance over the record."""
     point = errors.unknowns.unpack(x)
-    runs = _visited(errors, point)
+    runs = errors.visited(point)
     covariance = np.atleast_2d(np.cov(np.vstack(runs).T))
     values, vectors = np.linalg.eigh(covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance)))
     turn = (vectors / np.sqrt(values)).T
@@ -111,13 +110,6 @@ def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
     moved = replace(point, A=turn @ point.A @ back, C=point.C @ back, K=turn @ point.K, b=turn @ point.b,
                     e=turn @ point.e, Ez=turn @ point.Ez, Cz=point.Cz @ back, x0=point.x0 @ turn.T)
     return errors, errors.normalised(errors.unknowns.pack(moved))
-
-
-def _visited(errors: StateErrors, point: StatePoint) -> list[Array]:
-    """States (N, n) of every experiment."""
-    model, word = errors.at(point), SIMULATORS[errors.unknowns.criterion]
-    return [simulation.visited(simulation.prepared(model, word, e.u, e.y, None, ""), x0)
-            for e, x0 in zip(errors.data.experiments, point.x0)]
 
 
 def _first(errors: StateErrors, size: int) -> StateErrors:
@@ -160,7 +152,7 @@ def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: i
                 ) -> Iterator[Array]:
     """Yield rows [Cz, Dz, constant] whose z fills [-1, 1] on the record: states, inputs, outputs, random ones."""
     n, m = errors.unknowns.n, errors.unknowns.expansion.m
-    states = np.vstack(_visited(errors, point))
+    states = np.vstack(errors.visited(point))
     signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
     moving = np.concatenate([np.ones(n), np.full(m, float(latent.moved))])
     known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))])]

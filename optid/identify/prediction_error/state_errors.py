@@ -19,10 +19,10 @@ from optid.identify.prediction_error.descent import Criterion
 from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.roots import spectral_radius
-from optid.models.state_simulation import allowed_range
+from optid.models.state_simulation import allowed_range, prepared, visited
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.state_sensitivities import StatePredictor
-from optid.statistics.state_unknowns import StatePoint, StateUnknowns
+from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
 WILD = 10.0
@@ -110,6 +110,12 @@ class StateErrors(Criterion):
     def residuals(self, x: Array) -> list[Array]:
         """Return the errors (N, l) of every experiment."""
         return self._predictor.residuals(x)
+
+    def visited(self, point: StatePoint) -> list[Array]:
+        """Return the states (N, n) of the run of every experiment."""
+        model, word = self.at(point), SIMULATORS[self.unknowns.criterion]
+        return [visited(prepared(model, word, e.u, e.y, None, ""), x0)
+                for e, x0 in zip(self.data.experiments, point.x0)]
 
     def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.

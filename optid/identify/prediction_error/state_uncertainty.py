@@ -18,6 +18,7 @@ from optid.identify.noise import regression_lags
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.tangent_fit import CompressedErrors, LeastSquares
 from optid.program.compressed import Spread, degrees_of_freedom
+from optid.program.program import Program
 from optid.program.units import energy_unit
 from optid.statistics.coloured import long_autoregression, response_of, scattered
 from optid.statistics.hankel import complete_runs
@@ -36,10 +37,20 @@ class CompressedStates(CompressedErrors):
     Attributes:
         criterion: the errors.
         outward: from the units of the programme's models to those of the record.
+        fixed: whether the programme fixes by rows what changes no output.
     """
 
     criterion: StateErrors
     outward: Transform
+    fixed: bool = False
+
+    def settle(self, program: Program) -> None:
+        """Linearise the errors anew, where the variables of the programme stand."""
+        x = self.places.pack(program.values())
+        for name in ("problem", "statistics", "free", "_scaled"):
+            self.__dict__.pop(name, None)
+        for name, value in {"reference": x, "at": self.criterion.linearise(x)}.items():
+            object.__setattr__(self, name, value)
 
     @cached_property
     def _scaled(self) -> tuple[Array, Array, Array]:
@@ -83,7 +94,7 @@ class CompressedStates(CompressedErrors):
         """Return the scatter under the noise that the errors at the iterate show."""
         criterion, x = self.criterion, self.reference
         unknowns, outputs = criterion.unknowns, criterion.unknowns.l
-        known = moves.shape[1] - len(criterion.gauge_rows(x)) - len(self.free)
+        known = moves.shape[1] - (0 if self.fixed else len(criterion.gauge_rows(x)) + len(self.free))
         dof = degrees_of_freedom(self.statistics.rows / outputs, known / outputs)
         errors = criterion.residuals(x)
         complete = np.vstack([e[~np.isnan(e).any(axis=1)] for e in errors])

@@ -1,0 +1,288 @@
+"""State-space models with the states at every sample as variables: one sparse programme for NLP back ends.
+
+    minimise sum_k |W (y(k) - output(k))|²
+    subject to x(k+1) = A x(k) + B f(u(k)) + E g(output(k)) + Ez h(z(k)),
+               output(k) = C x(k) + D f(u(k)) + Fz h(z(k)) + d,    z(k) = Cz x(k) + Dz u(k) + const,
+
+multiple shooting with one sample between the nodes (Bock 1981) for the free run, with the optima of ``ss.exact``,
+``hammerstein_ss.exact`` and ``lfr.exact`` and another way there: a cross-check of their descents, and the way for
+constraints on states. A start is found as there; the programme is posed at the end of its descent, with the weights W
+found on the way, or at the best start itself with ``iterations=0``.
+
+The matrices are full; what changes no output (changes of the states, the scales of products such as mu b, affine
+changes of z) is fixed by linear rows: the step from the start is orthogonal to it. Courses stay within ten times
+their size at the start; nothing else keeps the poles inside the unit circle. Constraints that the start violates by
+much may lead to states that satisfy the equations backwards in time. A result whose run is unstable, or is not the
+run of its model, says so in its status. The functions g and h need a formula: polynomials and trigonometric ones,
+which the programme continues beyond their interval. The states are those of the start up to the small change that the
+gauge allows: constraints on single states suit models given as ``initial``, constraints on ``output`` every model.
+
+IPOPT takes records up to the limit in seconds; Uno and fatrop factorise densely and are for some hundred samples.
+
+Named variables: those of `formulations.state_space` (``A``, ``C``, ``mu``, ``b``, ``z``, ...), with the exact products
+``Theta``, and the courses ``states`` (N, nx) and ``output`` (N, l), with several experiments ``states[1]``, ...
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import scipy.sparse as sp
+
+from formulations.latent_signals import latent_channels
+from formulations.state_space import StateSpaceFit, state_space_fit
+from optid.bases import Bases, Polynomial, Trigonometric
+from optid.bases.basis import Basis, span
+from optid.data.record import Data
+from optid.errors import StructureError
+from optid.identify.arguments import in_memory
+from optid.identify.prediction_error.descent import Descent
+from optid.identify.prediction_error.refinement import NO_BOUND
+from optid.identify.prediction_error.state_errors import WILD, StateErrors
+from optid.identify.prediction_error.state_uncertainty import CompressedStates
+from optid.identify.subspace.plan import Plan
+from optid.models import HammersteinSS
+from optid.models.roots import spectral_radius
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status
+from optid.program.units import outer_bases
+from optid.program.view import View
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.linearised import Linearised
+
+Array = np.ndarray
+
+LIMIT = 5_000
+"""Samples up to which the programme is posed."""
+
+SAME_RUN = 1e-6
+"""Relative difference between the objective and the squared errors of a run of the model that is rounding."""
+
+
+def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = None, weighting: str = "auto",
+       offset: bool = True, feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+       initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
+       ) -> Procedure:
+    """Minimise the simulation error of a linear model with its states as variables.
+
+    Named variables: ``Theta``, ``output``, ``states``. Arguments as in `hammerstein_ss`, as are the errors raised.
+    """
+    return _fit("ss", data, nx, block_rows=block_rows, weighting=weighting, offset=offset, feedthrough=feedthrough,
+                stability=stability, initial=initial, iterations=iterations, constraints=constraints)
+
+
+def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
+                   block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
+                   feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+                   initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
+                   constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation error of a Hammerstein model, with output feedback or without, its states as variables.
+
+    Named variables: ``Theta``, ``output``, ``states``. Other arguments as in `formulations.state_space.hammerstein_ss`.
+
+    Args:
+        feedback_basis: polynomials or trigonometric functions.
+        iterations: Gauss-Newton steps per descent at most; 0 starts from the best subspace fit.
+        constraints: builders of smooth constraints in the named variables.
+
+    Raises:
+        StructureError: words, orders or starts that do not fit, too many samples, a rule about poles, a basis of the
+            feedback without a formula.
+        DataError: no stretch of some length in which every input is present.
+        RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
+    """
+    return _fit("hammerstein_ss", data, nx, basis=basis, feedback_basis=feedback_basis, block_rows=block_rows,
+                weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
+                iterations=iterations, constraints=constraints)
+
+
+def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3",
+        latent: str = "states+inputs", direct: bool = False, basis: Bases = "linear",
+        block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
+        feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
+        initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
+        constraints: Sequence[Any] = ()) -> Procedure:
+    """Minimise the simulation error of a model with functions of latent signals, its states as variables.
+
+    Named variables: ``Theta``, ``output``, ``states``. Other arguments as in `formulations.latent_signals.lfr`, errors
+    raised as in `hammerstein_ss`.
+
+    Args:
+        latent_basis: polynomials or trigonometric functions.
+    """
+    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations)
+    return _fit("lfr", data, nx, basis=basis, block_rows=block_rows, weighting=weighting, offset=offset,
+                feedthrough=feedthrough, stability=stability, initial=initial, iterations=iterations,
+                constraints=constraints, extend=extend)
+
+
+def _fit(name: str, data: Data, nx: int | str, constraints: Sequence[Any], stability: str, **settings: Any
+         ) -> Procedure:
+    count = in_memory(data, "simulation errors").n_samples
+    if count > LIMIT:
+        raise StructureError(f"{count} samples: with the states of every sample as variables this formulation takes up "
+                             f"to {LIMIT}. Use '{name}.exact', which has the same optima, or fewer samples")
+    for rule in constraints:
+        if getattr(rule, "about", frozenset()) == frozenset({"poles"}):
+            raise StructureError(f"constraint {rule.name!r} is about poles, which this programme does not have: use it "
+                                 f"with '{name}.exact'")
+    return state_space_fit(f"{name}.shooting", data, nx, criterion="simulation", stability=stability,
+                           constraints=constraints, finish=_shoot, **settings)
+
+
+def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
+           figures: Mapping[str, Any]) -> Procedure:
+    """Solve the programme from where the descents arrived, and judge the model by its own run."""
+    fit = StateShooting(plan.name, errors, constraints, plan.units)
+    x = fit.signed(best.x)
+    program = replace(fit.pose(x, errors.linearise(x), 0.0), settled=best.converged)
+    solution = yield program
+    if not solution.has_point:
+        return None
+    program.assign(solution.values)
+    x = fit.places.pack(solution.values)
+    status, reason = _judged(errors, x, solution)
+    if status is Status.LOCAL and isinstance(program.compressed, CompressedStates):
+        program.compressed.settle(program)
+    model = fit.recover(solution.values)
+    bound = Bound.none(NO_BOUND.format(errors.errors))
+    return Evidence(model, solution.objective, bound, status, reason, {**figures, "Gauss-Newton steps": best.steps})
+
+
+def _judged(errors: StateErrors, x: Array, solution: Solution) -> tuple[Status, str]:
+    """Take the solver's status only where the model is stable and its run has the errors of the programme."""
+    if solution.status not in (Status.LOCAL, Status.OPTIMAL):
+        return solution.status, solution.reason
+    radius = spectral_radius(errors.unknowns.unpack(x).A)
+    if radius >= errors.limit:
+        return Status.INACCURATE, (f"the model is unstable (spectral radius of A {radius:.6g}): its states satisfy the "
+                                   "equations, but no run from x0 will; use the .exact formulation or stability='free'")
+    value = errors.value(x)
+    if not abs(value - solution.objective) <= SAME_RUN * abs(value) + 1e-9 * errors.energy:
+        return Status.INACCURATE, (f"a run of the model has the squared errors {value:.6g}, the programme "
+                                   f"{solution.objective:.6g}: it is unstable, or leaves the interval of a function, "
+                                   "where this programme continues it; give that basis outside='extrapolate'")
+    return Status.LOCAL, NO_BOUND.format(errors.errors)
+
+
+class StateShooting(StateSpaceFit):
+    """The programme of a record, and the model of its values."""
+
+    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+        """State the programme with the start z0."""
+        errors, variables, units = self.criterion, self.places.variables(), self.units
+        start = dict(self.places.values(z0))
+        compressed = CompressedStates(at, self.places, z0, np.array([errors.energy]), errors.data.n_samples, errors,
+                                      units, fixed=True)
+        rows = np.pad(errors.gauge_rows(z0), ((0, 0), (0, z0.size - errors.unknowns.shared)))
+        structural: dict[str, Any] = {}
+        if len(rows := np.vstack([rows, compressed.free])):
+            rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+            structural["gauge"] = (rows @ (self.places.stacked(variables) - z0) == 0,)
+        for name, value in start.items():
+            variables[name].value = value
+        runs = errors.visited(errors.unknowns.unpack(z0))
+        derived = {}
+        for i, label in enumerate(errors.labels):
+            structural |= self._experiment(i, label, variables, runs[i])
+            residual = self._weighted(i) @ cp.vec(variables[f"output{label}"], order="F") - self._measured(i)
+            r = variables[f"residual{label}"] = cp.Variable(residual.size, name=f"residual{label}")
+            derived[r.name()] = residual
+            structural[r.name()] = (r == residual,)
+            r.value = residual.value
+        start = {name: np.asarray(variable.value) for name, variable in variables.items()}
+        courses = frozenset(variables) - set(self.places.names) - set(derived)
+        expansion = errors.unknowns.expansion
+        view = View({**variables, **self._exact_products(variables)}, gauge="norm", channels=expansion.input_names,
+                    outputs=expansion.output_names, reference=start, units=units,
+                    bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
+        objective = cp.Minimize(sum(cp.sum_squares(variables[name]) for name in derived))
+        program = Program(self.name, objective, structural, variables, start, self.recover, view,
+                          frozenset(structural), derived=derived, compressed=compressed, scale=errors.energy,
+                          courses=courses,
+                          note=NO_BOUND.format(errors.errors))
+        return program.subject_to(*self.constraints)
+
+    def _experiment(self, i: int, label: str, variables: dict[str, Any], run: Array) -> dict[str, Any]:
+        """Enter the courses of one experiment, their values those of a run; return the equations that tie them."""
+        e, unknowns, key = self.criterion.data.experiments[i], self.criterion.unknowns, self.criterion.key
+        expansion, n, found = unknowns.expansion, unknowns.n, {}
+
+        def course(name: str, value: Array) -> cp.Variable:
+            limit = np.broadcast_to(WILD * np.max(np.abs(value), axis=0), value.shape)
+            one = variables[f"{name}{label}"] = cp.Variable(value.shape, name=f"{name}{label}", bounds=[-limit, limit])
+            one.value = value
+            return one
+
+        x = course("states", run)
+        following, shown = x @ variables["A"].T, x @ variables["C"].T
+        for c, basis in enumerate(expansion.inputs):
+            b, eta = variables[key("b", c)], basis.values(e.u[:, c])
+            f = eta @ variables[key("mu", c)] if unknowns.free[c] else cp.Constant(eta[:, 0])
+            following = following + _outer(f, b[:n])
+            shown = shown + _outer(f, b[n:]) if unknowns.feedthrough[c] else shown
+        for j, one in enumerate(unknowns.latent):
+            row, matrix = variables[key("z", j)], variables[key("g", j)]
+            argument = x @ row[:n] + row[-1] + (e.u @ row[n:-1] if one.moved else 0.0)
+            z = course(f"signal of {key('z', j)}", argument.value)
+            found[f"{z.name()}"] = (z == argument,)
+            h = _values(one.basis, z, one.vectors @ variables[key("c", j)])
+            following = following + _outer(h, matrix[:n])
+            shown = shown + _outer(h, matrix[n:]) if one.direct else shown
+        if unknowns.constant:
+            shown = shown + _outer(cp.Constant(np.ones(len(run))), variables["offset"])
+        output = course("output", shown.value)
+        for j, family in enumerate(expansion.feedback):
+            nu = variables[key("nu", j)] if family.size > 1 else np.ones(1)
+            g = (_values(family.basis, output[:, family.output], family.vectors @ nu)
+                 - family.intercept @ nu - output @ (family.slope.T @ nu))
+            following = following + _outer(g, variables[key("e", j)])
+        first = variables["x0"] if len(self.criterion.labels) == 1 else variables["x0"][:, i]
+        return {**found, f"initial state{label}": (x[0] == first,), f"dynamics{label}": (x[1:] == following[:-1],),
+                f"outputs{label}": (output == shown,)}
+
+    def _weighted(self, i: int) -> sp.csr_array:
+        """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""
+        here, covariance = np.isfinite(self.criterion.data.experiments[i].y), np.linalg.inv(self.criterion.weight)
+        blocks = []
+        for pattern in np.unique(here[here.any(axis=1)], axis=0):
+            there = np.flatnonzero(pattern)
+            root = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(there, there)])).T
+            picked = sp.eye_array(len(here)).tocsr()[np.flatnonzero((here == pattern).all(axis=1))]
+            blocks.append(sp.kron(root @ np.eye(len(pattern))[there], picked))
+        return sp.csr_array(sp.vstack(blocks))
+
+    def _measured(self, i: int) -> Array:
+        return self._weighted(i) @ np.nan_to_num(self.criterion.data.experiments[i].y).ravel(order="F")
+
+    def _exact_products(self, variables: Mapping[str, cp.Variable]) -> dict[str, cp.Expression]:
+        """Every Theta = mu bᵀ (P, n + l)."""
+        key, free = self.criterion.key, self.criterion.unknowns.free
+        return {key("Theta", c): _outer(variables[key("mu", c)] if free[c] else cp.Constant(np.ones(1)),
+                                        variables[key("b", c)]) for c in range(len(free))}
+
+
+def _outer(left: Any, right: Any) -> cp.Expression:
+    return cp.reshape(left, (left.size, 1), order="F") @ cp.reshape(right, (1, right.size), order="F")
+
+
+def _values(basis: Basis, v: Any, coefficients: Any) -> Any:
+    """Return sum_j coefficients[j] eta_j(v) of a basis with a formula, as an expression of a course v."""
+    low, high = span(basis)
+    if isinstance(basis, Polynomial):
+        t = (2 * v - low - high) / (high - low)
+        before, now = cp.Constant(np.ones(v.size)), t
+        functions = [t]
+        for k in range(1, basis.p):
+            before, now = now, ((2 * k + 1) * cp.multiply(t, now) - k * before) / (k + 1)
+            functions.append(now)
+    elif isinstance(basis, Trigonometric):
+        angle = np.pi / (basis.half_range * (high - low) / 2) * (v - (low + high) / 2)
+        functions = [atom(j * angle) for j in range(1, basis.p + 1) for atom in (cp.cos, cp.sin)]
+    else:
+        raise StructureError(f"a {type(basis).__name__.lower()} basis of outputs or latent signals has no formula that "
+                             "NLP solvers can differentiate: use 'polynomial:p' or 'trigonometric:p', or the .exact "
+                             "formulation")
+    return sum(coefficients[j] * function for j, function in enumerate(functions))
