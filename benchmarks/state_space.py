@@ -5,7 +5,8 @@
 Simulated plants, 3000 samples to estimate from and as many to test on, white noise of 1 % at the output: an oscillator
 with a hardening spring (Duffing), two tanks with square-root outflow, a Hammerstein-Wiener system, a Wiener system, and
 two inputs and two outputs with two latent signals. Printed is the error of the free run on the test part, in standard
-deviations of the noise (1 is what the truth leaves), the share of seeds below 1.2, and the CPU seconds of a fit.
+deviations of the noise (1 is what the truth leaves), the share of seeds below 1.2, and the CPU seconds of a fit. Then
+records of 100,000 samples of Wiener-Hammerstein systems, noise of 0.1 %, in the same figures.
 
 Real records, with OPTID_DATA (free run on the test part, initial state from its first 50 samples): Silverbox with
 output feedback and with a latent signal, and cascaded tanks, their structure chosen by cross-validation in four blocks
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import butter, lfilter, sosfilt
 
 import optid
 from optid.errors import OptidError
@@ -189,11 +191,33 @@ def real(folder: Path) -> Iterator[tuple[str, str, float, str]]:
     yield "cascaded tanks", name, spent, f"{found:.3f} V (cross-validated {error:.3f} V)"
 
 
+def wiener_hammerstein(seed: int, samples: int = 100_000) -> tuple[float, float, str]:
+    """Return error over noise on as many new samples, CPU seconds and status of a fit to a long record of 60 dB."""
+    rng = np.random.default_rng(seed)
+
+    def linear(u: np.ndarray) -> np.ndarray:
+        pole = rng.uniform(0.5, 0.85) * np.exp(1j * rng.uniform(0.2, 0.9))
+        a = np.real(np.poly([pole, pole.conj(), rng.uniform(0.3, 0.8)]))
+        y = np.asarray(lfilter([0.0, *rng.normal(size=3)], a, u))
+        return y / y.std()
+
+    u = np.asarray(sosfilt(butter(3, 0.5, output="sos"), rng.normal(size=2 * samples)))
+    x, sigma = linear(u), 1e-3
+    y = linear(np.tanh(1.2 * x) + 0.15 * x**2 / (1 + x**2)) + sigma * rng.normal(size=x.size)
+    record, test = (optid.Data(u[part], y[part]) for part in (slice(samples), slice(samples, None)))
+    started = time.process_time()
+    fit = optid.fit(record, "lfr.exact", nx=6, direct=True, latent_basis="bspline:24")
+    spent = time.process_time() - started
+    error = np.asarray(fit.model.simulate(test, x0="fit")) - test.y
+    return float(np.sqrt(np.mean((error / sigma) ** 2))), spent, fit.solution.status.value
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print all tables."""
+    words = [*CASES, "wiener-hammerstein", "real"]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=25)
-    parser.add_argument("--only", nargs="+", choices=[*CASES, "real"], default=[*CASES, "real"])
+    parser.add_argument("--only", nargs="+", choices=words, default=words)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     print(f"{'plant':<20}{'median':>8}{'90 %':>8}{'below ' + str(GOAL):>12}{'CPU s':>8}")
@@ -206,6 +230,9 @@ def main() -> None:
                   f"{100 * np.mean(errors <= GOAL):10.0f} %{spent:8.2f}", flush=True)
             for failure in sorted({status for error, _, status in rows if not np.isfinite(error)}):
                 print(f"    {failure}")
+    for seed in range(min(options.seeds, 5)) if "wiener-hammerstein" in options.only else ():
+        error, spent, status = wiener_hammerstein(seed)
+        print(f"Wiener-Hammerstein, 100,000 samples, seed {seed}: {error:.3f}, {spent:.1f} CPU s, {status}", flush=True)
     folder = os.environ.get("OPTID_DATA")
     if "real" in options.only and folder:
         for record, structure, spent, errors in real(Path(folder)):

@@ -38,6 +38,7 @@ from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import enough_rows, in_memory, outputs_present
 from optid.identify.prediction_error.descent import Descent
+from optid.identify.prediction_error.latent_search import STAGES, first_samples
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
@@ -213,12 +214,14 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
                                  "use it with hammerstein_ss.asivid")
 
     def run() -> Procedure:
-        given = _block_rows(plan) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-        nx = yield from _subspace_starts(plan, given, block_rows is None, found, criterion == "prediction")
-        errors, starts = _entered(plan, nx, found, criterion, stability, tuple(rule.verify for rule in poles))
+        # what functions of latent signals are added to needs no more than a first part of a long record
+        first = plan if extend is None else replace(plan, data=first_samples(plan.data, STAGES[0]))
+        given = _block_rows(first) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
+        nx = yield from _subspace_starts(first, given, block_rows is None, found, criterion == "prediction")
+        errors, starts = _entered(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles))
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
-            errors, best, more = extend(errors, best)
+            errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best)
             figures = {**figures, **more}
         others = tuple(rule for rule in constraints if rule not in poles)
         evidence = yield from (finish or _refined)(plan, errors, others, best, {"order": nx, **figures})

@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import optid
 from optid.bases import BSpline, Polynomial, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError, StructureError
+from optid.identify.prediction_error.latent_search import _factors, _renewed, _visited
+from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, Nonlinearity
-from optid.statistics.state_unknowns import beyond_affine
+from optid.statistics.expansion import expand
+from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 SMOOTH = Nonlinearity(Polynomial(3, interval=(-2.0, 2.0), outside="extrapolate"), np.array([0.2, -0.3, 0.1]))
 CELLS = Nonlinearity(BSpline(4, interval=(-1.0, 1.0), outside="linear"), np.array([0.3, -0.5, 0.2, 0.4, 0.1, -0.2]))
@@ -150,17 +154,93 @@ def test_shapes_are_refused_by_name():
         beyond_affine(Polynomial(1, interval=(-1.0, 1.0)))
 
 
-@pytest.mark.parametrize("basis", [Polynomial(2), Polynomial(5), BSpline(6)])
-def test_coordinates_without_an_affine_part(basis):
+@pytest.mark.parametrize("basis", [Polynomial(2), Polynomial(5), BSpline(6), BSpline(6, outside="linear")])
+def test_coordinates_without_a_linear_part(basis):
     basis = replace(basis, interval=(-1.0, 3.0))
     nodes, weights = np.polynomial.legendre.leggauss(8)
     edges = np.linspace(-1, 3, 49)  # every cell of the bases is a number of these
     z = np.concatenate([(a + b) / 2 + (b - a) / 2 * nodes for a, b in zip(edges, edges[1:])])
     functions = basis.values(z) @ beyond_affine(basis)
-    assert functions.shape[1] == (basis.size - 2 if isinstance(basis, BSpline) else basis.size - 1)
-    integrals = (np.tile(weights, 48) * functions.T) @ np.column_stack([np.ones(z.size), z])
+    natural = 2 * (basis.outside == "linear")
+    assert functions.shape[1] == basis.size - 1 - natural
+    assert np.linalg.matrix_rank(np.column_stack([functions, np.ones(z.size), z])) == basis.size + 1 - natural
+    integrals = (np.tile(weights, 48) * functions.T) @ (z - 1)
     digits = 1e-4 if isinstance(basis, BSpline) else 1e-12  # the kinks of splines are between the nodes of a rule
     assert np.abs(integrals).max() < digits * np.abs(functions).max()
+
+
+def test_functions_with_straight_tails_are_natural_splines():
+    basis = BSpline(6, interval=(-1.0, 1.0), outside="linear")
+    step = 1e-4
+    ends = np.array([-1.0, 1.0 - step])
+    bend = (basis.slopes(ends + step) - basis.slopes(ends)) @ beyond_affine(basis) / step
+    inside = (basis.slopes(np.array([0.1 + step])) - basis.slopes(np.array([0.1]))) @ beyond_affine(basis) / step
+    assert np.abs(bend).max() < 1e-2 * np.abs(inside).max()
+
+
+def criterion_with_a_function(basis, samples=300):
+    """Simulation errors of a model with a spline of its input and states, and its unknowns."""
+    rng = np.random.default_rng(2)
+    one = Latent(basis, beyond_affine(basis), direct=True)
+    u = rng.uniform(-1, 1, (samples, 1))
+    data = Data(u, rng.normal(size=(samples, 1)))
+    unknowns = StateUnknowns(2, expand(data, "linear"), 1, (True,), latent=(one,))
+    x = 0.3 * rng.normal(size=unknowns.size)
+    return StateErrors(data, unknowns, np.eye(1)), x
+
+
+@pytest.mark.parametrize("outside", ["linear", "clamp"])
+def test_division_of_cells_keeps_the_model(outside):
+    errors, x = criterion_with_a_function(BSpline(5, interval=(-1.0, 1.0), outside=outside))
+    x[errors.unknowns.slices["z0"]] = [0.2, -0.3, 0.5, 0.1]
+    finer, moved = _renewed(errors, x, 2)
+    assert finer.unknowns.latent[0].basis.p == 10
+    assert np.vstack(finer.residuals(moved)) == pytest.approx(np.vstack(errors.residuals(x)), abs=1e-9)
+
+
+def test_a_signal_out_of_its_interval_is_brought_back():
+    """Polynomials keep the model: what a shift makes affine goes to the matrices and offsets."""
+    basis = Polynomial(3, interval=(-1.0, 1.0), outside="extrapolate")
+    errors, x = criterion_with_a_function(basis)
+    x[errors.unknowns.slices["z0"]] = [0.4, -0.6, 1.5, 0.7]
+    moved = _renewed(errors, x)[1]
+    point = errors.unknowns.unpack(moved)
+    z = np.vstack(_visited(errors, point)) @ point.Cz.T + errors.data.experiments[0].u @ point.Dz.T + point.offset_z
+    assert (z.min(), z.max()) == pytest.approx((-1 / 1.15, 1 / 1.15), abs=1e-6)
+    assert np.vstack(errors.residuals(moved)) == pytest.approx(np.vstack(errors.residuals(x)), abs=1e-8)
+
+
+def test_directions_contain_the_factors_of_a_transfer_function():
+    """(q - 0.3) / (q - 0.8) and 1 / (q - 0.5) in a row: the output of the first is among the directions."""
+    errors, x = criterion_with_a_function(Polynomial(3, interval=(-1.0, 1.0), outside="extrapolate"))
+    point = replace(errors.unknowns.unpack(x), A=np.array([[0.8, 0.0], [0.5, 0.5]]), b=np.array([[1.0], [1.0]]),
+                    C=np.array([[0.0, 1.0]]), d=np.zeros((1, 1)))
+    found = list(_factors(point, np.ones(3), 50, np.random.default_rng(0)))
+    assert any(row == pytest.approx([0.5, 0.0, 1.0], abs=1e-9) for row in found)
+    assert len(list(_factors(point, np.ones(3), 2, np.random.default_rng(0)))) == 2
+
+
+def test_forgotten_initial_states_leave_no_subnormal_numbers():
+    errors, x = criterion_with_a_function(Polynomial(2, interval=(-1.0, 1.0), outside="extrapolate"), 3000)
+    point = errors.unknowns.unpack(x)
+    x = errors.unknowns.pack(replace(point, A=0.5 * np.eye(2), Ez=0.01 * point.Ez))
+    (block,) = [block for block, _ in errors.blocks(x)(0)]
+    small = np.abs(block[block != 0])
+    assert np.all(block[-1, :2] == 0) and small.min() > 1e-160
+
+
+@pytest.mark.filterwarnings("ignore:.*steps gain less than")
+def test_a_long_record_is_fitted_in_stages():
+    """A saturation between two linear systems, 12,000 samples: the noise is reached."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=24_000)
+    x = lfilter([0.0, 0.3, 0.1], [1.0, -0.7], u)
+    clean = lfilter([0.0, 0.4], [1.0, -0.6], np.tanh(x / x.std()))
+    y = clean + 0.01 * clean.std() * rng.normal(size=u.size)
+    fit = optid.fit(Data(u[:12_000], y[:12_000]), "lfr.exact", nx=3, direct=True, latent_basis="bspline:14")
+    error = np.asarray(fit.model.simulate(Data(u[12_000:], y[12_000:]), x0="fit"))[:, 0] - y[12_000:]
+    assert np.sqrt(np.mean(error**2)) < 1.1 * 0.01 * clean.std()
+    assert fit.model.latent[0].basis.p == 14
 
 
 def oscillator(u, noise=0.0, seed=0):

@@ -5,6 +5,8 @@ Functions of the user cannot be compiled: a loop through them runs in Python.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -78,10 +80,16 @@ def _row(f: Nonlinearity) -> tuple[int, float, float, int, int, float, Array]:
 
 
 def _pieces(basis: Triangular | PiecewiseConstant | BSpline, mu: Array) -> Array:
-    """Coefficients (cells, degree + 1) of the polynomial in every cell, from values inside it."""
+    """Coefficients (cells, degree + 1) of the polynomial in every cell."""
+    return _pieces_of_functions(replace(basis, interval=span(basis))) @ mu
+
+
+@lru_cache(maxsize=64)
+def _pieces_of_functions(basis: Triangular | PiecewiseConstant | BSpline) -> Array:
+    """Those of every function (cells, degree + 1, P), from values inside the cells."""
     low, high = span(basis)
     degree = {Triangular: 1, PiecewiseConstant: 0}.get(type(basis), getattr(basis, "degree", 0))
     inside = (np.arange(degree + 1) + 0.5) / (degree + 1)
     points = low + (np.arange(basis.p)[:, None] + inside) * (high - low) / basis.p
-    values = (basis.values(points.ravel()) @ mu).reshape(points.shape)
-    return np.asarray(np.linalg.solve(np.vander(inside), values.T).T, dtype=float)
+    values = basis.values(points.ravel()).reshape(basis.p, degree + 1, basis.size)
+    return np.linalg.solve(np.vander(inside), values)

@@ -17,51 +17,71 @@ from numba import njit
 INSIDE, LEFT, REFUSED = 0, 1, 2
 """How a run ended: to the last sample, out of the range allowed, beyond the interval of a basis that refuses."""
 
+FORGOTTEN = 1e-150
+"""Derivatives of the state below this size count as zero."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def value_and_slope(tables, j, v):
-    """Return (f_j(v), f_j'(v), whether v was refused)."""
-    low, high = tables.low[j], tables.high[j]
+def evaluate(kind, low, high, outside, cells, angular, numbers, v):
+    """Return (f(v), f'(v), whether v was refused) of a function: its entries of `Tables`."""
     slack = 1e-12 * max(abs(low), abs(high))
     beyond = v < low - slack or v > high + slack
-    refused = beyond and tables.outside[j] == 2
-    frozen = (v < low or v > high) and tables.outside[j] != 0 and tables.outside[j] != 3
+    refused = beyond and outside == 2
+    frozen = (v < low or v > high) and outside != 0 and outside != 3
     excess = 0.0
-    if tables.outside[j] != 0:
-        excess = v - min(max(v, low), high) if tables.outside[j] == 3 else 0.0
+    if outside != 0:
+        excess = v - min(max(v, low), high) if outside == 3 else 0.0
         v = min(max(v, low), high)
     value, slope = 0.0, 0.0
-    if tables.kind[j] == 0:
-        rate = tables.cells[j] / (high - low)
+    if kind == 0:
+        rate = cells / (high - low)
         x = (v - low) * rate
-        cell = int(min(max(np.floor(x), 0.0), tables.cells[j] - 1.0))
+        cell = int(min(max(np.floor(x), 0.0), cells - 1.0))
         x -= cell
-        for d in range(tables.numbers.shape[2]):
+        for d in range(numbers.shape[1]):
             slope = slope * x + value
-            value = value * x + tables.numbers[j, cell, d]
+            value = value * x + numbers[cell, d]
         slope *= rate
-    elif tables.kind[j] == 1:
+    elif kind == 1:
         rate = 2.0 / (high - low)
         x = (v - (low + high) / 2) * rate
         before, now, slope_before, slope_now = 1.0, x, 0.0, 1.0
-        last = tables.numbers.shape[2] - 1
-        for k in range(tables.cells[j]):
-            value += tables.numbers[j, k, last] * now
-            slope += tables.numbers[j, k, last] * slope_now
+        last = numbers.shape[1] - 1
+        for k in range(cells):
+            value += numbers[k, last] * now
+            slope += numbers[k, last] * slope_now
             n = k + 1
             later = ((2 * n + 1) * x * now - n * before) / (n + 1)
             slope_later = ((2 * n + 1) * (now + x * slope_now) - n * slope_before) / (n + 1)
             before, now, slope_before, slope_now = now, later, slope_now, slope_later
         slope *= rate
-    elif tables.kind[j] == 2:
-        last = tables.numbers.shape[2] - 1
-        for k in range(tables.cells[j]):
-            rate = (k + 1) * tables.rate[j]
+    elif kind == 2:
+        last = numbers.shape[1] - 1
+        for k in range(cells):
+            rate = (k + 1) * angular
             angle = rate * (v - (low + high) / 2)
             cosine, sine = np.cos(angle), np.sin(angle)
-            value += tables.numbers[j, k, last - 1] * cosine + tables.numbers[j, k, last] * sine
-            slope += rate * (tables.numbers[j, k, last] * cosine - tables.numbers[j, k, last - 1] * sine)
+            value += numbers[k, last - 1] * cosine + numbers[k, last] * sine
+            slope += rate * (numbers[k, last] * cosine - numbers[k, last - 1] * sine)
     return value + slope * excess, 0.0 if frozen else slope, refused
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def value_and_slope(tables, j, v):
+    """Return (f_j(v), f_j'(v), whether v was refused)."""
+    return evaluate(tables.kind[j], tables.low[j], tables.high[j], tables.outside[j], tables.cells[j], tables.rate[j],
+                    tables.numbers[j], v)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def slopes(tables, first, z, found):
+    """Write the slopes (T, k) of the k functions of a table behind the first ones at arguments z (T, k)."""
+    kind, low, high, outside, cells, rate, numbers = tables
+    for k in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            c = first + j
+            found[k, j] = evaluate(
+                kind[c], low[c], high[c], outside[c], cells[c], rate[c], numbers[c], z[k, j])[1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -78,49 +98,80 @@ def march(parts, stretch, x, outputs, states):
     Returns:
         how the run ended and the sample at which it did.
     """
-    A, C, E, L, K = parts.A, parts.C, parts.E, parts.L, parts.K
+    # fields of tuples are taken out of them once: reading one in a loop counts references every time
+    A, C, E, L, K, output_of = parts.A, parts.C, parts.E, parts.L, parts.K, parts.output_of
     Ez, Fz, Cz = parts.Ez, parts.Fz, parts.Cz
+    drive, direct, feedback, measured, inward, least, most = stretch
+    kind, low, high, outside, cells, rate, numbers = parts.tables
     n, l, s, latent = A.shape[0], C.shape[0], E.shape[1], Ez.shape[1]  # noqa: E741
     later, w = np.empty(n), np.empty(latent)
-    for k in range(stretch.y.shape[0]):
+    for k in range(measured.shape[0]):
         for j in range(latent):
-            z = stretch.z[k, j]
+            z = inward[k, j]
             for i in range(n):
                 z += Cz[j, i] * x[i]
-            w[j], _, refused = value_and_slope(parts.tables, s + j, z)
+            c = s + j
+            w[j], _, refused = evaluate(kind[c], low[c], high[c], outside[c], cells[c], rate[c], numbers[c], z)
             if refused:
                 return REFUSED, k
         for i in range(n):
             if states.shape[0] > 0:
                 states[k, i] = x[i]
-            later[i] = stretch.drive[k, i]
+            later[i] = drive[k, i]
             for j in range(n):
                 later[i] += A[i, j] * x[j]
             for j in range(latent):
                 later[i] += Ez[i, j] * w[j]
         for o in range(l):
-            now = stretch.direct[k, o]
+            now = direct[k, o]
             for i in range(n):
                 now += C[o, i] * x[i]
             for j in range(latent):
                 now += Fz[o, j] * w[j]
-            if not (stretch.low[o] <= now <= stretch.high[o]):
+            if not (least[o] <= now <= most[o]):
                 return LEFT, k
             outputs[k, o] = now
-            given = stretch.y[k, o]
+            given = measured[k, o]
             for i in range(n):
                 later[i] += L[i, o] * now if np.isnan(given) else L[i, o] * given + K[i, o] * (given - now)
         for j in range(s):
-            fed = stretch.feedback[k, j]
+            fed = feedback[k, j]
             if np.isnan(fed):
-                fed, _, refused = value_and_slope(parts.tables, j, outputs[k, parts.output_of[j]])
+                fed, _, refused = evaluate(
+                    kind[j], low[j], high[j], outside[j], cells[j], rate[j], numbers[j], outputs[k, output_of[j]])
                 if refused:
                     return REFUSED, k
             for i in range(n):
                 later[i] += E[i, j] * fed
         for i in range(n):
             x[i] = later[i]
-    return INSIDE, stretch.y.shape[0]
+    return INSIDE, measured.shape[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def combine(weights, rows, into):
+    """Write sum_j weights[j] rows[j] of as many rows as there are weights; four at a time saves memory traffic."""
+    count, q = weights.size, into.size
+    left = count % 4
+    if left == 0:
+        for p in range(q):
+            into[p] = 0.0
+    elif left == 1:
+        a = weights[0]
+        for p in range(q):
+            into[p] = a * rows[0, p]
+    elif left == 2:
+        a, b = weights[0], weights[1]
+        for p in range(q):
+            into[p] = a * rows[0, p] + b * rows[1, p]
+    else:
+        a, b, c = weights[0], weights[1], weights[2]
+        for p in range(q):
+            into[p] = a * rows[0, p] + b * rows[1, p] + c * rows[2, p]
+    for j in range(left, count, 4):
+        a, b, c, d = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
+        for p in range(q):
+            into[p] += a * rows[j, p] + b * rows[j + 1, p] + c * rows[j + 2, p] + d * rows[j + 3, p]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -139,55 +190,49 @@ def sensitivities(parts, direct, signals, turn, jacobian):
         turn: (n, q) derivative S of the state, changed in place.
         jacobian: (T, l, q) written.
     """
-    A, C, Ez, Fz, Cz = parts.A, parts.C, parts.Ez, parts.Fz, parts.Cz
-    n, l, q, latent = A.shape[0], C.shape[0], turn.shape[1], Ez.shape[1]  # noqa: E741
-    turned, inner = np.empty((n, q)), np.empty((latent, q))
+    n, l, q, latent = parts.A.shape[0], parts.C.shape[0], turn.shape[1], parts.Ez.shape[1]  # noqa: E741
+    returned, bent, values = signals
+    row, column, signal, gain, ends = direct
+    Cz, returns = parts.Cz, returned.shape[0] > 0
+    stack, later = np.empty((n + latent + l, q)), np.empty((n, q))  # [S; H; J] and the next S
+    of_latent, of_output = np.empty((latent, n)), np.empty((l, n + latent))
+    of_state = np.empty((n, n + latent + l * returns))
+    for i in range(n):
+        for p in range(q):
+            stack[i, p] = turn[i, p]
+        for j in range(n):
+            of_state[i, j] = parts.A[i, j]
+        for c in range(latent):
+            of_state[i, n + c] = parts.Ez[i, c]
+    for o in range(l):
+        for j in range(n):
+            of_output[o, j] = parts.C[o, j]
+        for c in range(latent):
+            of_output[o, n + c] = parts.Fz[o, c]
     for k in range(jacobian.shape[0]):
         for c in range(latent):
-            for p in range(q):
-                inner[c, p] = 0.0
             for j in range(n):
-                a = signals.slopes[k, c] * Cz[c, j]
-                if a != 0.0:
-                    for p in range(q):
-                        inner[c, p] += a * turn[j, p]
-        for e in range(direct.ends[0], direct.ends[1]):
-            inner[direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
+                of_latent[c, j] = bent[k, c] * Cz[c, j]
+            combine(of_latent[c], stack, stack[n + c])
+        for e in range(ends[0], ends[1]):
+            stack[n + row[e], column[e]] += gain[e] * values[k, signal[e]]
         for o in range(l):
-            row = jacobian[k, o]
-            for p in range(q):
-                row[p] = 0.0
-            for j in range(n):
-                a = C[o, j]
-                if a != 0.0:
-                    for p in range(q):
-                        row[p] += a * turn[j, p]
-            for c in range(latent):
-                if Fz[o, c] != 0.0:
-                    for p in range(q):
-                        row[p] += Fz[o, c] * inner[c, p]
-        for e in range(direct.ends[1], direct.ends[2]):
-            jacobian[k, direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
-        for i in range(n):
-            into = turned[i]
-            for p in range(q):
-                into[p] = 0.0
-            for j in range(n):
-                a = A[i, j]
-                if a != 0.0:
-                    for p in range(q):
-                        into[p] += a * turn[j, p]
+            combine(of_output[o], stack, jacobian[k, o])
+        for e in range(ends[1], ends[2]):
+            jacobian[k, row[e], column[e]] += gain[e] * values[k, signal[e]]
+        if returns:
             for o in range(l):
-                if signals.returned.shape[0] > 0 and signals.returned[k, i, o] != 0.0:
-                    a = signals.returned[k, i, o]
-                    for p in range(q):
-                        into[p] += a * jacobian[k, o, p]
-            for c in range(latent):
-                if Ez[i, c] != 0.0:
-                    for p in range(q):
-                        into[p] += Ez[i, c] * inner[c, p]
-        for e in range(direct.ends[2], direct.ends[3]):
-            turned[direct.row[e], direct.column[e]] += direct.gain[e] * signals.values[k, direct.signal[e]]
+                for p in range(q):
+                    stack[n + latent + o, p] = jacobian[k, o, p]
+                for i in range(n):
+                    of_state[i, n + latent + o] = returned[k, i, o]
         for i in range(n):
-            for p in range(q):
-                turn[i, p] = turned[i, p]
+            combine(of_state[i], stack, later[i])
+        for e in range(ends[2], ends[3]):
+            later[row[e], column[e]] += gain[e] * values[k, signal[e]]
+        for i in range(n):
+            for p in range(q):  # what is forgotten is zero: numbers below the normal range are slow
+                stack[i, p] = later[i, p] if abs(later[i, p]) > FORGOTTEN else 0.0
+    for i in range(n):
+        for p in range(q):
+            turn[i, p] = stack[i, p]

@@ -237,9 +237,16 @@ def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
 
 def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signals:
     """Describe a run over a stretch with its states (T, n) and outputs (T, l), but for the `values` of unknowns."""
-    model, missing, slopes = job.model, np.isnan(stretch.y), np.zeros((len(states), len(job.model.latent)))
-    for j, (h, z) in enumerate(zip(model.latent, (stretch.z + states @ model.Cz.T).T)):
-        slopes[:, j] = h.slope(z)
+    from optid.models.state_kernels import slopes as write_slopes
+
+    model, missing, tables = job.model, np.isnan(stretch.y), job.model.parts.tables
+    z = stretch.z + states @ model.Cz.T
+    slopes = np.zeros_like(z)
+    if tables.compiled:
+        write_slopes(tables, len(model.feedback), z, slopes)
+    else:
+        for j, h in enumerate(model.latent):
+            slopes[:, j] = h.slope(z[:, j])
     returned = np.zeros((0, model.nx, model.l))
     if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
         own = model.returned(outputs) if missing.any() else 0.0

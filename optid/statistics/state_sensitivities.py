@@ -21,6 +21,9 @@ from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknown
 if TYPE_CHECKING:
     from optid.data.record import Data
 
+HUGE = 1e250
+"""Sum of squared sensitivities beyond which a run counts as one that leaves its range."""
+
 NUMBERS = 500_000
 """Entries of the sensitivities formed at a time."""
 
@@ -78,7 +81,7 @@ class StatePredictor:
             for block in _runs(self._job(model, index), unknowns, point, index, chunk):
                 count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
                 block = _weighted(block, covariance)
-                if not np.isfinite(block.sum()):
+                if not np.vdot(block, block) < HUGE:
                     raise FloatingPointError
                 yield block.reshape(-1, block.shape[2]), count
 

@@ -49,18 +49,21 @@ class Latent:
 
 
 def beyond_affine(basis: Basis, points: int = 64) -> Array:
-    """Return orthonormal coordinates (P, r) of the functions of a basis without a part in the span of {1, z}.
+    """Return orthonormal coordinates (P, r) of the functions of a basis that do not correlate with z.
 
-    That part is carried by the matrices. Orthogonal with respect to the uniform distribution on the interval.
+    What is linear in z is carried by the matrices, constants by the offsets. The distribution of z is taken as uniform
+    on the interval. Functions that go on straight beyond it meet its ends without curvature (natural splines) where
+    enough of them can: an end of few samples then bends no tail.
 
     Raises:
         StructureError: nothing is left.
     """
     low, high = basis.interval if basis.interval is not None else (-1.0, 1.0)
     nodes, weights = np.polynomial.legendre.leggauss(points)
-    values = basis.values((low + high) / 2 + (high - low) / 2 * nodes)
-    sizes, vectors = np.linalg.svd((np.column_stack([np.ones(points), nodes]).T * weights) @ values)[1:]
-    found = vectors[int(np.sum(sizes > 1e-9 * sizes[0])) :].T
+    family = _straight_at_ends(basis)
+    values = basis.values((low + high) / 2 + (high - low) / 2 * nodes) @ family
+    sizes, vectors = np.linalg.svd(((weights * nodes) @ values)[None])[1:]
+    found = family @ vectors[int(np.sum(sizes > 1e-9 * np.linalg.norm(values))) :].T
     if not found.size:
         raise StructureError(f"the basis {type(basis).__name__.lower()} of a latent function has no part that is not "
                              "affine, which the matrices carry: use more functions.")
@@ -72,6 +75,15 @@ SHAPES = {
     "Cz": "kn", "Dz": "km", "offset_z": "k",
 }
 """Shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments."""
+
+
+def _straight_at_ends(basis: Basis) -> Array:
+    """Return orthonormal coordinates (P, r) of natural splines where tails are straight; else of all functions."""
+    if basis.outside != "linear" or getattr(basis, "degree", 0) < 2:
+        return np.eye(basis.size)
+    vectors, sizes, _ = np.linalg.svd(basis.curvature()[[0, -1]].T)
+    left = vectors[:, int(np.sum(sizes > 1e-9 * sizes[0])) :]
+    return left if left.shape[1] > 1 else np.eye(basis.size)  # more than the straight line
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +21,17 @@ EXACT = 1e-24
 
 STEPS = 100
 
+CREEPING = 5
+"""Steps over which progress is measured."""
+
 COMPARED = 1e-6
 """Relative gain of a full step below which a start counts as arrived; only the best of them descends further."""
 
 DAMPED = 1e-7
 """Damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has."""
+
+GRAM = 1e-14
+"""Damping that remains where errors are nonlinear in the states: a Gram matrix then serves all steps but the last."""
 
 AGREE = 1e-4
 """Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
@@ -49,6 +56,7 @@ class Criterion(ABC):
         gauge: how the scale between mu and b is fixed.
         weight: (l, l) weight of the errors.
         unit: what one unit of the sum of squares is in units of the record.
+        bends: whether the errors are nonlinear in the initial states, so that steps of these are damped, too.
     """
 
     data: Data
@@ -56,6 +64,7 @@ class Criterion(ABC):
     gauge: str
     weight: Array
     unit: float = 1.0
+    bends: bool = False
 
     @property
     def errors(self) -> str:
@@ -135,7 +144,7 @@ class Descent:
 
 
 def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterations: int = STEPS,
-            tolerance: float = STATIONARY, start: str = "") -> Descent:
+            tolerance: float = STATIONARY, progress: float = 0.0, start: str = "") -> Descent:
     """Lower the sum of squares from a point by Levenberg-Marquardt steps; every iterate is admissible.
 
     Args:
@@ -144,6 +153,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         held: (p,) marks of shared unknowns that stay.
         iterations: at most.
         tolerance: relative gain of a full step below which it stops.
+        progress: relative fall over `CREEPING` steps below which it stops, too.
         start: name for the record.
     """
     x = criterion.normalised(x)
@@ -152,34 +162,35 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         return Descent(x, at, 0, False, "the run leaves its range", start, True)
     p = len(at.pull)
     free = np.ones(p, dtype=bool) if held is None else np.logical_not(held)
-    scale, least = np.zeros(int(free.sum())), EXACT * criterion.energy
-    damping, rejected, blocked = 1e-3, 0, False
+    moving = np.concatenate([free, np.ones(x.size - p, dtype=bool)]) if criterion.bends else free
+    scale, least = np.zeros(int(moving.sum())), EXACT * criterion.energy
+    damping, rejected, blocked, values = 1e-3, 0, False, [at.value]
     for count in range(1, iterations + 1):
-        root = at.root[:, free]
-        gain = _gain(root, at)
+        gain = _gain(at.root[:, free], at)
         if gain <= tolerance * at.value and not at.exact:
             at = criterion.linearise(x)
-            root = at.root[:, free]
-            gain = _gain(root, at)
+            gain = _gain(at.root[:, free], at)
         if gain <= tolerance * at.value or at.value <= least:
             return Descent(x, at, count, True, start=start)
-        scale = np.maximum(scale, np.linalg.norm(root, axis=0))
-        weights = np.where(scale > 0, scale, 1.0)
-        step = np.zeros(p)
-        stacked = np.vstack([root / weights, np.sqrt(damping) * np.eye(len(scale))])
-        pull = np.concatenate([-at.pull, np.zeros(len(scale))])
-        step[free] = np.linalg.lstsq(stacked, pull, rcond=1e-15)[0] / weights
-        moved = criterion.normalised(np.concatenate([x[:p] + step, x[p:] + at.follow(step)]))
-        expected = at.reach - float(np.sum((at.root @ step + at.pull) ** 2))
+        matrix, errors = at.whole if criterion.bends else (at.root, at.pull)
+        scale = np.maximum(scale, np.linalg.norm(matrix[:, moving], axis=0))
+        step = np.zeros(len(moving))
+        step[moving] = _damped(matrix[:, moving], errors, np.where(scale > 0, scale, 1.0), damping)
+        expected = at.reach - float(np.sum((matrix @ step + errors) ** 2))
+        whole = step if criterion.bends else np.concatenate([step, at.follow(step)])
+        moved = criterion.normalised(x + whole)
         allowed = criterion.admissible(moved)
         new = None
         if allowed and criterion.value(moved) < (1 + ROUNDING) * at.value:  # most steps that fail are told by the value
-            new = criterion.linearise(moved, "gram" if damping > DAMPED else "auto")
+            new = criterion.linearise(moved, "gram" if criterion.bends or damping > DAMPED else "auto")
         ratio = (at.value - new.value) / max(expected, 1e-300) if new is not None else -1.0
         if new is not None and ratio > 1e-3 and np.isfinite(new.value):
             x, at, rejected, blocked = moved, new, 0, False
             damping = 0.1 * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
-            damping = damping if damping > 1e-14 else 0.0
+            damping = damping if damping > 1e-14 else GRAM if criterion.bends else 0.0
+            values.append(at.value)
+            if values[-1] > (1 - progress) * values[-1 - CREEPING :][0] and len(values) > CREEPING:
+                return Descent(x, at, count, False, f"{CREEPING} steps gain less than {progress:g}", start)
             continue
         rejected, blocked = rejected + 1, blocked or not allowed
         damping = max(8.0 * damping, 1e-6)
@@ -190,6 +201,16 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
             reason = BORDER if blocked and not settled else "no step descends"
             return Descent(x, at, count, settled, reason, start, not settled)
     return Descent(x, at, iterations, False, f"{iterations} steps did not suffice", start)
+
+
+def _damped(matrix: Array, errors: Array, weights: Array, damping: float) -> Array:
+    """Return the step that lowers ``|matrix step + errors|² + damping |weights step|²`` most."""
+    p = len(weights)
+    stacked = np.vstack([np.column_stack([matrix / weights, -errors]), np.sqrt(damping) * np.eye(p, p + 1)])
+    if damping < GRAM:
+        return np.linalg.lstsq(stacked[:, :p], stacked[:, p], rcond=1e-15)[0] / weights
+    root: Any = np.linalg.qr(stacked, mode="r")  # several times as fast
+    return np.linalg.solve(root[:p, :p], root[:p, p]) / weights
 
 
 def _gain(root: Array, at: Linearised) -> float:

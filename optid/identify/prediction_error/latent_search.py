@@ -1,31 +1,52 @@
-"""Starts for functions of latent signals, one after another: directions of z by the gain of one Gauss-Newton step.
+"""The search for functions of latent signals, one after another: directions of z by the gain of one Gauss-Newton step.
 
 With Ez and Fz at zero the errors are linear in both, for every direction of z. The rank-one part of the step that the
-best directions promise starts a short descent; the best of those descends further.
+best directions promise starts a short descent; the better half of those goes on, until one is left. Splines begin on
+few cells, which are halved with the function kept; long records begin with a part of their samples.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
+from scipy.linalg import eigvals
 
 from optid.arrays import Array
+from optid.bases import BSpline, Linear
+from optid.data.record import Data
 from optid.errors import DataError, RankError
-from optid.identify.prediction_error.descent import Descent, descend
+from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.statistics.state_unknowns import Latent, StatePoint
+from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
-RANKED = 8_000
-"""Samples on which directions are ranked and short descents made."""
+RANKED = 3_000
+"""Samples on which directions are ranked and tried."""
 
-STAGE = 20_000
-"""Samples of the descent before the one on the whole record."""
+STAGES = (8_000, 20_000)
+"""Samples of the descents before the one on the whole record; the model without functions is fitted to the first."""
 
 MARGIN = 1.15
 """Interval of a basis, as a multiple of the range of z at the start."""
 
+CELLS = 12
+"""Cells up to which a spline is searched as it is; of more, half as many."""
+
+LARGEST, FAR, OFF = 8, 1e3, 1.05
+"""States of a model up to which its factors are tried; modulus from which a zero is one at infinity; radius at which
+responses are compared, off the poles that lie on the unit circle."""
+
+SAME = 0.999
+"""Ratio of the gains of two directions above which they count as the same."""
+
 SHORT = 12
+HEATS = ((10, SHORT), (5, 30), (2, 60))
+"""Number of descents that the best directions start, or that go on, and their steps."""
+
+PACE = {"search": 1e-2, "long": 3e-3, "short": 0.0}
+"""Relative fall over a few steps below which descents stop: in the search, on the whole of a long or short record."""
+
 SIZES = (1.0, 0.3, 0.05)
 """Shares of the Gauss-Newton step from which a descent may start."""
 
@@ -33,9 +54,8 @@ SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
 """What a function is shrunk to where a longer record would take the run out of its range."""
 
 
-def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 16,
-                 finalists: int = 4, seed: int = 0, iterations: int = 60
-                 ) -> tuple[StateErrors, Descent, dict[str, Any]]:
+def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 32,
+                 seed: int = 0, iterations: int = 60) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Give a model functions of latent signals and descend to an optimum with all of them.
 
     Args:
@@ -43,7 +63,6 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         best: its optimum.
         channels: the functions, each on the interval [-1, 1] of its argument.
         candidates: directions of z that are ranked, at least.
-        finalists: of them that are tried in descents.
         seed: of the random directions.
         iterations: of a descent at most.
 
@@ -54,23 +73,118 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         RankError: no direction of z leads to a model whose run stays finite.
     """
     rng, figures = np.random.default_rng(seed), {}
-    end, steps = best, best.steps
+    part = replace(errors, data=first_samples(errors.data, RANKED // errors.unknowns.l))
+    x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
-        errors, x = whitened(errors, end.x)
-        part = _first(errors, RANKED)
-        ranked = sorted(_ranked(part, x, latent, candidates, rng), key=lambda one: -one[0])
-        ends = [one for _, *chosen in ranked[:finalists] if (one := _short(part, x, latent, *chosen)) is not None]
-        if not ends:
-            raise RankError(f"no direction of latent signal {number} leads to a model that stays finite: use fewer "
-                            "latent signals, another basis, or latent='states'.")
-        errors = _widened(errors, (latent,))
-        starts = [one.x for one in sorted(ends, key=lambda one: one.value)]
-        for size in sorted({min(STAGE, errors.data.n_samples), errors.data.n_samples}):
-            stage = _first(errors, size)
-            end = descend(stage, _finite(stage, starts), iterations=iterations, start=best.start)
-            steps, starts = steps + end.steps, [end.x]
-        figures[f"gain promised by latent signal {number}"] = ranked[0][0]
-    return errors, replace(end, steps=steps), figures
+        try:
+            part, end, promise = _added(part, x, _coarse(latent), candidates, rng, iterations)
+        except RankError as error:
+            raise RankError(f"latent signal {number}: {error}") from error
+        figures[f"gain promised by latent signal {number}"] = promise
+        x, steps = end.x, steps + end.steps
+    for number in range(len(channels)):
+        part, end, more = _exchanged(part, end, number, candidates, rng, iterations)
+        x, steps = end.x, steps + more
+    total = errors.data.n_samples
+    for size in sorted({min(size, total) for size in (*STAGES, total)}):
+        part = replace(part, data=first_samples(errors.data, size))
+        while part.unknowns.latent[0].size < channels[0].size:
+            end = descend(part, _finite(part, x), iterations=iterations, tolerance=COMPARED, progress=PACE["search"])
+            part, x = _renewed(part, end.x, 2)
+            steps += end.steps
+        pace = PACE["search" if size < total else "long" if size > STAGES[0] else "short"]
+        end = descend(part, _finite(part, x), iterations=iterations, progress=pace, start=best.start)
+        x, steps = end.x, steps + end.steps
+    return part, replace(end, steps=steps), figures
+
+
+def _added(part: StateErrors, x: Array, latent: Latent, candidates: int, rng: np.random.Generator, iterations: int
+           ) -> tuple[StateErrors, Descent, float]:
+    """Add the function of a latent signal; also return the share of the errors that its best direction promised."""
+    part, x = whitened(part, x)
+    ranked = sorted(_ranked(part, x, latent, candidates, rng), key=lambda one: -one[0])
+    ranked = [one for one, before in zip(ranked, [None, *ranked]) if before is None or one[0] < SAME * before[0]]
+    ends = [one for _, *chosen in ranked[: HEATS[0][0]] if (one := _short(part, x, latent, *chosen)) is not None]
+    if not ends:
+        raise RankError("no direction leads to a model that stays finite: use fewer latent signals, another basis, or "
+                        "latent='states'.")
+    part, steps = _widened(part, (latent,)), sum(one.steps for one in ends)
+    ends.sort(key=lambda one: one.value)
+    starts = []
+    for one in ends[: HEATS[1][0]]:
+        filled = _renewed(part, one.x)[1]  # long first steps may have moved z far
+        starts.append(filled if np.isfinite(part.value(filled)) else one.x)
+    for count, more in (*HEATS[1:], (1, iterations)):
+        ends = [descend(part, x, iterations=more, tolerance=COMPARED, progress=PACE["search"]) for x in starts[:count]]
+        ends.sort(key=lambda one: one.value)
+        starts, steps = [one.x for one in ends], steps + sum(one.steps for one in ends)
+    return part, replace(ends[0], steps=steps), ranked[0][0]
+
+
+def _exchanged(part: StateErrors, end: Descent, number: int, candidates: int, rng: np.random.Generator,
+               iterations: int) -> tuple[StateErrors, Descent, int]:
+    """Search for one function anew beside the others, which it was found without; the better model stays.
+
+    Also return the number of steps.
+    """
+    point, latent = part.unknowns.unpack(end.x), part.unknowns.latent
+    kept = np.delete(np.arange(len(latent)), number)
+    rest = replace(part, unknowns=replace(part.unknowns, latent=tuple(latent[i] for i in kept)))
+    left = replace(point, cs=tuple(point.cs[i] for i in kept), Ez=point.Ez[:, kept], Fz=point.Fz[:, kept],
+                   Cz=point.Cz[kept], Dz=point.Dz[kept], offset_z=point.offset_z[kept])
+    without = descend(rest, rest.unknowns.pack(left), iterations=SHORT, tolerance=COMPARED)
+    if not np.isfinite(without.value):
+        return part, end, without.steps
+    try:
+        new, found, _ = _added(rest, without.x, latent[number], candidates, rng, iterations)
+    except RankError:
+        return part, end, without.steps
+    steps = without.steps + found.steps
+    return (new, found, steps) if found.value < end.value else (part, end, steps)
+
+
+def _coarse(latent: Latent) -> Latent:
+    """Return a function on fewer cells, which can be halved until they are those of a spline."""
+    basis = latent.basis
+    while isinstance(basis, BSpline) and basis.p > CELLS and basis.p % 2 == 0:
+        basis = replace(basis, p=basis.p // 2)
+    return replace(latent, basis=basis, vectors=beyond_affine(basis))
+
+
+def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors, Array]:
+    """Divide the cells of every function, and let z fill its interval again where it has left it or shrunk.
+
+    What is affine in the functions then moves to the matrices and offsets. A division alone changes nothing.
+    """
+    unknowns, finer, cs, affine = errors.unknowns, [], [], []
+    point, known = unknowns.unpack(x), np.linspace(-1, 1, 1001)
+    rows = np.hstack([point.Cz, point.Dz, point.offset_z[:, None]])
+    inputs = np.vstack([e.u for e in errors.data.experiments])
+    signals = np.hstack([np.vstack(errors.visited(point)), inputs, np.ones((len(inputs), 1))])
+    for one, row, c in zip(unknowns.latent, rows, point.cs):
+        basis: Any = one.basis
+        basis = basis if cells == 1 else replace(basis, p=cells * basis.p)
+        finer.append(replace(one, basis=basis, vectors=beyond_affine(basis)))
+        z, low, high = known, np.min(signals @ row), np.max(signals @ row)
+        if max(-low, high) > 1 or high - low < 1:
+            factor, middle = 2 / (MARGIN * (high - low)), (low + high) / 2
+            z = middle + known / factor
+            row[-1] -= middle
+            row *= factor
+        columns = np.column_stack([basis.values(known) @ finer[-1].vectors, known, np.ones(known.size)])
+        found = np.linalg.lstsq(columns, one.basis.values(z) @ one.vectors @ c)[0]
+        cs.append(found[:-2])
+        affine.append(found[-2] * row + found[-1] * np.eye(row.size)[-1])
+    n, point = unknowns.n, replace(point, Cz=rows[:, : unknowns.n], Dz=rows[:, unknowns.n : -1], offset_z=rows[:, -1])
+    linear = np.array([isinstance(basis, Linear) for basis in unknowns.expansion.inputs])
+    to_state, to_output = point.Ez @ affine, point.Fz @ affine
+    A, C = point.A + to_state[:, :n], point.C + to_output[:, :n]
+    shift = np.linalg.lstsq(np.eye(n) - A, to_state[:, -1])[0]
+    point = replace(point, A=A, C=C, b=point.b + linear * to_state[:, n:-1], x0=point.x0 - shift, cs=tuple(cs),
+                    d=point.d + linear * unknowns.feedthrough * to_output[:, n:-1],
+                    offset=point.offset + C @ shift + to_output[:, -1], offset_z=point.offset_z + point.Cz @ shift)
+    errors = replace(errors, unknowns=replace(unknowns, latent=tuple(finer)))
+    return errors, errors.normalised(errors.unknowns.pack(point))
 
 
 def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[Latent, ...], iterations: int = 60
@@ -112,26 +226,22 @@ def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
     return errors, errors.normalised(errors.unknowns.pack(moved))
 
 
-def _first(errors: StateErrors, size: int) -> StateErrors:
-    """The criterion on the first samples of a long record."""
-    data = errors.data
-    if data.n_samples <= size or data.n_experiments > 1:
-        return errors
-    return replace(errors, data=data.window(0, size))
+def first_samples(data: Data, size: int) -> Data:
+    """Return the first samples of a long record, which other experiments are not part of."""
+    return data if data.n_samples <= size or data.n_experiments > 1 else data.window(0, size)
 
 
-def _finite(errors: StateErrors, starts: list[Array]) -> Array:
-    """Return the first start whose run stays in its range; the best with a smaller last function where none does.
+def _finite(errors: StateErrors, start: Array) -> Array:
+    """Return a start whose run stays in its range, with a smaller last function where it must be.
 
     More samples may take a signal to where a function was not known.
     """
     at, last = errors.unknowns.slices, len(errors.unknowns.latent) - 1
     for share in (1.0, *SHARES):
-        for start in starts:
-            x = np.array(start)
-            x[at[f"g{last}"]] *= share
-            if np.isfinite(errors.value(x)):
-                return x
+        x = np.array(start)
+        x[at[f"g{last}"]] *= share
+        if np.isfinite(errors.value(x)):
+            return x
     raise RankError("a model that stays finite on the first samples of the record leaves its range on the rest, "
                     "however small its last latent function: use fewer latent signals, or another basis.")
 
@@ -150,14 +260,15 @@ def _with(point: StatePoint, rows: Array, cs: tuple[Array, ...], Ez: Array, Fz: 
 
 def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: int, rng: np.random.Generator
                 ) -> Iterator[Array]:
-    """Yield rows [Cz, Dz, constant] whose z fills [-1, 1] on the record: states, inputs, outputs, random ones."""
+    """Yield rows [Cz, Dz, constant] whose z fills [-1, 1]: states, inputs, outputs, parts of them, random ones."""
     n, m = errors.unknowns.n, errors.unknowns.expansion.m
     states = np.vstack(errors.visited(point))
     signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
     moving = np.concatenate([np.ones(n), np.full(m, float(latent.moved))])
-    known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))])]
     spread = signals.std(axis=0)
     weight = moving / np.where(spread > 0, spread, 1.0)
+    known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))]),
+             *_factors(point, moving, 2 * count, rng)]
     for number in range(max(count, len(known))):
         v = known[number] if number < len(known) else weight * rng.normal(size=n + m)
         z = signals @ v
@@ -165,6 +276,42 @@ def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: i
         if high - low > 1e-9 * np.abs(signals).max() * np.abs(v).max():
             factor = 2 / (MARGIN * (high - low))
             yield np.concatenate([factor * v, [-factor * (low + high) / 2]])
+
+
+def _factors(point: StatePoint, moving: Array, most: int, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield rows [Cz, Dz] of the factors of the transfer functions of a single input; of more than `most`, some.
+
+    A static function between two linear systems has one as its argument: some of the poles, and some of the zeros.
+    """
+    n, m = len(point.A), point.b.shape[1]
+    if m > 1 or n > LARGEST:
+        return
+    w = OFF * np.exp(1j * np.linspace(0.0, np.pi, 50 * (n + 1)))
+    response: Any = np.array([np.append(np.linalg.solve(one * np.eye(n) - point.A, point.b[:, 0]), 1.0) for one in w])
+    response *= moving
+    poles = _conjugates(np.linalg.eigvals(point.A))
+    for c, d in zip(point.C, point.d[:, 0]):
+        pencil = np.block([[point.A, point.b], [c[None], np.array([[d]])]])
+        zeros: Any = eigvals(pencil, np.diag(np.append(np.ones(n), 0.0)))
+        zeros = _conjugates(zeros[np.abs(zeros) < FAR])
+        excess = n - sum(map(len, zeros))
+        pairs = [(p, z) for p, z in product(_subsets(poles), _subsets(zeros))
+                 if len(p) and 0 <= len(p) - len(z) <= excess]
+        for i in rng.permutation(len(pairs))[:most] if len(pairs) > most else range(len(pairs)):
+            p, z = pairs[i]
+            wanted: Any = np.prod(w[:, None] - z, axis=1) / np.prod(w[:, None] - p, axis=1)
+            rows = np.vstack([response.real, response.imag])
+            yield np.linalg.lstsq(rows, np.concatenate([wanted.real, wanted.imag]))[0]
+
+
+def _conjugates(roots: Any) -> list[Any]:
+    """Group roots: real ones alone, complex ones with their conjugates."""
+    return [np.array([one, np.conj(one)]) if one.imag else np.array([one]) for one in roots if one.imag >= 0]
+
+
+def _subsets(groups: Sequence[Any]) -> list[Any]:
+    return [np.concatenate([np.zeros(0), *chosen]) for count in range(len(groups) + 1)
+            for chosen in combinations(groups, count)]
 
 
 def _ranked(errors: StateErrors, x: Array, latent: Latent, count: int, rng: np.random.Generator
@@ -176,7 +323,7 @@ def _ranked(errors: StateErrors, x: Array, latent: Latent, count: int, rng: np.r
         single = [replace(latent, vectors=latent.vectors[:, [j]], row=row) for j in range(r)]
         trial = _widened(errors, tuple(single))
         start = _with(point, np.tile(row, (r, 1)), (np.ones(1),) * r, np.zeros((n, r)), np.zeros((outputs, r)))
-        at = trial.linearise(trial.unknowns.pack(start))
+        at = trial.linearise(trial.unknowns.pack(start), "gram")
         if not np.isfinite(at.value):
             continue
         size = np.linalg.norm(at.root, axis=0)

@@ -62,6 +62,11 @@ class StateErrors(Criterion):
             return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
         return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
 
+    @property
+    def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether outputs or latent signals of a run act on its states."""
+        return self.limits is not None
+
     @cached_property
     def limits(self) -> tuple[Any, ...] | None:
         """Ranges that runs must not leave, where outputs act on states, or latent signals do."""
