@@ -34,7 +34,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
         feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
         initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
-        constraints: Sequence[Any] = ()) -> Procedure:
+        tries: int = 2, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the error of a model with functions of latent signals.
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in
@@ -48,26 +48,28 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         criterion: "simulation" (the free run) or "prediction" (K estimated).
         initial: models to start from besides, without latent signals.
         seed: of the directions of z that are tried.
+        tries: searches for every latent signal, those after the first beside the others; 1 is quick.
 
     Raises:
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
         RankError: too few samples, or no direction of z whose run stays finite.
     """
-    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations)
+    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations, tries)
     return state_space_fit(
         "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
         weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
         iterations=iterations, constraints=constraints, extend=extend)
 
 
-def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool, seed: int, iterations: int
-                    ) -> Callable[..., Any]:
+def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool, seed: int, iterations: int,
+                    tries: int) -> Callable[..., Any]:
     """Return what adds the latent signals of `lfr` to an optimum without them; arguments and errors as there."""
     check_integer(channels, "channels")
     one_of("latent", latent, ("states+inputs", "states"))
     inner = _on_latent(latent_basis)
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
-    return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations)
+    return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations,
+                   tries=check_integer(tries, "tries"))
 
 
 def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",

@@ -103,7 +103,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
         feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
         initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, seed: int = 0,
-        constraints: Sequence[Any] = ()) -> Procedure:
+        tries: int = 2, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a model with functions of latent signals, its states as variables.
 
     Named variables: ``Theta``, ``output``, ``states``. Other arguments as in `formulations.latent_signals.lfr`, errors
@@ -112,7 +112,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     Args:
         latent_basis: polynomials or trigonometric functions.
     """
-    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations)
+    extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations, tries)
     return _fit("lfr", data, nx, basis=basis, block_rows=block_rows, weighting=weighting, offset=offset,
                 feedthrough=feedthrough, stability=stability, initial=initial, iterations=iterations,
                 constraints=constraints, extend=extend)

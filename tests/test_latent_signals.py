@@ -11,7 +11,7 @@ from optid.bases import BSpline, Polynomial, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError, StructureError
-from optid.identify.prediction_error.latent_search import _factors, _renewed, _visited
+from optid.identify.prediction_error.latent_search import _factors, _renewed
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import expand
@@ -205,7 +205,7 @@ def test_a_signal_out_of_its_interval_is_brought_back():
     x[errors.unknowns.slices["z0"]] = [0.4, -0.6, 1.5, 0.7]
     moved = _renewed(errors, x)[1]
     point = errors.unknowns.unpack(moved)
-    z = np.vstack(_visited(errors, point)) @ point.Cz.T + errors.data.experiments[0].u @ point.Dz.T + point.offset_z
+    z = np.vstack(errors.visited(point)) @ point.Cz.T + errors.data.experiments[0].u @ point.Dz.T + point.offset_z
     assert (z.min(), z.max()) == pytest.approx((-1 / 1.15, 1 / 1.15), abs=1e-6)
     assert np.vstack(errors.residuals(moved)) == pytest.approx(np.vstack(errors.residuals(x)), abs=1e-8)
 

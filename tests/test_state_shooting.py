@@ -72,7 +72,7 @@ def test_subspace_starts_without_a_descent(case):
     theirs = optid.fit(data, f"{name}.exact", **options, **weights)
     assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
     ours.program.assign(ours.program.start)
-        assert ours.program.objective.value > (1 + 1e-9) * ours.solution.objective
+    assert ours.program.objective.value > (1 + 1e-9) * ours.solution.objective
 
 
 @pytest.mark.parametrize("weighting", ["auto", "determinant"])

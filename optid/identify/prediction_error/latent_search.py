@@ -55,7 +55,7 @@ SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
 
 
 def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 32,
-                 seed: int = 0, iterations: int = 60) -> tuple[StateErrors, Descent, dict[str, Any]]:
+                 seed: int = 0, iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Give a model functions of latent signals and descend to an optimum with all of them.
 
     Args:
@@ -65,6 +65,7 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         candidates: directions of z that are ranked, at least.
         seed: of the random directions.
         iterations: of a descent at most.
+        tries: searches for every function; those after the first know the other functions.
 
     Returns:
         The criterion with the functions, its optimum, and figures of the search.
@@ -82,7 +83,7 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
             raise RankError(f"latent signal {number}: {error}") from error
         figures[f"gain promised by latent signal {number}"] = promise
         x, steps = end.x, steps + end.steps
-    for number in range(len(channels)):
+    for number in [*range(len(channels))] * (tries - 1):
         part, end, more = _exchanged(part, end, number, candidates, rng, iterations)
         x, steps = end.x, steps + more
     total = errors.data.n_samples

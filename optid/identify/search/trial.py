@@ -159,7 +159,8 @@ def spared(candidate: Candidate) -> dict[str, Any]:
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}
     if candidate.formulation in ("ss.exact", "hammerstein_ss.exact", "lfr.exact"):
-        return {"iterations": STEPS, "block_rows": max(10, 2 * candidate.arguments["nx"] + 4)}
+        once = {"tries": 1} if candidate.formulation == "lfr.exact" else {}
+        return {"iterations": STEPS, "block_rows": max(10, 2 * candidate.arguments["nx"] + 4), **once}
     return {}
 
 
