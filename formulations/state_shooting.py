@@ -187,7 +187,7 @@ class StateShooting(StateSpaceFit):
         derived = {}
         for i, label in enumerate(errors.labels):
             structural |= self._experiment(i, label, variables, runs[i])
-            residual = self._weighted(i) @ cp.vec(variables[f"output{label}"], order="F") - self._measured(i)
+            residual: Any = self._weighted(i) @ cp.vec(variables[f"output{label}"], order="F") - self._measured(i)
             r = variables[f"residual{label}"] = cp.Variable(residual.size, name=f"residual{label}")
             derived[r.name()] = residual
             structural[r.name()] = (r == residual,)
@@ -280,7 +280,8 @@ def _values(basis: Basis, v: Any, coefficients: Any) -> Any:
             functions.append(now)
     elif isinstance(basis, Trigonometric):
         angle = np.pi / (basis.half_range * (high - low) / 2) * (v - (low + high) / 2)
-        functions = [atom(j * angle) for j in range(1, basis.p + 1) for atom in (cp.cos, cp.sin)]
+        atoms: Any = cp  # the stubs know no trigonometric functions
+        functions = [atom(j * angle) for j in range(1, basis.p + 1) for atom in (atoms.cos, atoms.sin)]
     else:
         raise StructureError(f"a {type(basis).__name__.lower()} basis of outputs or latent signals has no formula that "
                              "NLP solvers can differentiate: use 'polynomial:p' or 'trigonometric:p', or the .exact "

@@ -95,23 +95,23 @@ class Ladder:
         most = max(t.score for t in found)
         return min((t for t in found if t.score >= most - FINEST * (100 - most)), key=lambda t: t.parameters)
 
-    def choice(self, richest: str = LATENT) -> Trial | None:
-        """Return what is chosen among the classes up to one: a richer class has to win clearly."""
+    def choice(self) -> Trial | None:
+        """Return what is chosen so far: a richer class has to win clearly."""
         chosen = None
-        for kind in KINDS[: KINDS.index(richest) + 1]:
+        for kind in KINDS:
             best = self.best(kind)
             if best is not None and (chosen is None or (best.score > chosen.score and gain(chosen, best) > CLEAR)):
                 chosen = best
         return chosen
 
     def rival(self, kind: str) -> Trial | None:
-        """Return what a candidate of a class has to beat."""
-        found = [t for t in (self.best(kind), self.choice(kind)) if t is not None]
+        """Return what a candidate of a class has to beat; linear models are compared among themselves."""
+        found = [t for t in (self.best(kind), None if kind == LINEAR else self.choice()) if t is not None]
         return max(found, key=lambda t: t.score, default=None)
 
     def hopeless(self, kind: str) -> bool:
         """Whether what has been tried of a class is so far behind that finer choices will not help."""
-        best, chosen = self.best(kind), self.choice(kind)
+        best, chosen = self.best(kind), self.choice()
         if best is None or chosen is None:
             return best is None
         richer = (100 - best.estimation) < PROMISING * (100 - chosen.estimation)

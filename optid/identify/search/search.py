@@ -14,11 +14,14 @@ from optid.data.record import Data
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, KINDS, RUNGS, Ladder, classes_for, gain
+from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, classes_for, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, tried
 from optid.identify.verdict import Verdict, verdict
 from optid.registry import named_constraint, render
+
+FIRST = 0.25
+"""Share of the budget that linear models have before the others begin."""
 
 RESERVED = 0.1
 """Share of the budget that is kept for the fit of the choice."""
@@ -124,10 +127,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
 
     pool = Pool(attempt, count)
     try:
-        for i, kind in enumerate(possible, start=1):
-            limit = clock + i / len(possible) * (end - clock)  # what a class does not use is left to those after it
-            if not _climb(ladder, kind, pool, limit, end, partial(_told, ladder, progress, clock)):
-                stopped = f"the budget of {budget:g} s"
+        if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, progress, clock)):
+            stopped = f"the budget of {budget:g} s"
     except KeyboardInterrupt:
         stopped = "an interrupt"
     finally:
@@ -146,23 +147,34 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
                           stopped, time.monotonic() - clock)
 
 
-def _climb(ladder: Ladder, kind: str, pool: Pool, limit: float, end: float, told: Callable[[Trial], None]) -> bool:
-    """Try the candidates of a class until there are no more, or its time is over, which returns False."""
-    rung = RUNGS[kind](ladder)
-    batch = next(rung, None)
-    while batch is not None:
-        if ladder.rival(kind) is not None and time.monotonic() > limit:
+def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: float, told: Callable[[Trial], None]
+           ) -> bool:
+    """Try batch after batch until no class has more, or the time is over, which returns False.
+
+    Linear models come first, for so many seconds; then the class that has had the least time.
+    """
+    rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
+    waiting: dict[str, list[Candidate]] = {}
+    spent = dict.fromkeys(kinds, 0.0)
+    while rungs:
+        if ladder.choice() is not None and time.monotonic() > end:
             return False
+        kind = LINEAR if LINEAR in rungs and spent[LINEAR] < first else min(rungs, key=spent.__getitem__)
+        batch = waiting.pop(kind) if kind in waiting else next(rungs[kind], None)
+        if batch is None:
+            del rungs[kind]
+            continue
+        clock, rival = time.monotonic(), ladder.rival(kind)
         fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
-        rival = ladder.rival(kind)
         last = end if rival else np.inf  # the first are waited for
-        for candidate, trial in zip(fresh, pool.run([(c, rival, limit) for c in fresh], last, told)):
+        for candidate, trial in zip(fresh, pool.run([(c, rival, end) for c in fresh], last, told)):
             if trial is None:
                 ladder.trials[candidate.key] = Trial(candidate, reason="out of time")
+        spent[kind] += time.monotonic() - clock
         try:
-            batch = rung.send([ladder.trials[c.key] for c in batch])
+            waiting[kind] = rungs[kind].send([ladder.trials[c.key] for c in batch])
         except StopIteration:
-            batch = None
+            del rungs[kind]
     return True
 
 
