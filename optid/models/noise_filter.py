@@ -45,7 +45,11 @@ def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 
     `start` samples count as zero, and these samples are not predicted.
     """
     known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
-    samples, c, d = np.ascontiguousarray(s, dtype=float), np.asarray(c), np.asarray(d)
+    samples, c, d = np.ascontiguousarray(s, dtype=float), np.array(c, dtype=float), np.array(d, dtype=float)
+    if not start and np.isfinite(samples).all() and np.isfinite(known).all():  # C e = D s - drive, nothing to compile
+        whole = np.concatenate([[1.0], c])
+        e = lfilter(np.concatenate([[1.0], d]), whole, samples) - lfilter(np.ones(1), whole, known)
+        return Filtered(e, samples.copy(), samples - e, np.full(len(s), PRESENT, dtype=np.int8))
     with np.errstate(all="ignore"):
         found = Filtered(*late_njit(_march)(samples, known, c, d, start, -1))
         if np.all(found.state != PRESENT) and np.isnan(samples).any():
