@@ -449,3 +449,56 @@ def test_the_first_command_of_the_readme(tmp_path):
     assert "optimal (proved)" in result.stdout and result.stderr == ""
     assert (tmp_path / "thruster.html").read_text(encoding="utf-8").endswith("</html>\n")
     assert json.loads((tmp_path / "m.json").read_text())["format"] == "optid model"
+
+
+# -- identify ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short_ladder(monkeypatch):
+    from optid.identify.search.ladder import KINDS, LINEAR, RUNGS
+    from optid.identify.search.trial import Candidate
+
+    for kind in KINDS:
+        monkeypatch.setitem(RUNGS, kind, lambda ladder: iter(()))
+
+    def lines(ladder):
+        yield [Candidate(LINEAR, "arx", {"na": na, "nb": 2}) for na in (1, 2)]
+
+    monkeypatch.setitem(RUNGS, LINEAR, lines)
+
+
+def test_identify_names_the_structure_and_writes_the_model(csv, tmp_path, short_ladder):
+    result = run("identify", csv, "--inputs", "u1", "u2", "--outputs", "y1", "--workers", 1, "--split", 0.7,
+                 "--model", tmp_path / "m.json", "--report", tmp_path / "r.html")
+    assert result.exit_code == 0, result.output
+    for words in ("Search over 2 structures", "Chosen: --formulation arx --na 1 --nb 2", "The model on this record",
+                  "held out of the search", "model written to"):
+        assert words in result.output
+    assert optid.load(tmp_path / "m.json").na == 1 and "The model on this record" in (tmp_path / "r.html").read_text()
+
+
+def test_fit_without_orders_searches_for_them(csv, short_ladder):
+    result = run("fit", csv, "--inputs", "u1", "u2", "--outputs", "y1")
+    assert result.exit_code == 0 and "Search over 2 structures" in result.output
+    named = run("fit", csv, "--inputs", "u1", "u2", "--outputs", "y1", "--basis", "polynomial:3")
+    assert named.exit_code == 2 and "needs na, nb" in named.output
+
+
+@pytest.mark.parametrize("words, said", [
+    (("--classes", "wiener"), "use one of linear"), (("--budget", -1), "above 0"), (("--workers", 0), "workers"),
+    (("--horizon", 0), "horizon"), (("--solver", "nosuch"), "no solver"), (("--constraint", "nosuch"), "no constraint"),
+])
+def test_identify_refuses_what_cannot_be(csv, words, said):
+    result = run("identify", csv, "--inputs", "u1", "--outputs", "y1", *words)
+    assert result.exit_code == 2 and said in result.output
+
+
+def test_a_poor_model_is_told_with_what_would_help(tmp_path):
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1, 1, 500)
+    y = np.concatenate([np.zeros(6), np.convolve(u, 0.7 ** np.arange(40))[:494]])
+    path = table(tmp_path / "late.csv", u=u, y=y + 0.01 * rng.standard_normal(500))
+    result = run("fit", path, "--formulation", "arx", "--na", 1, "--nb", 1)
+    assert "The model on this record: useless" in result.output and "FAIL" in result.output
+    assert "Advice: a delay of 6 samples raises the simulation fit" in result.output and "--nk 6" in result.output

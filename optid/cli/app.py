@@ -224,6 +224,9 @@ def fit(
         )
         waiting.step("standard errors")
         text = describe(found)
+        if found.verdict is not None and found.verdict.word in ("poor", "useless"):
+            waiting.step("looking for what would help")
+            text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
         if held_out is not None:
             waiting.step("validating")
             text += f"\n\n{held_out.n_samples} samples held out of the fit\n{check(found.model, held_out)}"

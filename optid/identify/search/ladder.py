@@ -43,6 +43,9 @@ PATIENT = 12.0
 PROMISING = 0.7
 """What much less is: the share of the error on the record that it leaves."""
 
+EQUAL = 0.02
+"""Share of the error by which structures of a class may differ and still be as good: the smaller one is taken."""
+
 FINEST = 0.01
 """Share of the error (100 % less the cross-validated fit) that counts as an improvement."""
 
@@ -93,7 +96,7 @@ class Ladder:
         if not found:
             return None
         most = max(t.score for t in found)
-        return min((t for t in found if t.score >= most - FINEST * (100 - most)), key=lambda t: t.parameters)
+        return min((t for t in found if t.score >= most - EQUAL * (100 - most)), key=lambda t: t.parameters)
 
     def choice(self) -> Trial | None:
         """Return what is chosen so far: a richer class has to win clearly."""
