@@ -44,6 +44,8 @@ CASES = {
     "hammerstein armax": ("hammerstein_armax.exact", ARX | CUBIC | {"nc": 2}, curve),
     "bj": ("bj.exact", ARX | {"nc": 1, "nd": 1}, gain),
     "hammerstein bj": ("hammerstein_bj.exact", ARX | CUBIC | {"nc": 1, "nd": 1}, curve),
+    "state shooting": ("ss.shooting", STATES, None),
+    "hammerstein state shooting": ("hammerstein_ss.shooting", STATES | CUBIC, None),
     "sid": ("hammerstein_ss.sid", STATES | CUBIC, curve),
     "sivid": ("hammerstein_ss.sivid", STATES | {"basis": "linear", "feedback_basis": "polynomial:2"}, None),
     "asivid": ("hammerstein_ss.asivid", STATES | CUBIC | {"feedback_basis": "polynomial:2"}, None),
@@ -56,6 +58,7 @@ LOOSE = {
     "subspace.nuclear": ("subspace.nuclear", STATES | {"weight": 30.0}, None),
     "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles),
 }
+WEIGHED = ("ss.exact", "ss.shooting")  # errors in units of their own variances
 
 
 def record(seed=0, count=200, noise=0.3):
@@ -92,7 +95,7 @@ def facts(fit, r=1.0, s=1.0, level=0.0):
 
 def same(case, accuracy, constrained, units):
     base = fitted(case, constrained=constrained)
-    expected, unit = facts(base), 0 if case[0].endswith("ss.exact") else 2  # its errors are weighed by variances
+    expected, unit = facts(base), 0 if case[0].endswith(WEIGHED) else 2
     for r, s in units:
         other = fitted(case, r, s, constrained=constrained)
         assert other.solution.status is base.solution.status
