@@ -175,7 +175,7 @@ def _tried(fit: Any, before: float) -> Iterator[Advice]:
 
 def _neighbours(fit: Any) -> Iterator[tuple[str, str, Callable[[], Any]]]:
     name, arguments, data = fit.formulation, fit.arguments, fit.data
-    if "nk" in _known(fit):
+    if hasattr(fit.model, "nk") and "nb" in arguments:
         for delay in _delays(fit):
             words = " ".join(map(str, delay))
             yield (f"a delay of {words} samples", f"--nk {words}", partial(_try, fit, nk=list(delay)))
@@ -240,7 +240,6 @@ def _on_model(fit: Any) -> Iterator[Advice]:
             low, high = np.min(x), np.max(x)
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
                          f"--basis ...:interval={low:.4g},{high:.4g}")
-    verdict = fit.verdict
     count = fit.data.n_samples * fit.data.l
     parameters = sum(np.size(value) for _, value in model.coefficients())
     if count < TOO_FEW * parameters:
@@ -248,8 +247,7 @@ def _on_model(fit: Any) -> Iterator[Advice]:
                      "longer record")
     if float(fit.figures.get("condition", 1.0)) > 1e7:
         yield Advice("the inputs move too little to tell the lags apart", "optid design proposes an input")
-    if verdict is not None:
-        yield from _straight(fit)
+    yield from _straight(fit)
 
 
 def _straight(fit: Any) -> Iterator[Advice]:
@@ -281,10 +279,6 @@ def _score(model: Any, data: Data) -> float:
     found = fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(simulated_or_nan(model, raw)))
     value = float(np.mean(found))
     return value if np.isfinite(value) else -np.inf
-
-
-def _known(fit: Any) -> set[str]:
-    return {"nk"} if hasattr(fit.model, "nk") and "nb" in fit.arguments else set()
 
 
 def _more(values: Any, more: int) -> Any:
