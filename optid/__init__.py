@@ -18,7 +18,7 @@ _HOME = {
     "program.solution": ["Status", "Solution", "Bound"],
     "solving.solve": ["solve"],
     "identify.fitting": ["fit", "resolve", "Fit"],
-    "identify.search": ["identify", "Identification"],
+    "identify.search": ["Identification"],
     "identify.selection": ["path", "fit_by_holdout"],
     "identify.validation": ["validate", "compare_models", "fit_by_horizon"],
     "identify.order": ["order", "OrderStudy"],
@@ -31,6 +31,7 @@ _HOME = {
     "identify.design": ["design", "frequency_response"],
 }
 _MODULES = {name: name for name in ("signals", "bases", "errors", "examples", "plants", "faults", "studies")} | {
-    "plots": "show.plots", "report": "show.report", "noise": "identify.noise", "tracking": "identify.tracking"}
+    "plots": "show.plots", "report": "show.report", "identify": "identify", "noise": "identify.noise",
+    "tracking": "identify.tracking"}
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME, _MODULES)

@@ -13,6 +13,7 @@ from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
 _SHARED = re.compile(r"[Aa]rguments as in\s+`(?:([\w.]+)\.)?(\w+)`")
+_TRANSPARENT = {"recorded"}  # decorators that keep signature and docstring
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
@@ -68,10 +69,10 @@ def describe_function(function: Callable[..., Any]) -> Description:
 
 
 def _in_source(module: str, name: str) -> Description | None:
-    """Read a function that its module defines without decorators; None where it does not."""
+    """Read a function from the source of its module; None where it is not there, or a decorator may change it."""
     functions = _functions(module)
     node = functions.get(name)
-    if node is None or node.decorator_list:
+    if node is None or {ast.unparse(d) for d in node.decorator_list} - _TRANSPARENT:
         return None
     given = node.args
     plain = [*given.posonlyargs, *given.args]

@@ -69,3 +69,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     words = sorted(known)
     close = get_close_matches(name, words, n=1, cutoff=0.5)
     return f"Did you mean {close[0]!r}?" if close else "Known: " + ", ".join(words) + "."
+
+
+def __dir__() -> list[str]:
+    return sorted(name for name, value in globals().items() if getattr(value, "__module__", None) == __name__)

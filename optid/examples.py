@@ -13,6 +13,7 @@ import numpy as np
 from optid import plants, signals
 from optid.data.record import Data
 from optid.errors import LookupFailed, nearest
+from optid.lazy import public_names
 from optid.models.recursions import lfilter
 
 
@@ -232,3 +233,6 @@ _TWO_INPUTS = _System(
     "two_inputs", 1.0, {"valve": "", "heater": "V"}, {"temperature": "K"}, np.array([-1.1, 0.3]),
     (np.array([-0.6, -0.3]), np.array([0.5, 0.4])), (_saturation, _power),
     {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})
+
+
+__dir__ = public_names(__name__)

@@ -1,5 +1,6 @@
 """Public names that are loaded on first use, so that importing a package stays fast."""
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -23,3 +24,13 @@ def on_first_use(package: str, home: Mapping[str, Sequence[str]], modules: Mappi
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return load, lambda: sorted([*places, *public])
+
+
+def public_names(module: str) -> Callable[[], list[str]]:
+    """Return `__dir__` of a module: ``__all__``, or what it defines itself without an underscore."""
+    def names() -> list[str]:
+        space = vars(sys.modules[module])
+        own = [name for name, value in space.items() if getattr(value, "__module__", None) == module]
+        return sorted(space.get("__all__", [name for name in own if not name.startswith("_")]))
+
+    return names

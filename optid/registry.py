@@ -2,9 +2,12 @@
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from functools import cache
+from html import escape
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 from optid.errors import LookupFailed, StructureError, nearest
 
@@ -46,15 +49,56 @@ def fault_formulation(name: str) -> Callable[..., Any]:
     return entry_point(FAULTS, name).load()
 
 
-def render(result: Any, form: str = "text") -> Any:
-    """Return a result in a form, such as "text", by the renderer registered as "<class name>.<form>".
+def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> Any:
+    """Return a result in a form, by the renderer registered as "<class name>.<form>".
 
-    Results are data: they know no table and no figure, and import nothing that draws or prints them.
+    Results are data: they know no table and no figure, and import nothing that draws or prints them. A notebook shows
+    the text of a result that has no HTML of its own.
+
+    Args:
+        result: the result.
+        form: "text", "html" (for notebooks), "figure" (matplotlib), or "page" (writes a file).
+        arguments: of the renderer, after the result.
+        options: of the renderer.
 
     Raises:
         LookupFailed: no such renderer; the message has the nearest name.
     """
-    return entry_point(RENDERERS, f"{type(result).__name__}.{form}").load()(result)
+    name = f"{type(result).__name__}.{form}"
+    if form == "html" and name not in registered(RENDERERS):
+        return f"<pre>{escape(render(result))}</pre>"
+    return entry_point(RENDERERS, name).load()(result, *arguments, **options)
+
+
+class Rendered:
+    """Results that print, draw and report themselves through the registry."""
+
+    def summary(self) -> str:
+        """Return the printed result."""
+        return render(self)
+
+    def plot(self, *arguments: Any, **options: Any) -> Any:
+        """Return a matplotlib figure; the arguments are those of its function in `optid.plots`."""
+        return render(self, "figure", *arguments, **options)
+
+    def report(self, path: str | Path, *arguments: Any, **options: Any) -> Path:
+        """Write an HTML page that opens offline and return its path."""
+        return render(self, "page", path, *arguments, **options)
+
+    def __str__(self) -> str:
+        return render(self)
+
+    def __repr__(self) -> str:
+        values = {one.name: getattr(self, one.name) for one in fields(cast(Any, self)) if one.repr}
+        shown = [f"{name}={value!r}" for name, value in values.items()
+                 if isinstance(value, str | int | float) and len(str(value)) < 60]
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+    def _repr_html_(self) -> str:
+        return render(self, "html")
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        printer.text(f"{type(self).__name__}(...)" if cycle else str(self))
 
 
 def named_constraint(text: str) -> Any:

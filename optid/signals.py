@@ -15,6 +15,7 @@ import numpy as np
 
 from optid.arrays import check_integer, one_of
 from optid.errors import StructureError
+from optid.lazy import public_names
 
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
@@ -250,3 +251,6 @@ def _phases(kind: str, amplitudes: np.ndarray, seed: int) -> np.ndarray:
     power = amplitudes**2 / np.sum(amplitudes**2)
     # phi_k = -2 pi sum_{i<k} (k - i) p_i, by two cumulative sums.
     return -2 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(power)[:-1])])
+
+
+__dir__ = public_names(__name__)

@@ -297,7 +297,7 @@ def test_the_study_reads_like_a_page():
     text = str(found)
     assert max(map(len, text.splitlines())) <= 80
     assert found.nx == 4 and "Recommended: nx = 4; na = " in text and "order 3 is rejected" in " ".join(text.split())
-    figure = found.picture()
+    figure = found.plot()
     assert len(figure.axes) == 5 and "recommended: nx = 4" in figure.get_suptitle()
     lines = figure.axes[0].get_lines()[0].get_ydata()
     assert lines == pytest.approx(found.ranks.singular_values)

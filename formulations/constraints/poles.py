@@ -23,7 +23,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import root_scalar
 
-from formulations.constraints.rule import Rule, check_bounds
+from formulations.constraints.rule import Rule, check_bounds, recorded
 from optid.errors import StructureError
 from optid.models.roots import pulled, roots_of
 from optid.models.roots import radius as root_radius
@@ -94,6 +94,7 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
 
 
+@recorded
 def disc(centre: float, radius: float) -> Rule:
     """All poles lie in the disc of a given radius around a point of the real axis.
 
@@ -106,6 +107,7 @@ def disc(centre: float, radius: float) -> Rule:
                        f"the disc of radius {radius:g} around {centre:g}")
 
 
+@recorded
 def strip(low: float | None = None, high: float | None = None) -> Rule:
     """The real part of every pole lies in [low, high].
 
@@ -119,6 +121,7 @@ def strip(low: float | None = None, high: float | None = None) -> Rule:
     return region_rule(f"strip:{','.join(ends)}", sides, f"the strip {ends[0]} <= Re z <= {ends[1]}")
 
 
+@recorded
 def sector(angle: float) -> Rule:
     """Every pole has an argument of at most ``angle`` radians: no oscillation above angle / dt rad per second.
 
@@ -131,6 +134,7 @@ def sector(angle: float) -> Rule:
                        f"the sector |arg z| <= {angle:g}")
 
 
+@recorded
 def damped(ratio: float) -> Rule:
     """Every pole has at least a given damping ratio.
 
@@ -164,6 +168,7 @@ def damping_sides(rate: float) -> list[Side]:
     return sides
 
 
+@recorded
 def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> Rule:
     """All poles lie in the disc of a given radius; optionally real and separated by given points.
 

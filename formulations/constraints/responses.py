@@ -10,7 +10,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.constraints.rule import Rule, label, sign_of
+from formulations.constraints.rule import Rule, label, recorded, sign_of
 from formulations.constraints.shape import slopes_at
 from optid.errors import StructureError
 from optid.program.limits import Limit
@@ -22,6 +22,7 @@ HORIZON = 50  # samples over which the sign of a response is imposed
 REAL = 1e-9  # least eigenvalue in the inequality of positive realness, relative to the size of C
 
 
+@recorded
 def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float | None = None,
                      channel: str | None = None, output: str | None = None) -> Rule:
     """The response to a small impulse at an operating point has one sign.
@@ -38,6 +39,7 @@ def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float
                      summed=False)
 
 
+@recorded
 def step_response(sign: str = "positive", horizon: float = HORIZON, low: float | None = None,
                   high: float | None = None, channel: str | None = None, output: str | None = None) -> Rule:
     """The response to a step of the input from ``low`` up to ``high`` has one sign at every sample: no undershoot.
@@ -54,6 +56,7 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
     return _response("step_response", sign, horizon, channel, output, rows, summed=True)
 
 
+@recorded
 def no_effect(channel: str, output: str | None = None) -> Rule:
     """An input acts on no output, or not on a given one: its column of the transfer matrix is zero there."""
 
@@ -71,6 +74,7 @@ def no_effect(channel: str, output: str | None = None) -> Rule:
     return Rule(f"no_effect:{channel}" + ("" if output is None else f",{output}"), build)
 
 
+@recorded
 def positive_real(margin: float = 0.0) -> Rule:
     """The transfer matrix is positive real: ``G + G* >= 2 margin`` on and outside the unit circle.
 

@@ -1,13 +1,17 @@
 """A named constraint that is built when the variables of a formulation exist, and checks of its arguments."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from importlib import import_module
+from typing import Any, ParamSpec
 
 import numpy as np
 
 from optid.errors import StructureError
 from optid.program.view import View
+
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
@@ -21,12 +25,17 @@ class Rule:
             approximates.
         about: what it restricts, "poles" or "coefficients": a procedure of several steps hands it to the steps that
             choose these.
+        call: module, name and arguments of the function that returned it, from which a pickled rule is built again.
     """
 
     name: str
     build: Callable[[View], Any]
     verify: Callable[[Any], str] | None = None
     about: frozenset[str] = frozenset({"coefficients"})
+    call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]] | None = field(default=None, repr=False, compare=False)
+
+    def __reduce__(self) -> Any:
+        return super().__reduce__() if self.call is None else (_built_again, (*self.call, self.name))
 
     def __call__(self, view: View) -> dict[str, Any]:
         """Build the constraint in the variables of a formulation."""
@@ -35,6 +44,20 @@ class Rule:
     def named(self, name: str) -> "Rule":
         """Return the same constraint under another name, for two of a kind."""
         return replace(self, name=name)
+
+
+def recorded(function: Callable[P, Rule]) -> Callable[P, Rule]:
+    """Let the rules of a function remember its arguments, so that they can be pickled."""
+
+    @wraps(function)
+    def build(*args: P.args, **kwargs: P.kwargs) -> Rule:
+        return replace(function(*args, **kwargs), call=(function.__module__, function.__name__, args, kwargs))
+
+    return build
+
+
+def _built_again(module: str, function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any], name: str) -> Rule:
+    return getattr(import_module(module), function)(*args, **kwargs).named(name)
 
 
 def label(word: str, *names: str | None) -> str:

@@ -9,6 +9,7 @@ from optid.bases.basis import Basis
 from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
 from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.lazy import public_names
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -146,3 +147,6 @@ def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[A
                             "excite the input or drop the channel")
         found.append(family.fitted(float(low), float(high)))
     return found
+
+
+__dir__ = public_names(__name__)

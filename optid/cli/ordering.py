@@ -76,5 +76,5 @@ def order(
         )
         if picture is not None:
             waiting.step("drawing")
-            save_picture(found.picture(), picture)
+            save_picture(found.plot(), picture)
     conclude(str(found), heard, picture=picture)

@@ -1,10 +1,12 @@
 """Fit a model: examine the record, pose the problem, solve it, judge and prove the answer, report it."""
 
+import pickle
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,18 +15,22 @@ from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
+from optid.identify.parameters import Parameters, criteria, parameters
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
-from optid.registry import check_arguments, defaults, formulation, named_constraint, render
+from optid.registry import Rendered, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Rendered):
     """A fitted model with the evidence for it.
+
+    A pickled fit keeps its results. Its programme is not among them: it is posed and solved again when it is asked for
+    (by `program`, `uncertainty` or `resolve`), which needs constraints that can be pickled.
 
     Attributes:
         outcome: what the formulation ended with; see `program`, `solution`, `model`, `figures` and `steps`.
@@ -34,6 +40,7 @@ class Fit:
         prices: activity and price of every user constraint.
         findings: what the examination of the record found, one sentence each.
         seconds: wall time of the whole call.
+        settings: solver, accuracy and other settings of the solve.
     """
 
     outcome: Outcome = field(repr=False)
@@ -43,13 +50,14 @@ class Fit:
     prices: tuple[Price, ...] = ()
     findings: tuple[str, ...] = ()
     seconds: float = 0.0
+    settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def program(self) -> Program:
         """The last programme solved."""
         return self.outcome.program
 
-    @property
+    @cached_property
     def steps(self) -> tuple[tuple[str, Solution], ...]:
         """Name and solution of every programme on the way."""
         return self.outcome.steps
@@ -149,11 +157,104 @@ class Fit:
         return fit(self.data if data is None else data, formulation or self.formulation, prove=False,
                    **{**arguments, **changes})
 
-    def __str__(self) -> str:
-        return render(self)
+    # -- working with the model ------------------------------------------------------------------------------------
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text("Fit(...)" if cycle else str(self))
+    @cached_property
+    def params(self) -> Parameters:
+        """Estimates with standard errors and 95 % intervals, by name: ``fit.params["a1"]``."""
+        return parameters(self)
+
+    def conf_int(self, level: float = 0.95) -> Parameters:
+        """Return the parameters with intervals that contain the truth with this probability."""
+        return parameters(self, level)
+
+    def predict(self, data: Data | None = None, horizon: int = 1) -> Any:
+        """Predict so many samples ahead, as `Model.predict`; on the record of the fit when none is given."""
+        return self.model.predict(self._record() if data is None else data, horizon)
+
+    def simulate(self, u: Any = None, x0: Any = None) -> Any:
+        """Compute the outputs from inputs (N, m) or a record, as `Model.simulate`.
+
+        Args:
+            u: inputs in raw units, or a record; the record of the fit when not given.
+            x0: initial state; by default zero for inputs, and what fits best for a record.
+        """
+        given = self._record() if u is None else u
+        return self.model.simulate(given, x0=x0 if x0 is not None else "fit" if isinstance(given, Data) else "zero")
+
+    @cached_property
+    def residuals(self) -> Any:
+        """One-step prediction errors (N, l) on the record, NaN where there are none; a tuple of several experiments."""
+        return self.model.innovations(self._record())
+
+    @cached_property
+    def aic(self) -> float:
+        """Akaike's information criterion of the one-step prediction errors."""
+        return criteria(self)[0]
+
+    @cached_property
+    def bic(self) -> float:
+        """The Bayesian information criterion of the one-step prediction errors."""
+        return criteria(self)[1]
+
+    def validate(self, data: Data | None = None, **options: Any) -> Any:
+        """Compare the model with a record, as `optid.validate`; with that of the fit when none is given."""
+        from optid.identify.validation import validate
+
+        return validate(self.model, self._record() if data is None else data, **options)
+
+    def save(self, path: str | Path) -> None:
+        """Save the model as JSON; `optid.load` reads it."""
+        self.model.save(path)
+
+    def _record(self) -> Data:
+        if not isinstance(self.data, Data):
+            raise DataError("the fit was made from a stream, whose samples are not kept: pass a record")
+        return self.data
+
+    # -- copies ----------------------------------------------------------------------------------------------------
+
+    def __copy__(self) -> "Fit":
+        made = object.__new__(type(self))
+        made.__dict__.update(vars(self))
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        for name in ("solution", "_completed", "steps", "values"):
+            getattr(self, name)
+        constraints = tuple(_kept(one) for one in self.arguments.get("constraints", ()))
+        arguments = {**self.arguments, **({"constraints": constraints} if constraints else {})}
+        return {**{name: value for name, value in vars(self).items() if name != "outcome"}, "arguments": arguments}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "outcome" or "arguments" not in vars(self):  # a fit from a pickle has no outcome yet
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        settings = dict(self.settings)
+        problem = formulation(self.formulation)[1](self.data, **self.arguments)
+        vars(self)["outcome"] = run(problem, settings.pop("solver", "auto"), **settings)
+        return self.outcome
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """Stands for a constraint that cannot be pickled."""
+
+    name: str
+
+    def __call__(self, view: Any) -> Any:
+        raise StructureError(f"constraint {self.name!r} was not pickled with the fit, since it is a function without a "
+                             "name of its own: use a rule of formulations.constraints, or a function of a module")
+
+
+def _kept(constraint: Any) -> Any:
+    try:
+        pickle.dumps(constraint)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return _Lost(getattr(constraint, "name", getattr(constraint, "__name__", repr(constraint))))
+    return constraint
 
 
 def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hammerstein_arx.exact", *,
@@ -250,7 +351,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     prices = price_constraints(outcome.program, outcome.solution)
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
-               time.perf_counter() - started)
+               time.perf_counter() - started, {**settings, "solver": solver})
 
 
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:

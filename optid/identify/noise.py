@@ -23,6 +23,7 @@ from optid.data.stretches import between_gaps
 from optid.errors import DataError, StructureError
 from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
+from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
 from optid.models.kalman import NoiseCovariances, kalman_gain
@@ -252,3 +253,6 @@ def observer_gain(A: Array, C: Array, ratio: float) -> Array:
     """Return the gain for equal noise in all states, so many times that at the outputs in units of C."""
     size = np.linalg.norm(C, axis=1)
     return np.array(kalman_gain(A, C, ratio * np.eye(len(A)), np.diag(np.where(size > 0, size, 1.0) ** 2)).K)
+
+
+__dir__ = public_names(__name__)

@@ -60,6 +60,10 @@ class Tangent:
     noise: Array
     meaning: str
 
+    def __getstate__(self) -> dict[str, Any]:
+        _ = self._neighbours  # what `rebuild`, which holds the programme, is called for
+        return {**vars(self), "rebuild": None}
+
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
         return self.local.limits(self.slopes(quantity), level)

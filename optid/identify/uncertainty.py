@@ -89,6 +89,11 @@ class Uncertainty:
         """What the intervals are, in words."""
         return self.source.meaning
 
+    def at_level(self, level: float) -> "Uncertainty":
+        """Return the same intervals at another level, a probability."""
+        check_probability(level, "level")
+        return self if level == self.level else replace(self, level=float(level))
+
     # -- coefficients --------------------------------------------------------------------------------------------
 
     @cached_property

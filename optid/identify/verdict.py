@@ -7,7 +7,7 @@ functions suit the record. It speaks of this record only.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ class Verdict:
     """
 
     word: str
-    parts: tuple[Finding, ...]
+    parts: tuple[Finding, ...] = field(repr=False)
     score: float
 
     @property

@@ -112,3 +112,17 @@ def response_pairs(model: Model) -> list[tuple[str, str]]:
     words = [function.word for function in static_functions(model) if function.family == "nonlinearities"]
     sources = words if len(words) > model.m else model.inputs
     return [(source, output) for output in model.outputs for source in sources]
+
+
+def free_parameters(model: Any) -> int:
+    """Return the number of parameters of a model, less those that repeat others (gauge)."""
+    if hasattr(model, "parameters"):  # state equations of the user
+        return len(model.parameters)
+    shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
+    if model.structure != "ss":
+        return int(model.a.size + sum(b.size for b in model.b) + model.offset.size + shapes)
+    n, signals = len(model.A), model.B.shape[1] + model.E.shape[1]
+    direct = np.count_nonzero(np.any(np.c_[model.D, model.Fz] != 0, axis=0)) * model.l
+    shapes += sum(f.basis.size - 1 for f in (*model.feedback, *model.latent))
+    rows = sum(1 for f in model.latent) * (2 * n + 1)
+    return int(n * (model.l + signals) + direct + model.l + shapes + rows)

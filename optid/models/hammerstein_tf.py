@@ -31,7 +31,7 @@ FORGOTTEN = 1e-12
 """A free response below this share of its start no longer informs about the initial state."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class HammersteinTF(Model):
     """``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + offset``, in raw units.
 

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
+from html import escape
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -127,6 +128,13 @@ class Model(Ports):
         if points.shape != (self.m,):
             raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
         return points
+
+    def __repr__(self) -> str:
+        orders = ", ".join(f"{name}={value}" for name, value in self.orders.items())
+        return f"{type(self).__name__}({self.title} of {', '.join(self.outputs)}; {orders}, dt={self.dt:g})"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:
         """Return the equations and the poles."""

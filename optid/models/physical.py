@@ -24,7 +24,7 @@ CHUNK = 1024
 NEWTON = {"abstol": 1e-13, "abstolStep": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PhysicalModel(Model):
     """State equations written by a user, with estimated parameters, in raw units.
 

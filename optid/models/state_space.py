@@ -34,7 +34,7 @@ RESTS = 1e-12
 """A state that moves by less than this share of its size rests."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class StateSpace(Model):
     """State equations with static functions of the inputs, of the outputs and of latent signals, in raw units.
 

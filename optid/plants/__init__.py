@@ -15,6 +15,7 @@ A missing input, a wrong shape and a run that leaves all bounds raise a `DataErr
 `StructureError`.
 """
 
+from optid.lazy import public_names
 from optid.plants.feedback import EXAMPLE1, NOISE_CASES, TWO_MODES, FeedbackSystem, two_mode_plant
 from optid.plants.physical import (
     TWO_TANKS,
@@ -28,3 +29,6 @@ from optid.plants.physical import (
 
 __all__ = ["EXAMPLE1", "NOISE_CASES", "TWO_MODES", "TWO_TANKS", "FeedbackSystem", "ReactionWheelPendulum", "pendulum",
            "pendulum_input", "two_mode_plant", "two_tanks", "van_der_pol", "van_der_pol_drive"]
+
+
+__dir__ = public_names(__name__)

@@ -117,15 +117,15 @@ class Solution:
     claimed: str
     solver: str
     reason: str = ""
-    chosen: str = ""
+    chosen: str = field(default="", repr=False)
     values: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
     duals: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
     objective: float = float("nan")
-    bound: Bound | None = None
-    residuals: Residuals | None = None
-    scale: float = 1.0
+    bound: Bound | None = field(default=None, repr=False)
+    residuals: Residuals | None = field(default=None, repr=False)
+    scale: float = field(default=1.0, repr=False)
     iterations: int = -1
-    times: Times = Times()
+    times: Times = field(default=Times(), repr=False)
     claim: Status | None = None
     failed: str = ""
 

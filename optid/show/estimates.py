@@ -1,11 +1,13 @@
 """What was estimated, as rows: coefficients and nonlinearities with their errors."""
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.bases.splines import Triangular
 from optid.errors import OptidError
+from optid.identify.parameters import Parameter, Parameters, function_parameters
 from optid.models.functions import static_functions
 from optid.show.wording import Table, number
 
@@ -73,21 +75,22 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
 def coefficient_table(fit: "Fit") -> Table | None:
     """Coefficients mu of the bases; None where every channel is linear."""
     known, _ = uncertainty(fit)
-    functions, rows = static_functions(fit.model), []
-    for function in functions:
-        if function.is_linear:
-            continue
-        letter = {"feedback": "nu", "latent": "c"}.get(function.family, "mu")
-        where = "" if function.word in "fgh" else function.word if function.word[1] != "_" else function.name
-        for j, value in enumerate(function.nonlinearity.mu):
-            label = f"{letter}{j + 1}" + (f"[{where}]" if where else "")
-            if known is None:
-                rows.append((label, number(value)))
-            else:
-                interval = known.coefficients(function.index, function.family)
-                rows.append(_interval_row(label, value, interval.error[j], interval.lower[j], interval.upper[j]))
-    head = () if known is None else ("std. error", "95 % low", "95 % high")
-    return Table("Coefficients of the basis", ("coefficient", "estimate", *head), rows) if rows else None
+    functions = [function for function in static_functions(fit.model) if not function.is_linear]
+    rows = [row for function in functions for row in function_parameters(function, known)]
+    return _parameter_table("Coefficients of the basis", rows, known is None) if rows else None
+
+
+def parameters_table(found: Parameters) -> Table:
+    """Every parameter with its interval."""
+    note = f"No standard errors: {found.reason.rstrip('.')}." if found.reason else ""
+    return _parameter_table("Parameters", found, bool(found.reason), found.level, note)
+
+
+def _parameter_table(title: str, rows: Iterable[Parameter], bare: bool, level: float = 0.95, note: str = "") -> Table:
+    if bare:
+        return Table(title, ("parameter", "estimate"), [(row.name, number(row.estimate)) for row in rows], note)
+    ends = (f"{100 * level:g} % low", f"{100 * level:g} % high")
+    return Table(title, ("parameter", "estimate", "std. error", *ends), [_interval_row(*row) for row in rows])
 
 
 def _interval_row(

@@ -17,6 +17,7 @@ from optid.errors import DataError, DataWarning
 from optid.identify.equation_error import EquationError
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
+from optid.lazy import public_names
 from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
 from optid.show import panels, summary
 from optid.show.estimates import uncertainty
@@ -366,3 +367,6 @@ def _response_bands(fit: "Fit", w: Array) -> list[tuple[Array, Array] | None]:
     size, _ = known.frequency_response(w)
     lower, upper = (edge.reshape(w.size, -1).T for edge in (size.lower, size.upper))
     return list(zip(lower, upper))
+
+
+__dir__ = public_names(__name__)

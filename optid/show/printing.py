@@ -10,6 +10,7 @@ from optid.show.wording import Table
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
+    from optid.identify.parameters import Parameters
     from optid.identify.validation import Comparison, HorizonCurve, Validation
     from optid.identify.verdict import Verdict
 
@@ -89,6 +90,11 @@ def describe_horizons(curve: "HorizonCurve") -> str:
 def describe_comparison(found: "Comparison") -> str:
     """Return the comparison of several models as text, at most 80 columns wide."""
     return "\n".join(set_table(checks.comparison_table(found)))
+
+
+def describe_parameters(found: "Parameters") -> str:
+    """Return estimates with their intervals as text, at most 80 columns wide."""
+    return "\n".join(set_table(estimates.parameters_table(found)))
 
 
 _SHORT = ("Objective", "Bound", "Relative gap")

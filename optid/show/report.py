@@ -11,6 +11,7 @@ from optid import __version__, plots
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.validation import Validation, validate
+from optid.lazy import public_names
 from optid.models.functions import static_functions
 from optid.show import checks, comparing, estimates, summary, wording
 from optid.show.page import figure, template, versions
@@ -265,3 +266,6 @@ def _validation(fit: "Fit", name: str, test: Data | None, checked: Validation) -
         )
     tables = checks.validation_tables(checked)
     return {"title": TITLES[name], "tables": tables, "notes": checked.notes, "figures": figures}
+
+
+__dir__ = public_names(__name__)

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order.lags import LagScan, scan_lags
 from optid.identify.order.ranks import RankTest, order_test
 from optid.identify.order.states import StateCriteria, state_criteria
-from optid.registry import render
+from optid.registry import Rendered
 from optid.statistics.expansion import Expansion, check_channels, expand
 from optid.statistics.hankel import hankel_statistics
 
@@ -23,8 +22,8 @@ FEWEST, PER_ROW = 2, 1.5
 """Block rows at least; windows per row of the longest windows that are wanted."""
 
 
-@dataclass(frozen=True, eq=False)
-class OrderStudy:
+@dataclass(frozen=True, eq=False, repr=False)
+class OrderStudy(Rendered):
     """What `order` found; `print` it.
 
     Attributes:
@@ -46,13 +45,6 @@ class OrderStudy:
     nx: int
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return render(self, "text")
-
-    def picture(self) -> Any:
-        """Draw singular values with thresholds, criteria, and the scan of lags; a matplotlib figure."""
-        return render(self, "figure")
 
 
 def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBases = None,

@@ -18,7 +18,7 @@ from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, cl
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, tried
 from optid.identify.verdict import Verdict, verdict
-from optid.registry import named_constraint, render
+from optid.registry import Rendered, named_constraint
 
 FIRST = 0.25
 """Share of the budget that linear models have before the others begin."""
@@ -27,8 +27,8 @@ RESERVED = 0.1
 """Share of the budget that is kept for the fit of the choice."""
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Rendered):
     """What `identify` found; `print` it.
 
     Attributes:
@@ -63,9 +63,6 @@ class Identification:
         """What the model is worth on the record, from the blocks left out."""
         assert isinstance(self.fit.data, Data)
         return verdict(self.model, self.fit.data, self.chosen.by_block.tolist(), self.chosen.score)
-
-    def __str__(self) -> str:
-        return render(self)
 
 
 def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,

@@ -12,6 +12,7 @@ from optid.arrays import Array
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.fitting import fit
+from optid.models.functions import free_parameters
 
 WORSE = 1.3
 """A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
@@ -167,18 +168,6 @@ def spared(candidate: Candidate) -> dict[str, Any]:
 def halves(count: int) -> tuple[int, ...]:
     """Return the blocks in the order they are tried: every other one first."""
     return (*range(0, count, 2), *range(1, count, 2))
-
-
-def free_parameters(model: Any) -> int:
-    """Return the number of parameters of a model, less those that repeat others (gauge)."""
-    shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
-    if model.structure != "ss":
-        return int(model.a.size + sum(b.size for b in model.b) + model.offset.size + shapes)
-    n, signals = len(model.A), model.B.shape[1] + model.E.shape[1]
-    direct = np.count_nonzero(np.any(np.c_[model.D, model.Fz] != 0, axis=0)) * model.l
-    shapes += sum(f.basis.size - 1 for f in (*model.feedback, *model.latent))
-    rows = sum(1 for f in model.latent) * (2 * n + 1)
-    return int(n * (model.l + signals) + direct + model.l + shapes + rows)
 
 
 def _behind(known: Trial, rival: Trial) -> bool:

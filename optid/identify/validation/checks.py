@@ -15,7 +15,7 @@ from optid.identify.validation.correlations import LEVEL, Correlation, autocorre
 from optid.identify.validation.predictions import ONE_STEP, SIMULATION, Measures, one_step, predictors, simulated
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.functions import has_feedback, static_functions
-from optid.registry import render
+from optid.registry import Rendered
 
 LAGS = 25
 
@@ -25,8 +25,8 @@ KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent sign
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Validation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Validation(Rendered):
     """What `validate` found; `print` it.
 
     Attributes:
@@ -84,9 +84,6 @@ class Validation:
         """Whether the structure test passes and the residual tests do, together at the 1 % level (Bonferroni)."""
         white = not any(test.p_value < LEVEL / len(self.tests) for test in self.tests)
         return white and (self.structure is None or self.structure.passed)
-
-    def __str__(self) -> str:
-        return render(self)
 
 
 def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon: int = 1) -> Validation:

@@ -19,11 +19,11 @@ from optid.identify.validation.predictions import (
     common_fits,
     fit_by_horizon,
 )
-from optid.registry import render
+from optid.registry import Rendered
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Rendered):
     """What `compare_models` found; `print` it, or write a page with `optid.show.report.write_comparison`.
 
     Attributes:
@@ -63,9 +63,6 @@ class Comparison:
         if np.isnan(means).all():
             raise StructureError(f"no model has the prediction {predictor!r}; there are {', '.join(self.fits)}")
         return self.names[int(np.nanargmax(means))]
-
-    def __str__(self) -> str:
-        return render(self)
 
 
 def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizon: int = 1, x0: Any = "fit"

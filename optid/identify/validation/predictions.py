@@ -15,7 +15,7 @@ from optid.arrays import Array
 from optid.data.record import Data, as_list
 from optid.errors import DataError
 from optid.models.functions import has_feedback
-from optid.registry import render
+from optid.registry import Rendered
 
 ONE_STEP, MEASURED, SIMULATION = "one step", "measured feedback", "simulation"
 
@@ -137,8 +137,8 @@ def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Arr
         return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
-@dataclass(frozen=True, eq=False)
-class HorizonCurve:
+@dataclass(frozen=True, eq=False, repr=False)
+class HorizonCurve(Rendered):
     """Fits of the predictions so many samples ahead; `print` it.
 
     Attributes:
@@ -152,9 +152,6 @@ class HorizonCurve:
     horizons: tuple[int, ...]
     fits: Array
     simulation: Array
-
-    def __str__(self) -> str:
-        return render(self)
 
 
 def fit_by_horizon(model: Any, data: Data, horizons: Sequence[int] | None = None) -> HorizonCurve:

@@ -1,0 +1,118 @@
+"""What a fit estimated, as a table: estimates with standard errors and intervals, and information criteria."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optid.arrays import Array, check_probability
+from optid.errors import DataError, LookupFailed, OptidError, nearest
+from optid.models.functions import StaticFunction, free_parameters, static_functions
+from optid.registry import Rendered
+
+
+class Parameter(NamedTuple):
+    """An estimate; NaN stands for an error or an interval that is not known."""
+
+    name: str
+    estimate: float
+    error: float = np.nan
+    lower: float = np.nan
+    upper: float = np.nan
+
+
+@dataclass(frozen=True, repr=False)
+class Parameters(Rendered, Sequence):
+    """Estimated parameters in their order, by place or by name: ``fit.params["a1"].estimate``.
+
+    Attributes:
+        rows: the parameters.
+        level: probability that an interval contains the truth.
+        reason: why there are no standard errors, "" where there are some.
+    """
+
+    rows: tuple[Parameter, ...]
+    level: float = 0.95
+    reason: str = ""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.rows)
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return the parameter of a name, or those at a place or slice; another name raises `LookupFailed`."""
+        if not isinstance(key, str):
+            return self.rows[key]
+        for row in self.rows:
+            if row.name == key:
+                return row
+        raise LookupFailed(f"no parameter is called {key!r}. {nearest(key, self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(row.name for row in self.rows)
+
+    @property
+    def estimates(self) -> Array:
+        """Estimates (n,)."""
+        return np.array([row.estimate for row in self.rows])
+
+    def to_frame(self) -> Any:
+        """Return a pandas data frame, one row per parameter."""
+        import pandas
+
+        return pandas.DataFrame(self.rows, columns=Parameter._fields).set_index("name")
+
+
+def parameters(fit: Any, level: float = 0.95) -> Parameters:
+    """Return the parameters of a fit with intervals of a level: coefficients, then those of its static functions.
+
+    The matrices of a state-space model depend on the choice of its states; their place is taken by poles and static
+    gain where these have intervals.
+    """
+    check_probability(level, "level")
+    try:
+        known, reason = fit.uncertainty.at_level(level), ""
+    except OptidError as error:
+        known, reason = None, str(error)
+    rows = [Parameter(name, value) for name, value in fit.model.coefficients()] if known is None else [
+        Parameter(*row) for row in known.table()]
+    for function in static_functions(fit.model):
+        if not function.is_linear:
+            rows += function_parameters(function, known)
+    return Parameters(tuple(rows), level, reason)
+
+
+def function_parameters(function: StaticFunction, known: Any) -> list[Parameter]:
+    """Return the coefficients of a static function, with errors where the uncertainty is known."""
+    letter = {"feedback": "nu", "latent": "c"}.get(function.family, "mu")
+    where = "" if function.word in "fgh" else function.word if function.word[1] != "_" else function.name
+    names = [f"{letter}{j + 1}" + (f"[{where}]" if where else "") for j in range(function.nonlinearity.mu.size)]
+    if known is None:
+        return [Parameter(name, float(value)) for name, value in zip(names, function.nonlinearity.mu)]
+    found = known.coefficients(function.index, function.family)
+    columns = np.column_stack([found.value, found.error, found.lower, found.upper]).tolist()
+    return [Parameter(name, *row) for name, row in zip(names, columns)]
+
+
+def criteria(fit: Any) -> tuple[float, float]:
+    """Return AIC and BIC of a fit: minus twice the log likelihood of its one-step errors, plus the price of parameters.
+
+    The errors count as Gaussian with the covariance they have; samples with a missing output are left out.
+
+    Raises:
+        DataError: a stream, whose samples are gone, or fewer errors than outputs.
+    """
+    errors = np.vstack(fit.residuals if isinstance(fit.residuals, tuple) else (fit.residuals,))
+    errors = errors[np.isfinite(errors).all(axis=1)]
+    samples, outputs = errors.shape
+    if samples <= outputs:
+        raise DataError(f"{samples} samples have one-step errors of every output: too few for a likelihood")
+    sign, size = np.linalg.slogdet(errors.T @ errors / samples)
+    likelihood = samples * ((size if sign > 0 else -np.inf) + outputs * (1 + np.log(2 * np.pi)))
+    count = free_parameters(fit.model)
+    return float(likelihood + 2 * count), float(likelihood + np.log(samples) * count)

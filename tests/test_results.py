@@ -1,0 +1,157 @@
+"""What can be done with a result: parameters, predictions, copies, pickles, displays, completion."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sample_fits import example_fit, linear_fit, mimo_fit
+
+import optid
+from formulations import shape
+from optid.errors import DataError, LookupFailed, StructureError
+from optid.examples import example
+
+RESULTS = {
+    "fit": lambda: example_fit("thruster"),
+    "several outputs": mimo_fit,
+    "parameters": lambda: example_fit("thruster").params,
+    "uncertainty": lambda: example_fit("thruster").uncertainty,
+    "validation": lambda: optid.validate(example_fit("thruster").model, example("thruster").data),
+    "comparison": lambda: optid.compare_models([linear_fit().model] * 2, linear_fit().data),
+    "horizons": lambda: optid.fit_by_horizon(linear_fit().model, linear_fit().data),
+    "order": lambda: optid.order(linear_fit().data),
+    "search": lambda: optid.identify(example("thruster").data, budget=2, workers=1, classes=["linear"]),
+    "verdict": lambda: example_fit("thruster").verdict,
+    "solution": lambda: example_fit("thruster").solution,
+    "model": lambda: example_fit("thruster").model,
+    "record": lambda: example("thruster").data,
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_every_result_is_pickled_and_shown_in_three_lines(name):
+    result = RESULTS[name]()
+    again = pickle.loads(pickle.dumps(result))
+    assert type(again) is type(result) and str(again) == str(result)
+    assert str(copy.deepcopy(result)) == str(result)
+    shown = repr(result)
+    assert shown.count("\n") <= 2 and len(shown) <= 240
+
+
+def test_parameters_are_a_table_with_errors():
+    fit = example_fit("thruster")
+    table = dict((name, row) for name, *row in fit.uncertainty.table())
+    assert [list(fit.params[name][1:]) for name in table] == list(table.values())
+    assert fit.params.names[-10:] == tuple(f"mu{k}" for k in range(1, 11))
+    np.testing.assert_allclose(fit.params.estimates[-10:], fit.model.f.mu)
+    frame = fit.params.to_frame()
+    assert frame.loc["a1", "estimate"] == fit.params["a1"].estimate
+    with pytest.raises(LookupFailed, match="Did you mean"):
+        _ = fit.params["al"]
+
+
+def test_intervals_widen_with_their_level_and_are_named_after_it():
+    fit = linear_fit()
+    noisy = optid.fit(_noisy(), "arx", na=2, nb=1, nk=1)
+    half, most = noisy.conf_int(0.5), noisy.conf_int(0.99)
+    assert all(b.lower < a.lower < a.estimate < a.upper < b.upper for a, b in zip(half, most) if a.error > 0)
+    assert "99 % low" in str(most)
+    with pytest.raises(StructureError, match="level"):
+        fit.conf_int(1.5)
+
+
+def _noisy() -> optid.Data:
+    data = linear_fit().data
+    noise = 0.1 * np.random.default_rng(4).standard_normal(data.y.shape)
+    return optid.Data(data.u, data.y + noise, data.dt)
+
+
+def test_the_methods_do_what_the_functions_do(tmp_path):
+    fit = optid.fit(_noisy(), "arx", na=2, nb=1, nk=1)
+    data, model = fit.data, fit.model
+    np.testing.assert_array_equal(fit.predict(horizon=3), model.predict(data, 3))
+    np.testing.assert_array_equal(fit.simulate(), model.simulate(data, x0="fit"))
+    np.testing.assert_array_equal(fit.simulate(data.u[:50]), model.simulate(data.u[:50]))
+    np.testing.assert_array_equal(fit.residuals, model.innovations(data))
+    assert str(fit.validate()) == str(optid.validate(model, data))
+    assert fit.summary() == str(fit)
+    fit.save(tmp_path / "m.json")
+    assert optid.load(tmp_path / "m.json").equation() == model.equation()
+    assert fit.plot().axes
+    assert "<html" in fit.report(tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_information_criteria_are_those_of_a_gaussian_likelihood():
+    fit = optid.fit(_noisy(), "arx", na=2, nb=1, nk=1)
+    errors = fit.residuals[np.isfinite(fit.residuals)]
+    n, variance = errors.size, np.mean(errors**2)
+    likelihood = np.sum(-0.5 * np.log(2 * np.pi * variance) - errors**2 / (2 * variance))
+    assert fit.aic == pytest.approx(-2 * likelihood + 2 * 4)  # a1, a2, b0, offset
+    assert fit.bic == pytest.approx(-2 * likelihood + 4 * np.log(n))
+
+
+def test_a_pickled_fit_keeps_its_results_and_solves_again_when_its_programme_is_asked_for():
+    chosen = example("thruster")
+    rules = [shape.monotone("increasing"), shape.gain(low=0.1)]
+    fit = optid.fit(chosen.data, **{**chosen.suggestion, "constraints": rules})
+    again = pickle.loads(pickle.dumps(fit))
+    assert "outcome" not in vars(again)
+    assert again.solution.proof and again.simulation_fit == fit.simulation_fit
+    assert "outcome" not in vars(again)
+    assert again.uncertainty.table() == fit.uncertainty.table()
+    assert again.program.user_constraints.keys() == fit.program.user_constraints.keys()
+
+
+def test_a_constraint_that_cannot_be_pickled_is_named_when_it_is_needed():
+    fit = optid.fit(_noisy(), "arx", na=2, nb=1, nk=1, constraints=[lambda v: {"small": v["a"][0] <= 1}])
+    again = pickle.loads(pickle.dumps(fit))
+    assert again.model.equation() == fit.model.equation()
+    with pytest.raises(StructureError, match="lambda"):
+        _ = again.program
+
+
+def test_a_copy_shares_the_programme():
+    fit = linear_fit()
+    assert copy.copy(fit).program is fit.program
+    with pytest.raises(AttributeError, match="no attribute 'modle'"):
+        _ = fit.modle
+
+
+def test_a_stream_keeps_no_samples_to_predict(tmp_path):
+    data = linear_fit().data
+    np.savetxt(tmp_path / "r.csv", np.c_[data.u, data.y], delimiter=",", header="u,y", comments="")
+    fit = optid.fit(optid.open_stream(tmp_path / "r.csv", inputs=["u"], outputs=["y"], dt=0.1), "arx", na=2, nb=1)
+    with pytest.raises(DataError, match="stream"):
+        _ = fit.residuals
+
+
+def test_joblib_workers_return_fits():
+    joblib = pytest.importorskip("joblib")
+    data = _noisy()
+    found = joblib.Parallel(n_jobs=2)(joblib.delayed(optid.fit)(data, "arx", na=n, nb=1, nk=1) for n in (1, 2))
+    assert [fit.model.na for fit in found] == [1, 2]
+
+
+def test_identify_is_a_function_whatever_was_imported_before():
+    script = "import optid, optid.identify.fitting; optid.fit; assert callable(optid.identify), optid.identify"
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
+@pytest.mark.parametrize("name", ["signals", "bases", "errors", "examples", "plants", "plots", "report", "noise"])
+def test_modules_list_public_names_only(name):
+    module = getattr(optid, name)
+    listed = dir(module)
+    assert listed and not {"np", "Any", "dataclass", "Path", "Callable", "Sequence"} & set(listed)
+    assert all(hasattr(module, one) for one in listed)
+
+
+def test_the_stub_for_editors_is_that_of_the_signatures():
+    sys.path.insert(0, "docs")
+    try:
+        from stub import STUB, stub
+    finally:
+        sys.path.remove("docs")
+    assert STUB.read_text(encoding="utf-8") == stub(), "run python docs/stub.py"
